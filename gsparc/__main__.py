@@ -6,7 +6,7 @@ import os
 import sys
 from importlib.metadata import version
 
-from gsparc.commands.listing import COMMANDS, listed, suggest_command
+from gsparc.commands.listing import COMMANDS, list_commands, suggest_command
 
 READER_LEFT = 141  # a shell's status of a process that wrote to a closed pipe
 
@@ -29,7 +29,7 @@ def main() -> None:
 def _run() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help"):
-        sys.stdout.write(listed())
+        sys.stdout.write(list_commands())
         return
     if name == "--version":
         sys.stdout.write(f"gsparc {version('gsparc')}\n")

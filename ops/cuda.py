@@ -46,7 +46,7 @@ def load() -> None:
         calls.libraries["cuda"] = cuda_library.load()
 
 
-def tiles(settings: KernelSettings) -> int:
+def count_tiles(settings: KernelSettings) -> int:
     """Count the tiles of one pose's image."""
     return -(-settings.height // _native.TILE_HEIGHT) * -(-settings.width // _native.TILE_WIDTH)
 
@@ -72,10 +72,10 @@ def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) 
     return numbers.to(device)
 
 
-def capacity_of(plan: Plan) -> int:
+def entry_capacity(plan: Plan) -> int:
     """Return how many entries a plan has room for."""
     # Of `entries`: the tiles' starts first, then two numbers for each entry.
-    return (plan.buffers.entries.numel() - plan.num_poses * tiles(plan.settings) - 1) // 2
+    return (plan.buffers.entries.numel() - plan.num_poses * count_tiles(plan.settings) - 1) // 2
 
 
 def run_on_plan(
@@ -85,7 +85,7 @@ def run_on_plan(
     means, buffers = gaussians.means, plan.buffers
     entries, capacity = None, 0
     if buffers.entries.numel():
-        entries, capacity = buffers.entries, capacity_of(plan)
+        entries, capacity = buffers.entries, entry_capacity(plan)
     view = (_tables(means.device, means.dtype, plan.settings), *buffers[:5], buffers.starts[-1:], entries)
     inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
     counts = (plan.num_poses, len(means), capacity, *sizes)
@@ -100,7 +100,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
         raise MemoryError(
             f"{count} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
         )
-    starts = count * tiles(plan.settings) + 1
+    starts = count * count_tiles(plan.settings) + 1
     if count * n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
         return replace(plan, buffers=Buffers._make([*zeros, buffers.entries.new_zeros(starts)]))
@@ -161,7 +161,7 @@ def _composite_backward(
 ) -> Any:
     samples, n, channels = features.shape
     rows = _by_gaussian(features, plan.num_poses)
-    check_memory(capacity_of(plan), features.element_size() * (_native.MOMENTS + rows.shape[2]))
+    check_memory(entry_capacity(plan), features.element_size() * (_native.MOMENTS + rows.shape[2]))
     grads, _, grad_means2d = out
     grad_rows = torch.empty_like(rows)
     images = (image, transmittance, grad_image, grad_transmittance)
@@ -186,7 +186,7 @@ def _weights(out: Any, plan: Plan, gaussians: Gaussians) -> Any:
 
 @register_kernel("weights_backward", "cuda")
 def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tensor) -> None:
-    check_memory(capacity_of(plan), out.means.element_size() * (_native.MOMENTS + 1))
+    check_memory(entry_capacity(plan), out.means.element_size() * (_native.MOMENTS + 1))
     if slopes[0].numel() > 0:
         run_on_plan("weights_backward", plan, gaussians, *slopes, *out, sizes=(1,))
     else:
@@ -195,12 +195,12 @@ def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tenso
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Return the order (V,) of visible Gaussians; tiles' starts and ends, entries' ranks and 32 weights."""
-    means, buffers, capacity = gaussians.means, plan.buffers, capacity_of(plan)
+    means, buffers, capacity = gaussians.means, plan.buffers, entry_capacity(plan)
     pixels = _native.TILE_WIDTH * _native.TILE_HEIGHT
     # A frozen entry is a block of weights, one for each pixel of its tile.
     check_memory(capacity, pixels * means.element_size())
     blocks = means.new_zeros(capacity, pixels)
-    starts = buffers.entries[: tiles(plan.settings) + 1].clone()
+    starts = buffers.entries[: count_tiles(plan.settings) + 1].clone()
     ends = starts[:-1].clone()
     # The kernel moves each end to the first entry of its tile that no pixel sees.
     if len(means) > 0:

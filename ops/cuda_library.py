@@ -141,14 +141,14 @@ def build(path: Path, *architectures: str) -> None:
             "the CUDA kernels are not built and there is no nvcc to build them; install the CUDA toolkit or "
             "set CUDA_HOME"
         )
-    targets = [target(nvcc, arch) for arch in architectures]
+    targets = [arch_option(nvcc, arch) for arch in architectures]
     LOG.info("building the CUDA kernels for sm_%s (about a minute, once)", ", sm_".join(architectures))
     started = time.perf_counter()
     compile_to(path, [nvcc, *FLAGS, *targets, f"-I{SOURCES}", *cuda_sources()])
     LOG.info("built in %.0f s: %s", time.perf_counter() - started, path)
 
 
-def target(nvcc: str, arch: str) -> str:
+def arch_option(nvcc: str, arch: str) -> str:
     """Return nvcc's option for a GPU: native code, or PTX for one newer than nvcc."""
     listed = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
     known = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", listed)})

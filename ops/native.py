@@ -17,10 +17,10 @@ from gsparc.ops.operators import (
     check_memory,
     composite,
     contiguous,
+    count_strips,
     make_plan,
     mean_weights,
     register_kernel,
-    strips,
 )
 from gsparc.ops.results import Plan
 from gsparc.ops.settings import KernelSettings
@@ -123,11 +123,11 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     """Return the order (V,) of visible Gaussians, and weights alpha T as blocks of pixels; see frozen.h."""
     rows, grid, run = _native.STRIP_ROWS, plan.grid, partial(run_on_plan, "freeze", plan, gaussians)
     counts = torch.zeros(
-        strips(grid.height) * grid.width + 1, dtype=torch.int64
+        count_strips(grid.height) * grid.width + 1, dtype=torch.int64
     )  # a tile has a column at least
     # Counted first, filled afterwards: the rows of a sparse matrix have no size before.
     lanes = run(counts, None, None)
-    starts = counts[: strips(grid.height) * -(-grid.width * rows // lanes) + 1].cumsum(0)
+    starts = counts[: count_strips(grid.height) * -(-grid.width * rows // lanes) + 1].cumsum(0)
     size = int(starts[-1])
     check_memory(size, 4 + lanes * gaussians.means.element_size())
     ranks, weights = torch.empty(size, dtype=torch.int32), gaussians.means.new_empty(size, lanes)

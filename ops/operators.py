@@ -122,7 +122,7 @@ def differentiable(
     return operator(fixed, *tensors)
 
 
-def strips(height: int) -> int:
+def count_strips(height: int) -> int:
     """Count the strips of an image so many rows high."""
     # Rounded up: the last strip may be cut off.
     return -(-height // calls.kernels().STRIP_ROWS)
@@ -147,7 +147,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
         order=means.new_empty(poses, n, dtype=torch.int32),
         shown=means.new_empty(poses, dtype=torch.int32),
         slots=means.new_empty(poses, n + 1, dtype=torch.int64),
-        starts=means.new_empty(poses * strips(grid.height) + 1, dtype=torch.int64),
+        starts=means.new_empty(poses * count_strips(grid.height) + 1, dtype=torch.int64),
         entries=means.new_empty(0, dtype=torch.int32),  # the kernel counts them
     )
     empty = Plan(

@@ -10,13 +10,13 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import run_directory, show_result
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation.open_runs import calibrate_and_store, collect_evidence
 from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.evaluation.table import Column, Interval, Table
-from gsparc.prediction.risk import Guarantee, calibration_facts, run_trials, too_few
+from gsparc.prediction.risk import Guarantee, calibration_facts, explain_too_few, run_trials
 from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
@@ -27,7 +27,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     RunSettings.of(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    settings = plain(config)
+    settings = to_dict(config)
     evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
     # Refused here, before hundreds of draws would fail in the same way.
     if config.confidence != "auto" and config.confidence not in evidence.scores:
@@ -46,7 +46,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_summary(run_dir / "summary.json", facts)
     title = f"{known['dataset/name']}, {known['model/name']}"
     draw_calibration(evidence, divisions, promise, title, run_dir / "confidence.png")
-    few = too_few(len(evidence), promise)
+    few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None else [few]
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)

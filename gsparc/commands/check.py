@@ -37,7 +37,7 @@ def check(
     # Here: they bring torch, which --help does not need.
     from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.plausibility import find_level_steps, link_levels, plausibility_warnings
+    from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 
@@ -52,7 +52,7 @@ def check(
     steps = [] if levels is None else find_level_steps(levels)
     warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
     # Channels and spectra have conventions to be tried, powers of links have levels to be plausible.
-    warnings += convention_warnings(reading.data) if levels is None else plausibility_warnings(levels, steps)
+    warnings += convention_warnings(reading.data) if levels is None else sanity_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):

@@ -14,15 +14,15 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import run_directory, show_result
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.commands.train import read_inputs, train
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.cells import Budget, Contender, plan_cells, plugin_contenders
-from gsparc.evaluation.experiment.fitting import CellResult, PreparedCell, prepare_cell, run_cells
 from gsparc.evaluation.experiment.latency import Latency, time_by_dataset
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
+from gsparc.evaluation.experiment.run_cells import CellResult, PreparedCell, prepare_cell, run_cells
 from gsparc.evaluation.experiment.table import (
     CELL,
     average_cells,
@@ -43,7 +43,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods and report."""
     RunSettings.of(config)
     run_dir = run_directory()
-    settings = plain(config)
+    settings = to_dict(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)
     methods = plugin_contenders() | read_entries("methods", Contender, settings["methods"])

@@ -12,7 +12,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.public.fetch import MIRROR, PublicSet, fetch, public_sets
 
 
-def about(one: PublicSet) -> str:
+def describe_set(one: PublicSet) -> str:
     """Say what a set is, its size and licence, how it is used and cited, and where it comes from."""
     size = one.size if one.sources else "by hand"
     licence = one.licence or "no licence stated: ask its makers before you pass it on"
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     names = [word for word in words if word != "accept=true"]
     for one in () if names else public_sets().values():
-        console.print(about(one), markup=False)
+        console.print(describe_set(one), markup=False)
     for name in names:
         # One by one: what comes after a set that fails is fetched all the same.
         try:

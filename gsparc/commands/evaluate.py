@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
@@ -62,7 +62,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     evaluation, data, split = evaluate_files(
-        paths, plain(config.dataset), plain(config.split), eval_on=config.eval_on, baselines=config.baselines
+        paths,
+        to_dict(config.dataset),
+        to_dict(config.split),
+        eval_on=config.eval_on,
+        baselines=config.baselines,
     )
     # All folds of a run share its configuration, and so its seed.
     seed = checkpoint.read(paths[0]).configuration.get("seed")

@@ -15,7 +15,7 @@ from gsparc.apps.export.along.taps import Trajectory, write_taps
 from gsparc.apps.export.compiled.blob import write_form
 from gsparc.apps.export.compiled.make import FIGURES, compile_model
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times
@@ -76,7 +76,7 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     place, time_s = _places(predictor, config), read_times(config.table)
     if time_s is None:
         raise SettingError(f"table={config.table}: no column time_s [s]")
-    facts = write_taps(predictor, Trajectory(time_s, place), plain(config), folder / "taps.npz")
+    facts = write_taps(predictor, Trajectory(time_s, place), to_dict(config), folder / "taps.npz")
     taps, rate_hz = facts.pop("taps/count"), facts.pop("taps/rate_hz")
     line = (
         f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['taps/residual_db']:.1f} dB of the channels "

@@ -14,10 +14,10 @@ from omegaconf import DictConfig
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import write_summary
-from gsparc.evaluation.table import Table, format_number
+from gsparc.evaluation.table import Table, to_text
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     RunSettings.of(config)
     # Bits, noise and channels of PUSCH are drawn from torch's global generator.
     torch.manual_seed(int(config.seed))
-    run_dir, settings = run_directory(), plain(config)
+    run_dir, settings = run_directory(), to_dict(config)
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
     # Seconds of the experiments alone: reading the data is not theirs.
     started = time.perf_counter()
@@ -72,7 +72,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     rates = [
         [
             f"{level:g}",
-            *(format_number(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
+            *(to_text(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
         ]
         for level in levels
     ]
@@ -81,14 +81,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     if modulations:
         keys = ("ebno_at_bler_0.1", "behind_perfect_db")
         errors = [
-            [
-                label,
-                *(
-                    format_number(facts[f"pusch/{m}/{name}/{key}"], ".2f")
-                    for m in modulations
-                    for key in keys
-                ),
-            ]
+            [label, *(to_text(facts[f"pusch/{m}/{name}/{key}"], ".2f") for m in modulations for key in keys)]
             for name, (label, _, _) in STYLES.items()
             if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
         ]
@@ -100,9 +93,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
     )
     if antennas:
-        beams = [
-            [str(n), *(format_number(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas
-        ]
+        beams = [[str(n), *(to_text(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
         heads = ["antennas", *BEAMS.values()]
         sections.append(Table.of_texts("maximum-ratio beams, all test positions", [], heads, beams))
     return sections

@@ -78,7 +78,7 @@ COMMANDS = {
 }
 
 
-def listed() -> str:
+def list_commands() -> str:
     """List all commands with one line each."""
     width = max(map(len, COMMANDS))
     rows = "".join(f"  {name:<{width}}  {command.answers}\n" for name, command in COMMANDS.items())

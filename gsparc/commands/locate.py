@@ -12,7 +12,7 @@ from gsparc.apps.locate.judging import locate_by_model, report
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
 
 LIMITS = {
@@ -35,7 +35,7 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     if config.dataset.name == "fingerprints":
         localisation = locate_fingerprints(config)
     else:
-        plan = read_plan_settings(plain(config))
+        plan = read_plan_settings(to_dict(config))
         localisation = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
     facts, tables, lines = report(localisation, config.against, run_dir)
     return finish_run(run_dir, facts, *tables, lines=lines)

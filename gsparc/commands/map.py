@@ -14,7 +14,7 @@ from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
 from gsparc.apps.maps.promised import map_notes, read_or_gather
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
@@ -60,7 +60,7 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
 def task(config: DictConfig) -> dict[str, Any]:
     """Map, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
-    run_dir, settings = run_directory(), plain(config)
+    run_dir, settings = run_directory(), to_dict(config)
     floor = read_plan_settings(settings)
     predictor = load(config.ckpt)
     how = PromiseSettings(**settings["promise"])
@@ -92,7 +92,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if check_geotiff(config.geotiff):
         write_geotiff(run_dir / "map.tif", field, predictor.site.georeference)
     facts = {
-        **field.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
+        **field.summarise(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
         "promise/calibrated": int(promise is not None), **peak_memory(),
     }  # fmt: skip

@@ -10,7 +10,7 @@ from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promised import read_or_gather, reopen_training
 from gsparc.commands.shared.output import coordinates, finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation.summary import write_samples
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
@@ -20,7 +20,7 @@ from gsparc.prediction.operating_point import load
 def task(config: DictConfig) -> dict[str, Any]:
     """Try candidates, draw and write; returns the facts of `summary.json`."""
     RunSettings.of(config)
-    run_dir, settings, path = run_directory(), plain(config), str(config.ckpt)
+    run_dir, settings, path = run_directory(), to_dict(config), str(config.ckpt)
     stored = checkpoint.read(path)
     if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored

@@ -14,7 +14,7 @@ from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promised import read_or_gather
 from gsparc.commands.map import settings_of, stations_of
 from gsparc.commands.shared.output import coordinates, finish_run, run_directory
-from gsparc.commands.shared.settings import plain
+from gsparc.commands.shared.settings import to_dict
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
 
@@ -22,7 +22,7 @@ from gsparc.prediction.operating_point import load
 def task(config: DictConfig) -> dict[str, Any]:
     """Choose, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
-    run_dir, settings = run_directory(), plain(config)
+    run_dir, settings = run_directory(), to_dict(config)
     floor = read_plan_settings(settings)
     # Before anything is measured there is no model, and places are spread over the area.
     predictor = None if config.ckpt is None else load(config.ckpt)

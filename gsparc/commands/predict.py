@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation.answers import predict_file
 from gsparc.prediction.operating_point import load
 
@@ -17,7 +17,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     RunSettings.of(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     station = None if config.station is None else str(config.station)
-    how: dict[str, Any] = {"columns": plain(config.columns), "overwrite": bool(config.overwrite)}
+    how: dict[str, Any] = {"columns": to_dict(config.columns), "overwrite": bool(config.overwrite)}
     facts = predict_file(predictor, config.places, config.out, station=station, **how)
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:

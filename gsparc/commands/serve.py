@@ -21,7 +21,7 @@ from gsparc.prediction.operating_point import load
 OTHERS = 64  # files that are open beside connections: the log, libraries
 
 
-def loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     """Tell whether a host is this machine itself, which nobody else reaches."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
@@ -35,7 +35,7 @@ def task(config: DictConfig) -> None:
     whole(0, 65535).check("port", config.port)
     token = config.token or os.environ.get("GSPARC_TOKEN")
     # Without a token only this machine's own users may be answered.
-    if not token and not loopback(config.host):
+    if not token and not is_loopback(config.host):
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")

@@ -12,12 +12,12 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import run_directory
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation import simulated, summary
 from gsparc.evaluation.console import open_console
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.effects import from_config as effects_from_config
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.report import choice_table, closing_sentences, summary_facts
@@ -35,7 +35,7 @@ def campaign(config: DictConfig) -> Campaign:
     Raises:
         ValueError: a setting that does not exist or cannot be.
     """
-    settings = plain(config)
+    settings = to_dict(config)
     return Campaign(
         scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
         SpectrumSettings(**settings["spectrum"]), ArraySettings(**settings["csi"]),
@@ -44,7 +44,7 @@ def campaign(config: DictConfig) -> Campaign:
     )  # fmt: skip
 
 
-def _effects(config: dict[str, Any]) -> PropagationEffects | AutoSettings:
+def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
     # Effects that are to be chosen among stand under `full`; without it they are given.
     if "full" not in config:
         return effects_from_config(config)

@@ -14,7 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.done import State, measurements_hash
@@ -34,7 +34,7 @@ def variants_of(config: DictConfig) -> dict[str, Callable[[], MethodFactory]]:
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
     variants = {
         str(name): partial(build, OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
-        for name, overrides in plain(config.variants).items()
+        for name, overrides in to_dict(config.variants).items()
     }
     return variants | {name: method_class(name) for name in config.baselines}
 
@@ -56,8 +56,8 @@ def task(config: DictConfig) -> pd.DataFrame:
     build(config.model)  # its parts check themselves
     run_dir = run_directory()
     study = study_of(config)
-    data = load(plain(config.dataset))
-    split = split_for(plain(config.split), data)
+    data = load(to_dict(config.dataset))
+    split = split_for(to_dict(config.split), data)
     try:
         # Rounds that were done on other data, splits or settings do not count as these.
         state = State.of(config, measurements_hash(data), split.sha256)

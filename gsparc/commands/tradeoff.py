@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish_run, in_multirun, run_directory
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import plain
+from gsparc.commands.shared.settings import to_dict
 from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
@@ -25,9 +25,9 @@ from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
-from gsparc.models.reduced import reduce_method, setting_combinations
+from gsparc.models.reduced import list_settings, reduce_method
 from gsparc.prediction import operating_point
-from gsparc.prediction.pareto import Point, front
+from gsparc.prediction.pareto import Point, pareto_front
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, reference_copy
 from gsparc.training import tracking
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 def task(config: DictConfig) -> dict[str, Any]:
     """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
-    run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
+    run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
     state = State.of(config, measurements_hash(run.data), run.split.sha256)
     trained = run.stored[0].extra.get("run_id")  # the front is stored in the file itself, which changes it
     state = replace(state, files=state.files | ({"ckpt": trained} if trained else {}))
@@ -53,7 +53,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = method.reduction_inputs(data, learned)
-    settings = list(setting_combinations(method, plain(config.grid)))
+    settings = list(list_settings(method, to_dict(config.grid)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
@@ -61,14 +61,14 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     others = tradeoff.fit_others(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
-    clocks = {name: Predictor(one.methods[0], data.site).cycling(places) for name, one in others.items()}
+    clocks = {name: Predictor(one.methods[0], data.site).cycle_places(places) for name, one in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.measure_candidates(candidates, threads, data, fold, **how)
     figure = DECIDING[data.site.scored]
-    pareto = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
+    pareto = pareto_front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     # Stored points are chosen by closeness to the full model, which uses no measured value of tested rows.
-    chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
+    chosen = pareto_front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         operating_point.store_points(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
@@ -96,7 +96,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     finish_run(run_dir, facts, sheet, lines=tradeoff.why_irreducible(method))
     # A front of one model's points alone would hide that another method is as fast and better.
     for p in best:
-        other = tradeoff.beaten_by(p, beside, figure)
+        other = tradeoff.find_better(p, beside, figure)
         if other is not None:
             log.warning("%s: %s is as fast and better", p.label, other)
 

@@ -31,7 +31,7 @@ from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
-from gsparc.evaluation.console import plain
+from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.done import (
@@ -43,7 +43,7 @@ from gsparc.evaluation.experiment.done import (
 )  # fmt: skip
 from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
-from gsparc.evaluation.metric_formats import deciding_figure, score_of
+from gsparc.evaluation.metric_formats import main_figure, score_of
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
@@ -115,9 +115,9 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     RunSettings.of(config)
     tracking.refuse_missing_loggers(config)
     watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
-    with heeded.recording(reads):
+    with heeded.record_reads(reads):
         module = _data(config, known)
-        return RunInputs(method, module, split_for(plain(config.split), module.measurements), reads, watch)
+        return RunInputs(method, module, split_for(to_dict(config.split), module.measurements), reads, watch)
 
 
 def train(
@@ -154,7 +154,7 @@ def train(
         with tracking.open_loggers(config) as loggers:
             whole = fit_context(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
             contexts = _of_folds(whole, split, resumes, begun.watch.spent)
-            with heeded.recording(reads), _advising(contexts):
+            with heeded.record_reads(reads), _advising(contexts):
                 # `Method.fit` of every fold; what takes gradient steps (models/splat/method.py) makes the
                 # Trainer of `config.trainer` there and calls `trainer.fit(module, datamodule)`.
                 keep = partial(_keep, data, split, contexts, run_id)
@@ -171,7 +171,7 @@ def train(
 
             facts = {**evaluation.facts, **summary.provenance(), **_of_fits(fits)}
             facts |= {"run_id": run_id, "seed": int(config.seed), "options/unused": unused}
-            facts["program"] = program_hash(plain(config))
+            facts["program"] = program_hash(to_dict(config))
             files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
             objects = TrainedRun(fits.methods, files, data, split, evaluation)
             if in_full:
@@ -300,8 +300,8 @@ def _keep(
     for note in report.notes:
         log_of_models.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if not curve.read(context.run_dir):  # a method that trains in one piece
-        context.curve(report.seconds, fitted.name)
-    marks = fitting.checkpoint_marks(report, data, split.folds[number], context)
+        context.log_curve(report.seconds, fitted.name)
+    marks = fitting.run_marks(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
@@ -310,7 +310,7 @@ def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
     """Its name where a baseline of that name would be fitted in the same way."""
     plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
     kind = all_methods().get(method.name)
-    same = kind is not None and plain(config.model) == config_node(import_target(kind))
+    same = kind is not None and to_dict(config.model) == config_node(import_target(kind))
     return method.name if plainly and same else None
 
 
@@ -320,7 +320,7 @@ def _of_fits(fits: FoldFits) -> dict[str, Any]:
     said = [note for note in fits.notes if not isinstance(note, Caution)]  # those were warnings
     facts["model/learned"] = "\n".join(said) or None
     if fits.cost.stages:
-        facts |= {"time/cost": fits.cost.described(fits.limited_by), "time/unused_s": fits.cost.unused_s}
+        facts |= {"time/cost": fits.cost.describe(fits.limited_by), "time/unused_s": fits.cost.unused_s}
     return facts
 
 
@@ -376,7 +376,7 @@ def task(config: DictConfig) -> float:
                 title = f"{made}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 show_result(run_dir, table, lines=summary.remarks(facts, config.eval_on))
-    figure = deciding_figure(facts, config.eval_on)
+    figure = main_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:
         return score_of(figure, value)

@@ -16,7 +16,7 @@ from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, plane_grid
 from gsparc.apps.view.viewed import open_model
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, plain
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import whole
@@ -33,7 +33,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     save = None if config.save is None else Path(str(config.save))
     # Before model and data are read, which takes seconds.
     check(save, int(config.port))
-    view = view_of(plain(config))
+    view = view_of(to_dict(config))
     end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
     viewed, site = view.viewed, view.viewed.site
     facts = {

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
-from gsparc.data.errors import DataError, suggest_nearest
+from gsparc.data.errors import DataError, suggest_name
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 
@@ -161,7 +161,7 @@ def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurement
     """
     chosen = set(names)
     for name in chosen - set(CONVENTIONS):
-        hint = suggest_nearest(name, CONVENTIONS, 0.4)
+        hint = suggest_name(name, CONVENTIONS, 0.4)
         raise DataError(f"conventions: {name!r} is none of {', '.join(CONVENTIONS)}{hint}")
     # In the table's order, not the user's: axes are exchanged before what runs along them is turned.
     for name in [name for name in CONVENTIONS if name in chosen]:

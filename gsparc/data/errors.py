@@ -60,7 +60,7 @@ def name_row_ranges(rows: Sequence[str], count: int = 5) -> str:
     return list_first(pieces, count)
 
 
-def suggest_nearest(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
+def suggest_name(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     """Return `; did you mean 'gp'?`, or nothing when no known name is close."""
     close = difflib.get_close_matches(name, known, 1, cutoff)
     return f"; did you mean {close[0]!r}?" if close else ""

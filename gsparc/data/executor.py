@@ -104,7 +104,7 @@ def run_each(
     elif not uses_other_processes():
         results = _in_threads(lambda number: (number, work(pieces[number])), numbers, threads)
     else:
-        blob = cloudpickle.dumps((heeded.carried(work), os.getcwd(), torch.get_num_threads()))
+        blob = cloudpickle.dumps((heeded.return_with_reads(work), os.getcwd(), torch.get_num_threads()))
         results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
     with closing(results):  # what has begun is cancelled
         for count, (number, result) in enumerate(results, 1):
@@ -116,7 +116,7 @@ def run_each(
             if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
                 logged, left = now, whole - (now - began)
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
-            yield number, heeded.brought(result) if uses_other_processes() else result
+            yield number, heeded.take_result(result) if uses_other_processes() else result
 
 
 @lru_cache(maxsize=1)

@@ -1,7 +1,7 @@
 """Which options a run heeds: classes of settings note what is read of them while a method fits and predicts.
 
 What is read where nothing follows from it does not count: checks of values, copies, stored states. What only
-a part reads counts when the part has weight (`apart`, `count`).
+a part reads counts when the part has weight (`set_apart`, `count`).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _reads: Reads | None = None
 
 
 @contextmanager
-def recording(reads: Reads) -> Iterator[None]:
+def record_reads(reads: Reads) -> Iterator[None]:
     """Note in `reads` what is read meanwhile, here and in processes that `executor.run_each` starts."""
     global _reads
     before, _reads = _reads, reads
@@ -94,7 +94,7 @@ def _same(value: Any, configured: Any) -> bool:
 
 
 @contextmanager
-def apart() -> Iterator[set[str]]:
+def set_apart() -> Iterator[set[str]]:
     """Note what is read within in a set of its own, which counts when it is given to `count`."""
     reads = _reads or Reads(())
     outer, reads.noted = reads.noted, set()
@@ -104,24 +104,24 @@ def apart() -> Iterator[set[str]]:
         reads.noted = outer
 
 
-def count(*paths: str) -> None:
+def count_reads(*paths: str) -> None:
     """Count these as heeded, as in `Reads.noted`."""
     if _reads is not None:
         _reads.noted.update(paths)
 
 
-def carried(work: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, set[str]]]:
-    """Return work for other processes, with what is read there; see `brought`."""
+def return_with_reads(work: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, set[str]]]:
+    """Return work for other processes, with what is read there; see `take_result`."""
     options = () if _reads is None else _reads.options
 
     def there(piece: Any) -> tuple[Any, set[str]]:
-        with recording(own := Reads(options)):
+        with record_reads(own := Reads(options)):
             return work(piece), own.noted
 
     return there
 
 
-def brought(result: tuple[Any, set[str]]) -> Any:
-    """Return the result of work that was `carried`."""
-    count(*result[1])
+def take_result(result: tuple[Any, set[str]]) -> Any:
+    """Return the result of work that was `return_with_reads`."""
+    count_reads(*result[1])
     return result[0]

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from gsparc.data import spacing
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements, TrainTest
-from gsparc.data.spacing import nearest_neighbour_distance
+from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import CORNERS, AnySplit, FileSettings, Fold, SplitSettings, make_split
 
 Draws = np.random.Generator
@@ -92,16 +92,14 @@ def inner_folds(
         cut = _cut(where, settings, count, rng)
     else:
         which = np.arange(len(known))  # folds of rows, not of places
-    folds = tuple(one.each(lambda part: known[np.isin(which, part)]) for one in cut.folds)
+    folds = tuple(one.map(lambda part: known[np.isin(which, part)]) for one in cut.folds)
     units = np.full(len(positions), NOT_TESTED)
     tested = np.isin(known, np.concatenate([one.test for one in folds]))
     units[known[tested]] = cut.unit[which][tested]
     return InnerFolds(cut.name, folds, units)
 
 
-def cut_inner_folds(
-    data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int
-) -> InnerFolds:
+def cut_folds(data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int) -> InnerFolds:
     """Return `inner_folds` of measurements.
 
     Where both ends are taken for moving only because stations are learned together, what moves is the other
@@ -148,7 +146,7 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
         return settings
     places = positions[fold.train]
     gap = float(np.median(cKDTree(places).query(positions[fold.val])[0]))
-    if not gap > FARTHER * (nearest_neighbour_distance(places) or gap):
+    if not gap > FARTHER * (neighbour_distance(places) or gap):
         return settings
     known = np.sort(np.concatenate([fold.train, fold.val]))
     where = positions[known]
@@ -205,11 +203,7 @@ def _pieces(places: int, settings: SplitSettings, count: int, rng: Draws) -> Ite
 
 
 def _draws(
-    where: np.ndarray,
-    settings: SplitSettings,
-    count: int,
-    rng: Draws,
-    station: np.ndarray | None = None,
+    where: np.ndarray, settings: SplitSettings, count: int, rng: Draws, station: np.ndarray | None = None
 ) -> tuple[Fold, ...]:
     """`count` distinct draws of a split by seeds of their own, each with the fewest rows again."""
     seeds = rng.integers(2**31, size=DRAWS * count)
@@ -226,7 +220,7 @@ def _draws(
 def _stations(station: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> InnerFolds | None:
     """Folds of rows of stations or runs (n,) that leave out whole ones; None where there is one alone."""
     number, name = int(station.max()) + 1, settings.name
-    together = max(min(settings.together(number), number - 2), 0)
+    together = max(min(settings.held_out_count(number), number - 2), 0)
     settings = replace(settings, name="stations", leave_out=together)
     where = np.zeros((len(station), 3))
     if number == 1:

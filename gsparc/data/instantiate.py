@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
 
-from gsparc.data.errors import DataError, suggest_nearest
+from gsparc.data.errors import DataError, suggest_name
 from gsparc.data.limits import SettingError
 
 _Kind = TypeVar("_Kind")
@@ -18,7 +18,7 @@ _Kind = TypeVar("_Kind")
 def suggest_or_list(name: str, known: Iterable[str]) -> str:
     """Return `; did you mean 'gp'?`, or what there is when nothing is close."""
     known = list(known)
-    return suggest_nearest(name, known) or f"; there are {', '.join(sorted(known))}"
+    return suggest_name(name, known) or f"; there are {', '.join(sorted(known))}"
 
 
 def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun: str = "setting") -> _Kind:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import DataError, suggest_nearest
+from gsparc.data.errors import DataError, suggest_name
 
 
 class SettingError(DataError):
@@ -40,7 +40,7 @@ class Limit:
         """Raise `SettingError` unless `value` is allowed for the setting called `name`."""
         if self.holds(value):
             return
-        hint = suggest_nearest(value, self.known) if isinstance(value, str) else ""
+        hint = suggest_name(value, self.known) if isinstance(value, str) else ""
         raise SettingError(f"{name}={value!r}: {self.words} is needed{hint}")
 
 

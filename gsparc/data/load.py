@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data import spacing
 from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError, suggest_nearest
+from gsparc.data.errors import DataError, suggest_name
 from gsparc.data.instantiate import (
     accepted_arguments,
     from_settings,
@@ -144,7 +144,7 @@ def _choices() -> dict[str, DictConfig]:
 
 def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     if str(name) not in choices:
-        hint = suggest_nearest(str(name), choices, 0.4)
+        hint = suggest_name(str(name), choices, 0.4)
         raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")
     return choices[str(name)]
 

@@ -50,9 +50,9 @@ class Snapshots:
         empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
         antenna, places = column * target.shape[1], data.moving[rows[first]]
         one = cls(rows, moment, antenna, names, places, empty, tones - tones.mean(), run)
-        return replace(one, values=one.arranged(target))
+        return replace(one, values=one.arrange(target))
 
-    def arranged(self, rows: np.ndarray) -> np.ndarray:
+    def arrange(self, rows: np.ndarray) -> np.ndarray:
         """Return values (n, A, K) by moment and antenna of channels (S, a, K) of the same rows."""
         values = np.zeros_like(self.values)
         for offset in range(rows.shape[1]):

@@ -113,7 +113,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         DataError: all problems, with array and row.
     """
     check = Checker(raw, str(source))
-    check.names()
+    check.check_names()
     measured = check.measurement()
     about = _attributes(check, Path(source).stem, measured)
     links = None if measured is None else expand_links(check, measured, part)
@@ -130,33 +130,33 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     if values is None:
         # Positions are checked all the same, so that one message lists everything that is wrong.
         for name in ("rx_position", "tx_position"):
-            check.position(name, None)
+            check.read_positions(name, None)
         check.problems.raise_if_any()
     assert values is not None
     rows = len(values)
-    row_names = links.named(check.name_rows(rows))
+    row_names = links.name_rows(check.name_rows(rows))
     check.row_names = row_names
-    ends = {end: check.position(f"{end}_position", rows) for end in ("rx", "tx")}
-    rotation = check.rotation(rows)
-    given_mask = check.mask(raw.arrays[measured].shape, links.censored)
+    ends = {end: check.read_positions(f"{end}_position", rows) for end in ("rx", "tx")}
+    rotation = check.read_rotation(rows)
+    given_mask = check.read_mask(raw.arrays[measured].shape, links.censored)
     mask = None if given_mask is None else given_mask.reshape(values.shape)
-    frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
+    frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
     named = str(raw.attributes.get("conventions", "")).split()
     # Transposed images: their grid is that of the axes as they will be.
     turned = values.shape[:0:-1] if "transposed" in named else values.shape[1:]
-    grid = check.grid(*turned) if kind == "spectrum" else None
+    grid = check.read_grid(*turned) if kind == "spectrum" else None
     antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
-    array = check.real("array_position", (antennas, 3))
+    array = check.read_real("array_position", (antennas, 3))
     if array is not None:
         antenna = [f"antenna {i}" for i in range(len(array))]
-        check_positions(check.problems, check.where("array_position"), array, antenna)
+        check_positions(check.problems, check.describe_array("array_position"), array, antenna)
     noise = _not_negative(check, "noise_variance", rows)
     # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":
         check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
     position_std = _not_negative(check, "position_std", rows)
-    offsets = check.ragged(rows)
-    release_split = check.release_split(rows)
+    offsets = check.read_ragged(rows)
+    release_split = check.read_split(rows)
     _in_range(check, measured, values, mask)
     if all(one is not None for one in (*ends.values(), rotation)):
         _static(check, links, ends, rotation)
@@ -236,7 +236,7 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
 def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
     kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    array = check.array(name, *SHAPES[kind])
+    array = check.read_array(name, *SHAPES[kind])
     if array is None:
         return None, kind
     if kind == "csi" and array.size:
@@ -256,7 +256,7 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
 
 def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
     """An array () or (S,) as (S,) float64."""
-    array = check.real(name, (), (rows,))
+    array = check.read_real(name, (), (rows,))
     if array is None:
         return None
     values = np.broadcast_to(array, (rows,)).copy()
@@ -339,11 +339,11 @@ def _directions(
     check: Checker, offsets: np.ndarray | None, rx: np.ndarray, rotation: np.ndarray
 ) -> list[np.ndarray] | None:
     """Unit vectors (paths, 3) of each sample in the receiver's frame."""
-    present = check.given("path_direction", "path_last_point")
+    present = check.present("path_direction", "path_last_point")
     if offsets is None or not present:
         return None
     name = present[0]
-    vectors = check.real(name, (int(offsets[-1]), 3))
+    vectors = check.read_real(name, (int(offsets[-1]), 3))
     if vectors is None:
         return None
     owner = np.repeat(np.arange(len(rx)), np.diff(offsets))
@@ -356,7 +356,7 @@ def _directions(
     bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
     if len(bad):
         paths, expected = (f"path {i}" for i in bad), "expected a direction that is not zero"
-        return check.problems.add_rows(check.where(name), paths, expected)
+        return check.problems.add_rows(check.describe_array(name), paths, expected)
     return np.split((vectors / length[:, None]).astype(np.float32), offsets[1:-1])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.assemble import check_positions
-from gsparc.data.errors import Problems, suggest_nearest
+from gsparc.data.errors import Problems, suggest_name
 from gsparc.data.raw import Raw
 from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
 from gsparc.ops import SphereGrid
@@ -40,25 +40,25 @@ class Checker:
         self.unknown: str | None = None  # a position that nobody gave
         self.sizes: dict[str, int] = {}  # of axes by their letter
 
-    def where(self, name: str) -> str:
+    def describe_array(self, name: str) -> str:
         """Say how messages name an array of this file."""
         return f"{self.source}, {name}"
 
     def refuse(self, name: str, what: str) -> Any:
         """Note what is wrong with an array; returns None, so that a check can end with it."""
-        self.problems.add(self.where(name), what)
+        self.problems.add(self.describe_array(name), what)
 
     def refuse_rows(self, name: str, bad: np.ndarray, what: str) -> bool:
         """Note `what` for the rows of an array where `bad` (S, ...) has a True; returns whether one does."""
         rows = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
-        self.problems.add_rows(self.where(name), (self.row_names[i] for i in rows), what)
+        self.problems.add_rows(self.describe_array(name), (self.row_names[i] for i in rows), what)
         return len(rows) > 0
 
-    def given(self, *names: str) -> list[str]:
+    def present(self, *names: str) -> list[str]:
         """Return those of `names` that the file holds."""
         return [name for name in names if name in self.raw.arrays]
 
-    def names(self) -> None:
+    def check_names(self) -> None:
         """Refuse misspelt names and foreign units; note that other unknown names are ignored.
 
         Raises:
@@ -73,12 +73,10 @@ class Checker:
                 shapes = FIELDS[name].shapes
                 # Channels and spectra may have an axis of stations behind that of rows.
                 shapes += [(*shape, None) for shape in shapes] if name in ("csi", "spectrum") else []
-                sound &= self.array(name, *shapes) is not None
+                sound &= self.read_array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
-            if hint := suggest_nearest(
-                name, [known for known in FIELDS if known not in self.raw.arrays], 0.6
-            ):
+            if hint := suggest_name(name, [known for known in FIELDS if known not in self.raw.arrays], 0.6):
                 self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")
@@ -87,7 +85,7 @@ class Checker:
 
     def measurement(self) -> str | None:
         """Choose spectrum, csi, rssi or rssi_db: the only one, or the one that an attribute names."""
-        present, named = self.given(*MEASUREMENTS), self.raw.attributes.get("measurement")
+        present, named = self.present(*MEASUREMENTS), self.raw.attributes.get("measurement")
         if named is not None and named not in present:
             there = " and ".join(present) or "none of these"
             self.refuse("measurement", f"{named!r} names no measurement of this file, which holds {there}")
@@ -103,11 +101,11 @@ class Checker:
         """Return what messages call each row: `row_name`, or its number."""
         names = self.raw.arrays.get("row_name")
         self.row_names = [f"row {i}" for i in range(rows)]
-        if names is not None and self.fits("row_name", names, (rows,)):
+        if names is not None and self.has_shape("row_name", names, (rows,)):
             self.row_names = [str(name) for name in names]
         return self.row_names
 
-    def array(self, name: str, *shapes: Shape, kinds: str | None = None) -> np.ndarray | None:
+    def read_array(self, name: str, *shapes: Shape, kinds: str | None = None) -> np.ndarray | None:
         """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
         array, kinds = self.raw.arrays.get(name), kinds or KINDS.get(name, REAL)
         if array is None:
@@ -116,14 +114,14 @@ class Checker:
         wide = kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
         if array.dtype.kind not in kinds or wide:
             return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
-        return array if self.fits(name, array, *shapes) else None
+        return array if self.has_shape(name, array, *shapes) else None
 
-    def real(self, name: str, *shapes: Shape) -> np.ndarray | None:
+    def read_real(self, name: str, *shapes: Shape) -> np.ndarray | None:
         """Return the same as float64."""
-        array = self.array(name, *shapes)
+        array = self.read_array(name, *shapes)
         return None if array is None else array.astype(np.float64)
 
-    def fits(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
+    def has_shape(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
         """Tell whether `array` has one of `shapes`, letters for sizes found before; note it when not."""
         wanted = [tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes]
         if not wanted or any(_fits(array.shape, shape) for shape in wanted):
@@ -137,12 +135,12 @@ class Checker:
         self.refuse(name, f"expected shape {known}{here}, {fault}")
         return False
 
-    def position(self, name: str, rows: int | None) -> np.ndarray | None:
+    def read_positions(self, name: str, rows: int | None) -> np.ndarray | None:
         """Return (S, 3) or (3,) float64 [m]."""
         if name not in self.raw.arrays:
             remedy = "; or say dataset.tx_position=[X,Y,Z]" if name == "tx_position" else ""
             return self.refuse(name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]{remedy}")
-        array = self.real(name, (3,), (rows, 3))
+        array = self.read_real(name, (3,), (rows, 3))
         if array is None:
             return None
         rows_named = self.row_names or [f"row {i}" for i in range(len(array))]
@@ -151,7 +149,7 @@ class Checker:
         # Places that nobody gave are NaN on purpose and pass unchecked.
         if name == self.unknown:
             return array
-        if check_positions(self.problems, self.where(name), known, names):
+        if check_positions(self.problems, self.describe_array(name), known, names):
             return None
         stored = self.raw.arrays[name]
         # Distance to the next number: at a UTM northing of 5,000 km float32 has steps of half a metre.
@@ -163,9 +161,9 @@ class Checker:
             )
         return array
 
-    def mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
+    def read_mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
         """Return bool, like the measurement; None: all was measured. Only `censored` rows may be empty."""
-        array = self.array("mask", shape)
+        array = self.read_array("mask", shape)
         if array is None:
             return None
         if not np.isin(array, (0, 1)).all():
@@ -178,13 +176,13 @@ class Checker:
         self.refuse_rows("mask", empty, "nothing measured; expected a True, or drop the row")
         return mask
 
-    def frequencies(self, count: int | None) -> tuple[np.ndarray | None, float | None]:
+    def read_frequencies(self, count: int | None) -> tuple[np.ndarray | None, float | None]:
         """Return (K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` (None without csi)."""
-        frequency = self.real("frequency_hz", (), (None,) if count is None else (count,))
+        frequency = self.read_real("frequency_hz", (), (None,) if count is None else (count,))
         if count is not None and "frequency_hz" not in self.raw.arrays:
             fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"
             self.refuse("frequency_hz", fault)
-        carrier = self.real("carrier_hz", ())
+        carrier = self.read_real("carrier_hz", ())
         if frequency is not None and carrier is not None and frequency.size:
             away = np.abs(frequency)
             if 2 * away.max() < carrier and away.min() <= np.ptp(frequency):  # values in MHz are far from 0
@@ -211,9 +209,9 @@ class Checker:
             return None, None
         return np.atleast_1d(frequency), float(frequency.mean() if carrier is None else carrier)
 
-    def rotation(self, rows: int) -> np.ndarray | None:
+    def read_rotation(self, rows: int) -> np.ndarray | None:
         """Return (S, 3, 3) local to world; the identity when the file says nothing."""
-        present = self.given("rx_orientation", "rx_rotation")
+        present = self.present("rx_orientation", "rx_rotation")
         # Two statements of one rotation can disagree, and nothing says which is right.
         if len(present) == 2:
             fault = "rx_orientation and rx_rotation are both given; expected one of them"
@@ -221,30 +219,32 @@ class Checker:
         if not present:
             return np.tile(np.eye(3), (rows, 1, 1))
         shape = (4,) if present == ["rx_orientation"] else (3, 3)
-        values = self.real(present[0], shape, (rows, *shape))
+        values = self.read_real(present[0], shape, (rows, *shape))
         if values is None:
             return None
         values = np.broadcast_to(values, (rows, *shape))
         if present == ["rx_rotation"]:
             expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
             return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
-        return self.turned("rx_orientation", values, self.row_names)
+        return self.to_matrices("rx_orientation", values, self.row_names)
 
-    def turned(self, name: str, values: np.ndarray, rows: Sequence[str]) -> np.ndarray | None:
+    def to_matrices(self, name: str, values: np.ndarray, rows: Sequence[str]) -> np.ndarray | None:
         """Return rotations (n, 3, 3) of quaternions (n, 4) of an array."""
         good = is_unit(values)
         bad = (
             f"{rows[i]} = {np.array2string(values[i], separator=', ')}"
             for i in np.flatnonzero(~good).tolist()
         )
-        self.problems.add_rows(self.where(name), bad, "expected a quaternion (w, x, y, z) of length 1")
+        self.problems.add_rows(
+            self.describe_array(name), bad, "expected a quaternion (w, x, y, z) of length 1"
+        )
         return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
 
-    def grid(self, height: int, width: int) -> SphereGrid | None:
+    def read_grid(self, height: int, width: int) -> SphereGrid | None:
         """Return directions of the pixels; by default row i, column j at i and j steps from the horizon."""
         if "grid_deg" not in self.raw.arrays:
             return SphereGrid.hemisphere(height, width)
-        values = self.real("grid_deg", (4,))
+        values = self.read_real("grid_deg", (4,))
         if values is None:
             return None
         elevation, _, elevation_step, azimuth_step = values
@@ -260,12 +260,12 @@ class Checker:
             return self.refuse("grid_deg", f"{fault}; expected at most 360 in all")
         return SphereGrid(height, width, *(math.radians(v) for v in values))
 
-    def ragged(self, rows: int) -> np.ndarray | None:
+    def read_ragged(self, rows: int) -> np.ndarray | None:
         """Return path_offsets (S + 1,) int64."""
-        per_path = self.given(*(n for n in FIELDS if n.startswith("path_") and n != "path_offsets"))
+        per_path = self.present(*(n for n in FIELDS if n.startswith("path_") and n != "path_offsets"))
         if per_path and "path_offsets" not in self.raw.arrays:
             return self.refuse("path_offsets", f"missing, but {per_path[0]} is given")
-        offsets = self.array("path_offsets", (rows + 1,))
+        offsets = self.read_array("path_offsets", (rows + 1,))
         if offsets is None:
             return None
         # Cast first: differences of unsigned integers wrap around and never are negative.
@@ -277,9 +277,9 @@ class Checker:
                 return self.refuse(name, f"expected {count} paths as path_offsets says, found {shape}")
         return offsets.astype(np.int64)
 
-    def release_split(self, rows: int) -> TrainTest | None:
+    def read_split(self, rows: int) -> TrainTest | None:
         """Return (train, test) rows that the file names, or None."""
-        names = self.given("split_train", "split_test")
+        names = self.present("split_train", "split_test")
         if len(names) == 1:
             self.problems.add(self.source, f"{names[0]} is given alone; expected split_train and split_test")
         if len(names) < 2:
@@ -298,7 +298,7 @@ class Checker:
         return parts[0], parts[1]
 
     def _refuse_numbers(self, name: str, rows: np.ndarray, what: str) -> None:
-        self.problems.add_rows(self.where(name), (f"row {i}" for i in rows), what)
+        self.problems.add_rows(self.describe_array(name), (f"row {i}" for i in rows), what)
 
 
 UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this they are refused

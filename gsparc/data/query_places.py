@@ -150,23 +150,23 @@ def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
 def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> Sheet:
     """Arrays of places as columns of a table; where one end moves they need not name it."""
     check, columns, alone = Checker(raw, source), dict[str, np.ndarray | None](), len(moving) == 1
-    pair = check.given("latitude", "longitude") if alone else []
+    pair = check.present("latitude", "longitude") if alone else []
     for end in moving:
         before, named = ("", True) if alone else (f"{end}_", False)
-        position = check.given(f"{end}_position", *["position"] * named)[:1]
+        position = check.present(f"{end}_position", *["position"] * named)[:1]
         if len(position) + len(pair) / 2 != 1:
             fault = f"{end}_position" + ", or latitude and longitude" * alone
             found = " and ".join([*position, *pair]) or "no places"
             raise DataError(f"{source}: of the {ENDS[end]} expected {fault}; found {found}")
         # Two columns are x and y without a height, which `with_heights` fills later.
         for name in position:
-            places = check.real(name, (2,), (3,), (None, 2), (None, 3))
+            places = check.read_real(name, (2,), (3,), (None, 2), (None, 3))
             axes = () if places is None else np.atleast_2d(places).T
             columns |= {f"{before}{axis}": values for axis, values in zip("xyz", axes, strict=False)}
-        columns |= {name: check.real(name, (), (None,)) for name in pair}
-        for name in check.given(f"{end}_height", *["height"] * named):
+        columns |= {name: check.read_real(name, (), (None,)) for name in pair}
+        for name in check.present(f"{end}_height", *["height"] * named):
             if f"{before}z" not in columns:  # a second statement of it is not read
-                columns[f"{before}z"] = check.real(name, (), (None,))
+                columns[f"{before}z"] = check.read_real(name, (), (None,))
     check.problems.raise_if_any()
     station, names = raw.arrays.get("station"), raw.arrays.get("station_name")
     # Numbers refer to the file's own list, text to the model's names.

@@ -189,7 +189,7 @@ def _read_npz(path: Path) -> Raw:
     with readable(path, "cannot be read", OSError):
         if not is_archive(path):  # numpy would take anything else for a pickle and speak of that
             raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
-    refuse_sizes(path, _stated_npz(path))
+    check_array_sizes(path, _stated_npz(path))
     try:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
@@ -237,7 +237,7 @@ def _datasets(path: Path, to_disk: bool = False) -> Iterator[tuple[h5py.File, di
         known = {name: one for name, one in items.items() if one.size is not None}
         # What lies in one piece takes nothing that is not in the file.
         stated = {name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in known.items()}
-        refuse_sizes(path, stated, to_disk)
+        check_array_sizes(path, stated, to_disk)
         yield file, items
 
 
@@ -303,7 +303,7 @@ SPARE = 2**30  # bytes of disk that other programs keep; of memory half, for wha
 Stated = dict[str, tuple[tuple[int, ...], int]]  # shapes, and bytes that are taken when they are read
 
 
-def refuse_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
+def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
     """Raise DataError before an array is read that the file cannot hold, or for which there is no room.
 
     Args:

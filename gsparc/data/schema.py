@@ -88,7 +88,7 @@ class Links:
     unknown_transmitter: bool = False
     georeference: Georeference | None = None
 
-    def named(self, rows: list[str]) -> list[str]:
+    def name_rows(self, rows: list[str]) -> list[str]:
         """Return names (S,) of rows, with their stations."""
         if self.stations is None or self.station is None:
             # A row of a file of links is a place and a station; the place alone would name several rows.
@@ -311,7 +311,7 @@ class Measurements:
             return np.hstack([self.tx, self.rx_position])
         return self.tx if self.site.moving_end == "tx" else self.rx_position
 
-    def side(self, rows: np.ndarray) -> np.ndarray:
+    def censored_side(self, rows: np.ndarray) -> np.ndarray:
         """Return `censored` of rows (n,), (n,) int8."""
         return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.blocks import take
-from gsparc.data.errors import DataError, list_first, suggest_nearest
+from gsparc.data.errors import DataError, list_first, suggest_name
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
@@ -144,9 +144,7 @@ def _there(stations: Stations | None, name: str, source: str) -> Stations:
 def _number(stations: Stations, wanted: str | int, option: str, source: str) -> int:
     found = find_station(wanted, stations.name, len(stations))
     if found is None:
-        hint = (
-            suggest_nearest(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.name, 9)}"
-        )
+        hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.name, 9)}"
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
     return found
 

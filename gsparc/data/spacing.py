@@ -20,10 +20,10 @@ MIXING = 2**62 + np.array(_ODD)
 EDGE = 1e-6  # of a square: places on its edge are in it, however they were rounded
 
 
-def nearest_neighbour_distance(places: np.ndarray) -> float:
+def neighbour_distance(places: np.ndarray) -> float:
     """Return the median distance [m] from places (n, D) to the nearest other, copies left out; 0 of one.
 
-    >>> nearest_neighbour_distance(np.array([[0.0, 0], [0, 0], [0, 2], [0, 4]]))
+    >>> neighbour_distance(np.array([[0.0, 0], [0, 0], [0, 2], [0, 4]]))
     2.0
     """
     places = np.unique(places, axis=0)

@@ -32,7 +32,7 @@ class Fold:
     val: np.ndarray
     test: np.ndarray
 
-    def each(self, change: Callable[[np.ndarray], np.ndarray]) -> Fold:
+    def map(self, change: Callable[[np.ndarray], np.ndarray]) -> Fold:
         """Return the three parts changed alike."""
         return Fold(*map(change, (self.train, self.val, self.test)))
 
@@ -130,7 +130,7 @@ class SplitSettings(Checked):
         if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
             ROWS.check("leave_out", self.leave_out)
 
-    def together(self, count: int) -> int:
+    def held_out_count(self, count: int) -> int:
         """Return how many of `count` stations, or runs, are held out together; 0: each in its turn."""
         if self.name == "runs":
             return max(round(self.test_fraction * count), 1)
@@ -208,7 +208,7 @@ def make_split(
         where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
-    folds = tuple(fold.each(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
+    folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
     return Split(settings.name, folds, hash_indices(folds))
 
 
@@ -251,7 +251,7 @@ def rows_to_leave_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: in
 
 def remove_rows(split: Split, absent: np.ndarray) -> Split:
     """Return the same folds without the rows `absent` (n,)."""
-    folds = tuple(fold.each(lambda part: np.setdiff1d(part, absent)) for fold in split.folds)
+    folds = tuple(fold.map(lambda part: np.setdiff1d(part, absent)) for fold in split.folds)
     return Split(split.name, folds, hash_indices(folds))
 
 
@@ -316,7 +316,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         raise DataError(f"split={name}: these measurements have one {name[:-1]}; take split=random or blocks")
     unit = np.unique(unit, return_inverse=True)[1].reshape(-1)
     count = int(unit.max()) + 1
-    together = settings.together(count)
+    together = settings.held_out_count(count)
     least = 2 if name == "stations" else 1
     if count - max(together, 1) < least:
         remain = "two at least must remain" if least == 2 else "one must remain"

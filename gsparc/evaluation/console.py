@@ -76,7 +76,7 @@ def repeated_warnings() -> list[str]:
     return [f"warnings that came again: {', '.join(again)}"] if again else []
 
 
-def plain(node: DictConfig) -> dict[str, Any]:
+def to_dict(node: DictConfig) -> dict[str, Any]:
     """Return a group of settings as plain containers; a setting that is still missing is an error."""
     return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
 
@@ -89,7 +89,7 @@ def error_in_one_line(error: BaseException) -> str:
             part, _, choice = choice.rpartition("/")
             there = ", ".join(error.options)
             return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
-        hint = suggest_or_list(choice, choices(group) or list(error.options))
+        hint = suggest_or_list(choice, list_choices(group) or list(error.options))
         return f"{group}={choice}: no such choice{hint}"
     if isinstance(error, errors.OverrideParseException):
         return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
@@ -123,7 +123,7 @@ def config_folder() -> Path:
     return Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0])
 
 
-def choices(group: str) -> list[str]:
+def list_choices(group: str) -> list[str]:
     """Every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
     folder = config_folder() / group
     own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}

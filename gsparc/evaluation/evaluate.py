@@ -24,7 +24,7 @@ from gsparc.prediction.timing import (
     ClockSettings,
     cycle_queries,
     draw_queries,
-    median_and_p95,
+    p50_p95,
     time_interleaved,
 )
 
@@ -104,7 +104,7 @@ def evaluate(
         own = {**pool_figures(one, data, split), "skill": _skill(one, others)}
         facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
     facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
-    decided = scores.decided_by()
+    decided = scores.dominant_row()
     if decided and data.row_names:
         decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
     facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
@@ -160,7 +160,7 @@ def time_methods(
     }
     for name in methods:
         room = {OWN: "time", FIELD: FIELD}.get(name, f"baseline/{name}")
-        p50, p95 = median_and_p95(one[name])
+        p50, p95 = p50_p95(one[name])
         facts |= {
             f"{room}/render_ms_p50": p50,
             f"{room}/render_ms_p95": p95,
@@ -195,7 +195,7 @@ def _skill(scores: Scores, others: Mapping[str, FittedBaseline]) -> float | None
     if "nearest" not in others:
         return None
     # Rows without a target are NaN in both, so that the means are over the same rows.
-    own, bar = (float(np.nanmean(one.squares())) for one in (scores, others["nearest"].scores))
+    own, bar = (float(np.nanmean(one.squared_errors())) for one in (scores, others["nearest"].scores))
     return 1 - own / bar if bar > 0 else None
 
 

@@ -33,8 +33,8 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     mean_db, spread_db = power_in_decibels(mean[known], variance[known])
     row = scores.row[known]
     power = data.target[row, 0].astype(np.float64) * data.site.target_scale
-    silent = data.side(row) > 0
-    heard = (data.side(row) == 0) & (power > 0)
+    silent = data.censored_side(row) > 0
+    heard = (data.censored_side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
     if heard.any():
         # z of .95 is 1.645 for the central 90 % of a normal distribution.
@@ -77,7 +77,7 @@ def sensitivity_levels(data: Measurements) -> np.ndarray | None:
 
     NaN where it heard all, or its silent rows have several levels, as in lists of the strongest.
     """
-    rows = np.flatnonzero(data.side(np.arange(len(data))) > 0)
+    rows = np.flatnonzero(data.censored_side(np.arange(len(data))) > 0)
     if not len(rows):
         return None
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
@@ -96,7 +96,7 @@ def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | No
 
     That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
     """
-    side, prediction = data.side(scores.row), scores.samples["prediction"]
+    side, prediction = data.censored_side(scores.row), scores.samples["prediction"]
     if not side.any():
         return {}
     level = data.target[scores.row, 0].astype(np.float64) * data.site.target_scale

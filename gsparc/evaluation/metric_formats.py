@@ -65,7 +65,7 @@ PER_SAMPLE: dict[Scored, str] = {
 """The figure of a single sample, in decibels."""
 
 
-def deciding_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
+def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
     """Return the figure that methods are compared by; where rows were silent, these count too."""
     kind: Scored = facts["dataset/kind"] if facts.get("dataset/kind") in DECIDING else "spectrum"
     return WITH_SILENT if facts.get(f"{prefix}/{WITH_SILENT}") is not None else DECIDING[kind]

@@ -32,9 +32,9 @@ from gsparc.prediction.risk import (
     Evidence,
     Guarantee,
     calibrate_threshold,
+    explain_too_few,
     join_evidence,
     relax_guarantee,
-    too_few,
 )
 from gsparc.training.context import FitContext
 
@@ -382,9 +382,9 @@ def calibrate_and_store(
     if np.isfinite(threshold):
         of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
-    if too_few(len(evidence), promise) is not None:
+    if explain_too_few(len(evidence), promise) is not None:
         return stored, f"{kind_changed}no threshold keeps the bound"
-    bad, limit = promise.bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
+    bad, limit = promise.is_bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
     other = relax_guarantee(evidence, promise, kind, spatial, seed)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"

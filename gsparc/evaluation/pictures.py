@@ -33,7 +33,7 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         draw_sector_levels(method, data, np.sort(np.r_[fold.train, fold.val]), path.with_name("sectors.png"))
-        measured = data.side(rows) == 0  # of a silent row the target is its level
+        measured = data.censored_side(rows) == 0  # of a silent row the target is its level
         return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
     assert data.site.grid is not None
     known = [said.confidence.numpy() for _, _, said in told if said.confidence is not None]
@@ -140,7 +140,7 @@ def draw_calibration(
     left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
     left.set_title(title)
     for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
-        broken = trial.facts()["broken_of_all"]
+        broken = trial.summarise()["broken_of_all"]
         label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
         right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)
     # a draw that accepts nobody has no share of bad ones: NaN

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gsparc.evaluation.metric_formats import DECIDING, deciding_figure, score_of
+from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
 
 # Columns by the facts of a summary that they hold: of the run, of its own method, of any method.
 OF_RUN = {
@@ -40,7 +40,7 @@ def result_rows(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     folds = max(counts[2], 1)
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
     shared["kind"] = shared["kind"] if shared["kind"] in DECIDING else "spectrum"
-    shared |= {"fold": 0 if folds == 1 else None, "figure": deciding_figure(facts), "alone": None}
+    shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts), "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}
     own = {name: facts.get(key) for name, key in OF_MODEL.items()}
     model = own | {"effects": facts.get("model/effects") or "none"}

@@ -44,11 +44,11 @@ class Scores:
         """Flat figures over all folds together."""
         return type(metrics_for(self.kind)).summary(self.samples)
 
-    def squares(self) -> np.ndarray:
+    def squared_errors(self) -> np.ndarray:
         """Squared errors (S,), of powers in decibels; NaN where nothing was measured."""
         return self.samples["error_db"] ** 2 if self.kind == "rssi" else self.samples["mse"]
 
-    def decided_by(self) -> dict[str, Any]:
+    def dominant_row(self) -> dict[str, Any]:
         """Return the row that alone makes over half of all error or power, and a figure that no row decides.
 
         `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /

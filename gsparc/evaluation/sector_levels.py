@@ -21,13 +21,13 @@ LEAST = 10  # rows that were heard of a sector
 
 def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, path: Path) -> bool:
     """Draw rows (n,) of sectors, less the law of distance; returns whether there were patterns."""
-    every = method.every() if isinstance(method, PerStation) else None
-    field = None if every is None else every.joint()
+    every = method.all_stations() if isinstance(method, PerStation) else None
+    field = None if every is None else every.joint_method()
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
         return False
     trend = field.own.never.trend
     assert isinstance(trend, Sectors)
-    heard = rows_of_stations(data, rows, field.places).loud
+    heard = rows_of_stations(data, rows, field.places).measured
     count = np.bincount(heard.station, minlength=len(field.places))
     # Without an azimuth there is no angle to draw over.
     count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0

@@ -11,12 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.checks.describe import (
-    describe_spacing,
-    distinct_places,
-    propose_block_side,
-    rows_in_test_blocks,
-)
+from gsparc.data.checks.describe import distinct_places, propose_side, spacing_words, test_block_rows
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.outliers import find_outliers, too_far
 from gsparc.data.checks.plausibility import LinkLevels, find_outlier_rows
@@ -85,7 +80,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
         power * data.site.target_scale if data.site.kind == "rssi" else (power * data.site.target_scale) ** 2
     )
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
-    heard = heard | (data.side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
+    heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
     value = power[row, entry]
     if data.site.kind == "rssi":
@@ -148,7 +143,7 @@ def _title(data: Measurements, places: Spots) -> str:
     kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
     stations = data.site.stations
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
-    apart = describe_spacing(distinct_places(data), data.site.wavelength).partition(";")[0]
+    apart = spacing_words(distinct_places(data), data.site.wavelength).partition(";")[0]
     return f"{data.site.name}: {len(data)} {kind} at {len(places.place)} places{at}\n{apart}"
 
 
@@ -185,8 +180,8 @@ def _draw_map(
         )
         assert axis.figure is not None
         axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
-    side = propose_block_side(data)
-    test = np.zeros(0, np.int64) if side is None else rows_in_test_blocks(data, side)
+    side = propose_side(data)
+    test = np.zeros(0, np.int64) if side is None else test_block_rows(data, side)
     if len(test):
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}

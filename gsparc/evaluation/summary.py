@@ -19,14 +19,7 @@ from uuid import uuid4
 import numpy as np
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.metric_formats import (
-    CALIBRATION,
-    TABLES,
-    WITH_SILENT,
-    deciding_figure,
-    form_of,
-    score_of,
-)
+from gsparc.evaluation.metric_formats import CALIBRATION, TABLES, WITH_SILENT, form_of, main_figure, score_of
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
@@ -125,7 +118,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
     chi2 = {str(facts.get("model/label")): facts.get(f"{prefix}/{CALIBRATION}")}
-    wrong = wrong_deviations(chi2, deciding_figure(facts, prefix))
+    wrong = wrong_deviations(chi2, main_figure(facts, prefix))
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
@@ -214,7 +207,7 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return the baseline that beats the method, if one does; where rows were silent, these count too."""
-    figure = deciding_figure(facts, prefix)
+    figure = main_figure(facts, prefix)
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
     known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}

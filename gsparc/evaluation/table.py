@@ -38,7 +38,7 @@ class Interval:
         """`29.08 [27.4, 30.6]`, or `29.08 ± 0.30`."""
         ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
         error = "" if self.error is None or math.isnan(self.error) else f" ± {self.error:{form}}"
-        return f"{format_number(self.value, form)}{ends}{error}"
+        return f"{to_text(self.value, form)}{ends}{error}"
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,7 @@ class Column:
         """Return a cell as text."""
         if isinstance(value, Interval):
             return value.text(self.form)
-        return (
-            format_number(value, self.form)
-            if value is None or isinstance(value, (int, float))
-            else str(value)
-        )
+        return to_text(value, self.form) if value is None or isinstance(value, (int, float)) else str(value)
 
 
 # Of all tables of results; seconds are means over folds, each of which trains a model.
@@ -164,6 +160,6 @@ class Table:
         return result
 
 
-def format_number(value: float | None, form: str) -> str:
+def to_text(value: float | None, form: str) -> str:
     """Return a number in a format, or a dash where there is none or NaN."""
     return "-" if value is None or math.isnan(value) else format(value, form)

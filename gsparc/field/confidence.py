@@ -131,7 +131,7 @@ class Confidence(nn.Module):
         return ((g - low) / (high - low)).clamp(0, 1) * torch.exp(-outside)
 
 
-def confidence_weighted_loss(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
+def weighted_loss(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
     """Return C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
 
     log C = log(1 + e^g) is a softplus, finite and with a finite slope for every g.

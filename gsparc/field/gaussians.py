@@ -95,10 +95,7 @@ class GaussianField(nn.Module):
 
 
 def create_field(
-    settings: FieldSettings,
-    box: Tensor,
-    receiver: Tensor | None,
-    rotation: Tensor | None,
+    settings: FieldSettings, box: Tensor, receiver: Tensor | None, rotation: Tensor | None
 ) -> GaussianField:
     """Return a field before training.
 

@@ -80,9 +80,9 @@ def requested_steps(context: FitContext, rows: int, own: int | None = None) -> i
         if value is not None and (type(value) is not int or value < 0):
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
     if own == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
-        heeded.count("model.steps")
+        heeded.count_reads("model.steps")
         return own
-    heeded.count("trainer.max_steps", "trainer.max_epochs")
+    heeded.count_reads("trainer.max_steps", "trainer.max_epochs")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     of_epochs = None if epochs is None else epochs * -(-rows // size)
     return min(one for one in (steps, of_epochs) if one is not None)
@@ -213,7 +213,7 @@ def make_trainer(
     options["max_epochs"] = -1
     # Without validation rows nothing is looked at, however often that was asked for.
     unwatched = (f"trainer.{name}" for name in make.keywords if name != "val_check_interval")
-    heeded.count("callbacks", *(["trainer"] if len(fold.val) else unwatched))
+    heeded.count_reads("callbacks", *(["trainer"] if len(fold.val) else unwatched))
     processes = SummedGradients.named(make.keywords.get("strategy"))
     if module.count is None:  # networks of published methods make tensors of their own, on the CPU
         if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
@@ -229,7 +229,7 @@ def make_trainer(
         **options,
     )
     if processes is not None:  # which note nothing here
-        heeded.count("*")
+        heeded.count_reads("*")
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     return trainer, batches

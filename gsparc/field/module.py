@@ -16,7 +16,7 @@ from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
 from gsparc.data.schema import Site
 from gsparc.field import edit
-from gsparc.field.confidence import confidence_weighted_loss
+from gsparc.field.confidence import weighted_loss
 from gsparc.field.distributed import process_count
 from gsparc.field.initial import Snapshot
 from gsparc.field.losses import fits_ssim_window, ssim, task_loss
@@ -228,7 +228,7 @@ class GaussianModule(NetworkModule):
         if confidence is None:
             return task.mean(), task
         exponent = confidence.exponent(self.site.moving(batch.tx, batch.rx))
-        return confidence_weighted_loss(task, exponent, confidence.settings.alpha).mean(), task
+        return weighted_loss(task, exponent, confidence.settings.alpha).mean(), task
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Return the loss per sample (B,) before confidence; what was not measured counts as met."""

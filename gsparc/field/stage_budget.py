@@ -31,13 +31,13 @@ class StageBudget(L.Callback):
         return self.budget.counted - self._begin
 
     def _look(self, trainer: L.Trainer) -> None:
-        if first_process_value(float(self.budget.over()), trainer):
+        if first_process_value(float(self.budget.is_spent()), trainer):
             trainer.should_stop = True
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
         """Count in another process, whose processor time is its own."""
         if os.getpid() != self._process:
-            self.budget.moved()
+            self.budget.restart_processor()
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Leave out what making the Trainer took, which is no part of the stage; look at the clock."""

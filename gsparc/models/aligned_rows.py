@@ -26,7 +26,7 @@ from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.target_rows import TINY_POWER
-from gsparc.physics.row_factors import Freedom, alignment_factors, freedom_words
+from gsparc.physics.row_factors import Freedom, align_factors, freedom_words
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import neighbour_weights
@@ -184,7 +184,7 @@ class _Rows:
         if len(rest):
             next_to = cKDTree(self.places[trunk]).query(self.places[rest])[1]
             child, parent = np.r_[child, rest], np.r_[parent, trunk[next_to]]
-        steps = alignment_factors(values[child], values[parent], self.tones, self.freedom_of_phase)
+        steps = align_factors(values[child], values[parent], self.tones, self.freedom_of_phase)
         for row, onto, step in zip(child, parent, steps, strict=True):
             factors[row] = step * factors[onto]
         return factors
@@ -234,12 +234,12 @@ class _Rows:
     def _swept(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
             told = self._told(factors, weights)
-            factors = alignment_factors(self.values, told, self.tones, self.freedom_of_phase)
+            factors = align_factors(self.values, told, self.tones, self.freedom_of_phase)
         return factors
 
     def _error(self, factors: np.ndarray, weights: csr_array) -> float:
         told = self._told(factors, weights)
-        told = told * alignment_factors(told, self.values, self.tones, self.freedom)[:, None]
+        told = told * align_factors(told, self.values, self.tones, self.freedom)[:, None]
         missed = np.abs(self.values - told) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
 

@@ -70,7 +70,7 @@ def fit_or_resume(
     (data, rows), left = align_phases(data, fold), context.resume
     aligning = budget.spent if data.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
-        heeded.count("*")
+        heeded.count_reads("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
             return _restored(factory, data, fold, context, left / checkpoint.MODEL)
@@ -89,9 +89,7 @@ def fit_or_resume(
     return method, report
 
 
-def checkpoint_marks(
-    report: FitReport, data: Measurements, fold: Fold, context: FitContext
-) -> dict[str, Any]:
+def run_marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
     """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
     report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}

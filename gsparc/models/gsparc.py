@@ -37,7 +37,7 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
     Raises:
         ValueError: a term that is asked for means nothing here.
     """
-    with heeded.apart():  # what decides is counted below; the method may heed more
+    with heeded.set_apart():  # what decides is counted below; the method may heed more
         switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
         count, falls = model.field.count, model.attenuation.inverse_distance
         terms = resolve_terms(switches, init, data, model.emission.hidden, count, falls)
@@ -70,7 +70,7 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         method = settings.create_as(import_path(kind))
         if rendered:
             options += ["init.name"] * (init.name in ("auto", "diffuse"))
-    heeded.count(*options)
+    heeded.count_reads(*options)
     for reason in reasons:
         log.info("%s", reason)
     return method

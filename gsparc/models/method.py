@@ -20,7 +20,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.physics.row_factors import alignment_factors
+from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext, FitReport
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class MethodFactory(ABC):
     """Makes unfitted methods, and says what holds for all of them before any measurements are seen."""
 
     name: str  # of its methods, as it appears in tables
-    # Attributes that hold settings of other names, by setting; "": it tells `heeded.count` itself.
+    # Attributes that hold settings of other names, by setting; "": it tells `heeded.count_reads` itself.
     stored_names: ClassVar[Mapping[str, str]] = {}
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
@@ -242,8 +242,8 @@ def predict_in_batches(
         return
     told = list(asked())
     moments, back = Snapshots.of(data, rows), np.argsort(order)
-    means = moments.arranged(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
-    turns = alignment_factors(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    means = moments.arrange(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
+    turns = align_factors(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
     factors = torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
     for chosen, batch, said in told:
         factor = factors[chosen]
@@ -322,8 +322,8 @@ class HasProcess(Protocol):
 class HasJoint(Protocol):
     """Levels of several stations, or at several places, with their covariance."""
 
-    def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See `gsparc.models.powers.together.field.JointPowerField.joint`."""
+    def predict_joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """See `gsparc.models.powers.together.field.JointPowerField.predict_joint`."""
         ...
 
     def with_station(self, place: np.ndarray, sectors: Tensor) -> HasJoint:

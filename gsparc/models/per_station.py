@@ -143,7 +143,7 @@ class PerStation(Method):
             folder = "unheard" if number == UNHEARD else f"station{number}"
             resume = None if left is None else left / folder
             # The run's `datamodule` loads rows of all stations: a station's fit makes loaders of its own.
-            own = context.within(
+            own = context.for_part(
                 folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
             )
             if len(numbers) > 1:
@@ -161,7 +161,7 @@ class PerStation(Method):
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = fitting.checkpoint_marks(report, part, inner, own)
+                extra = fitting.run_marks(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
@@ -192,7 +192,7 @@ class PerStation(Method):
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
-            with heeded.apart():
+            with heeded.set_apart():
                 how, why = self.factory.choose_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
         together, joint = how == "together", self.factory.shares(data.site)
@@ -250,7 +250,7 @@ class PerStation(Method):
         stations = self._stations(query) if query.station is None else query.station
         answers: list[tuple[Tensor, Prediction]] = []
         for number in stations.unique().tolist():
-            chosen, copy = (stations == number).nonzero()[:, 0], self.of(number)
+            chosen, copy = (stations == number).nonzero()[:, 0], self.copy_for(number)
             answers.append((chosen, copy.predict(_seen_by(copy.site, query.rows(chosen)))))
         # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
@@ -260,7 +260,7 @@ class PerStation(Method):
         """See `Method.gradient_problem`; that of any copy."""
         return next(filter(None, (copy.gradient_problem() for copy in self._copies.values())), None)
 
-    def of(self, number: int) -> Method:
+    def copy_for(self, number: int) -> Method:
         """Return the copy that answers for a station.
 
         Raises:
@@ -273,7 +273,7 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: station {name} had too few training rows")
         return OneStationView(copy, number) if self._shared else copy
 
-    def every(self) -> AllStationsView | None:
+    def all_stations(self) -> AllStationsView | None:
         """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
         stations = None if self.site is None else self.site.stations
         return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
@@ -342,7 +342,7 @@ class OneStationView(View):
         super().__init__(inner)
         self.number = number
 
-    def joint(self) -> HasJoint | None:
+    def joint_method(self) -> HasJoint | None:
         """Return what knows how levels of stations go together; None where nothing does."""
         method = getattr(self.inner, "only", None)
         return method if isinstance(method, HasJoint) else None

@@ -28,9 +28,7 @@ def reduce_method(method: Method, settings: Settings, measured: Measured) -> Met
     return method.reduced(settings, measured) if settings else method
 
 
-def setting_combinations(
-    method: Method, grid: Mapping[str, Sequence[Any] | None]
-) -> Iterator[dict[str, Any]]:
+def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> Iterator[dict[str, Any]]:
     """Yield settings: none, then all combinations in `grid` of knobs the method has.
 
     Strides must divide the columns, others are left out with a warning.

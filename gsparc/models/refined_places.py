@@ -53,12 +53,12 @@ def errors_of(data: Measurements, known: np.ndarray, asked: float | None, heeds:
         asked: of every coordinate [m].
         heeds: whether what is fitted can place rows anew; where not, a warning says so.
     """
-    with heeded.apart():
+    with heeded.set_apart():
         std = data.position_std if asked is None else np.full(len(data), asked)
     if std is None or not std[known].any():
         return None
     if heeds:
-        heeded.count("model.position_std")
+        heeded.count_reads("model.position_std")
         return std
     what = "channels with phases of the carrier and powers, of one end that moves"
     log.warning("position_std is not used: it is for %s", what)

@@ -78,7 +78,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     if not trusted:
         for path in set(iterate_targets(OmegaConf.to_container(node, resolve=False))) - terms:
             refuse_foreign(path)
-    with heeded.apart():  # what is handed on is not used yet
+    with heeded.set_apart():  # what is handed on is not used yet
         method = instantiate(fill_defaults(deepcopy(node)), _convert_="all")
     if not isinstance(method, MethodFactory):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")

@@ -30,7 +30,7 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     measured = data.mask[rows]
     total = np.where(measured, target, 0).sum(0) / np.maximum(measured.sum(0), 1)
     if data.censored is not None:
-        measured = measured | (data.side(rows) != 0).reshape(-1, *(1,) * (target.ndim - 1))
+        measured = measured | (data.censored_side(rows) != 0).reshape(-1, *(1,) * (target.ndim - 1))
     return np.where(measured, target, total.astype(target.dtype))
 
 
@@ -75,12 +75,12 @@ def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
 
 def heard_rows(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return those of rows (n,) that were heard, in their order; a saturated one counts as its level."""
-    return rows[data.side(rows) <= 0]
+    return rows[data.censored_side(rows) <= 0]
 
 
 def unheard_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """Say what a fit to `heard(data, rows)` left out; nothing where all of rows (n,) were heard."""
-    side, notes = data.side(rows), {1: "where nothing was heard are not learned from"}
+    side, notes = data.censored_side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
     return tuple(f"{n} rows {said}" for one, said in notes.items() if (n := int((side == one).sum())))
 
@@ -88,4 +88,4 @@ def unheard_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
 def power_rows(data: Measurements, rows: np.ndarray) -> PowerRows:
     """Return powers of rows (n,) in decibels, levels where they are censored."""
     decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
-    return PowerRows(data.moving[rows], decibels, data.side(rows))
+    return PowerRows(data.moving[rows], decibels, data.censored_side(rows))

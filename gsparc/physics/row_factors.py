@@ -45,7 +45,7 @@ def resolvable_delays(tones: np.ndarray) -> np.ndarray:
     return step * np.arange(-half, half + 1)
 
 
-def alignment_factors(
+def align_factors(
     values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedom: Freedom
 ) -> np.ndarray:
     """Return factors (n, K) that turn rows to their references best; 1 where nothing is free.
@@ -53,7 +53,7 @@ def alignment_factors(
     The delay is the largest of the correlation over tones, between samples by a parabola.
 
     >>> reference = np.ones((1, 2, 8), complex)  # of one row: two antennas, eight tones
-    >>> factor = alignment_factors(1j * reference, reference, np.arange(8) * 1e6, "phase")
+    >>> factor = align_factors(1j * reference, reference, np.arange(8) * 1e6, "phase")
     >>> bool(np.allclose(factor[:, None] * 1j * reference, reference))
     True
 
@@ -68,7 +68,7 @@ def alignment_factors(
     if len(values) > AT_ONCE:
         parts = np.array_split(np.arange(len(values)), -(-len(values) // AT_ONCE))
         return np.concatenate(
-            [alignment_factors(values[part], reference[part], tones, freedom) for part in parts]
+            [align_factors(values[part], reference[part], tones, freedom) for part in parts]
         )
     product = (values * reference.conj()).sum(1)
     slope = np.zeros(len(values))

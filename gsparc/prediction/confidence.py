@@ -16,7 +16,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.baselines.gp import choose_kernel_by_left_out, principal_components
+from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
 from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
@@ -36,7 +36,7 @@ def gather_evidence(method: Method, data: Measurements, fold: Fold, rows: np.nda
             for chosen, batch, said in predict_in_batches(method, data, rows)
         ]
     )
-    return replace(evidence, scores=evidence.scores | rival_scores(data, fold, evidence.row))
+    return replace(evidence, scores=evidence.scores | position_scores(data, fold, evidence.row))
 
 
 def errors_and_scores(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -62,16 +62,16 @@ def expected_score(prediction: Prediction) -> Tensor | None:
     return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
-def rival_scores(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
+def position_scores(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Return the confidences `RIVALS` (n,) of rows (n,), which rest on places alone."""
     known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    return {kind: rival_score(kind, known, kernel, data.moving[rows]) for kind in RIVALS}
+    return {kind: position_score(kind, known, kernel, data.moving[rows]) for kind in RIVALS}
 
 
-def rival_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray) -> np.ndarray:
+def position_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray) -> np.ndarray:
     """Return minus the distance of places (B, 3) to the nearest known one [m], or minus `process_variance`.
 
-    >>> rival_score("distance", np.zeros((1, 3)), None, np.array([[3.0, 4.0, 0.0]]))
+    >>> position_score("distance", np.zeros((1, 3)), None, np.array([[3.0, 4.0, 0.0]]))
     array([-5.])
     """
     if kind == "distance":
@@ -90,13 +90,13 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
-    return choose_kernel_by_left_out(data.moving[few], parts.scores, len(parts.mean))
+    return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean))
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
     rows = torch.from_numpy(known)
-    white = Factor.of(kernel.gram(rows)).whitened(kernel.between(rows, torch.from_numpy(places)))
+    white = Factor.of(kernel.gram(rows)).whiten(kernel.between(rows, torch.from_numpy(places)))
     # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
     return (1 + kernel.noise - white.square().sum(0)).numpy()
 
@@ -150,7 +150,7 @@ class Trusted(Stored):
             assert self.kernel is not None
             if places is None:
                 raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
-            return rival_score(kind, self.known, self.kernel, places)
+            return position_score(kind, self.known, self.kernel, places)
         score = prediction.confidence if kind == "learned" else expected_score(prediction)
         if score is None:
             what = "has no confidence of its own" if kind == "learned" else "states no error variance"

@@ -20,7 +20,7 @@ class JointMixin:
     method: Method
     queries: Queries
 
-    def joint(self, places: Any, stations: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    def predict_joint(self, places: Any, stations: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return levels (G, k) of measurements, covariances (G, k, k) and noise (k,), float64.
 
         Levels are in decibels of `site.level_unit`, the rest [dB^2]. None: nothing is known of how levels of
@@ -33,8 +33,8 @@ class JointMixin:
         known = self._known()
         return None if known is None else self._together(known, places, torch.as_tensor(stations))
 
-    def elsewhere(self, places: Any, station: Any, sectors: Any) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return levels (G, k) and deviations [dB] of k sectors that are not there yet, see `joint`.
+    def predict_new(self, places: Any, station: Any, sectors: Any) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return levels (G, k) and deviations [dB] of k sectors that are not there yet, see `predict_joint`.
 
         Args:
             places: (G, 3) of the moving end, world [m].
@@ -51,8 +51,8 @@ class JointMixin:
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
     def _known(self) -> HasJoint | None:
-        every = self.method.every() if isinstance(self.method, PerStation) else None
-        return None if every is None else every.joint()
+        every = self.method.all_stations() if isinstance(self.method, PerStation) else None
+        return None if every is None else every.joint_method()
 
     def _together(
         self, known: HasJoint, places: Any, stations: torch.Tensor
@@ -60,7 +60,7 @@ class JointMixin:
         moving = torch.from_numpy(np.asarray(places, np.float64) - self.site.origin)
         if moving.dim() == 2:
             moving = moving[:, None].expand(-1, len(stations), 3)
-        level, covariance, noise = (part.numpy() for part in known.joint(moving, stations))
+        level, covariance, noise = (part.numpy() for part in known.predict_joint(moving, stations))
         return level + 10 * np.log10(self.site.target_scale), covariance, noise
 
     def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float] | None:
@@ -80,10 +80,10 @@ class JointMixin:
         """
         query = self.queries.query(tx, rx, torch.float64).query
         places = query.places(self.site)
-        known = self.method.joint() if isinstance(self.method, OneStationView) else None
+        known = self.method.joint_method() if isinstance(self.method, OneStationView) else None
         if isinstance(self.method, OneStationView) and known is not None:
             station = torch.full((len(places),), self.method.number)
-            _, covariance, noise = known.joint(places[None], station)
+            _, covariance, noise = known.predict_joint(places[None], station)
             return (covariance[0] - noise.diag()).numpy(), float(noise[0])
         process = self.method.process() if isinstance(self.method, HasProcess) else None
         if process is None:

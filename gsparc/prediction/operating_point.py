@@ -91,7 +91,7 @@ def choose_within_budget(
     site, draw = stored.site, np.random.default_rng(0)
     ends = 2 if site.static_end is None else 1
     places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)
-    calls = {i: Predictor(way, site).cycling(places) for i, way in enumerate(ways)}
+    calls = {i: Predictor(way, site).cycle_places(places) for i, way in enumerate(ways)}
     times = time_interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
     here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
     fitting = [i for i in here if here[i] <= budget_ms]

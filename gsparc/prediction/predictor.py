@@ -112,7 +112,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
         method, whole = (
-            one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
+            one.copy_for(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
         )
         return self._with(method, whole, station_site(self.site, number), self._unit)
 
@@ -155,14 +155,14 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         sure = self._confidence(own, query)
         return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
-    def asked(self, query: Query) -> Prediction:
+    def predict_query(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local, in stored units."""
         return predict_with_threads(self.method, query)
 
-    def linear(self, tx: Any = None, rx: Any = None) -> Prediction:
+    def predict_linear(self, tx: Any = None, rx: Any = None) -> Prediction:
         """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
 
-        >>> bool((predictor.linear(rx=[2.0, 1.0, 1.5]).mean > 0).all())  # no decibels
+        >>> bool((predictor.predict_linear(rx=[2.0, 1.0, 1.5]).mean > 0).all())  # no decibels
         True
         """
         return self.predict(tx, rx, unit=LINEAR if self.site.kind == "rssi" else None)
@@ -202,7 +202,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         if said or self.site.kind != "rssi" or self.site.stations is None:
             return ask(self)
         # One call for all stations where the method has one, else a call for each.
-        every = self.method.every() if isinstance(self.method, PerStation) else None
+        every = self.method.all_stations() if isinstance(self.method, PerStation) else None
         if every is not None:
             return ask(self._with(every, None, station_site(self.site, 0), self._unit))
         stations = self._stations()
@@ -221,7 +221,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
                 stations[-1] = self.at(name)
         return stations
 
-    def cycling(self, places: np.ndarray) -> Call:
+    def cycle_places(self, places: np.ndarray) -> Call:
         """Return calls for a clock: one place (n, 3), or of both ends (n, 6) [m, local], another every time.
 
         Of several stations the first that the model answers for is asked.
@@ -348,7 +348,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return Prediction(mean, said.variance, unknown), single
 
 
-def keep(path: str | Path, extra: Mapping[str, Any]) -> None:
+def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
     checkpoint.update_extra(path, extra)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.inner_folds import InnerFolds, cut_inner_folds
+from gsparc.data.inner_folds import InnerFolds, cut_folds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
@@ -39,15 +39,15 @@ class Learned:
         """Return those (n,) that were learned from, sorted."""
         return np.sort(np.concatenate([self.fold.train, self.fold.val]))
 
-    def cut(self, count: int, seed: int, split: SplitSettings | None = None) -> InnerFolds:
+    def cut_folds(self, count: int, seed: int, split: SplitSettings | None = None) -> InnerFolds:
         """Return `count` folds of these rows, cut by `split`; None: as the test rows were."""
-        return cut_inner_folds(self.data, self.fold, split or self.context.split, count, seed)
+        return cut_folds(self.data, self.fold, split or self.context.split, count, seed)
 
     def refit(self, fold: Fold, context: FitContext) -> Method:
         """Return the method fitted anew on a fold."""
         return fitting.fit_or_resume(by_station(self.factory, self.data), self.data, fold, context)[0]
 
-    def without(self, fold: Fold, split: SplitSettings | None = None) -> Method:
+    def forget(self, fold: Fold, split: SplitSettings | None = None) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
 
         One that can forget rows does so, with its settings as they are; another one is fitted anew.
@@ -62,7 +62,7 @@ class Learned:
             context = replace(self.context, run_dir=Path(folder), split=split or self.context.split)
             return self.refit(fold, context)
 
-    def answerable(self, fold: Fold) -> Fold:
+    def drop_unlearned(self, fold: Fold) -> Fold:
         """Return a fold without test rows of stations that too few training rows are left of."""
         if not isinstance(self.method, PerStation):
             return fold

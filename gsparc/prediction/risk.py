@@ -67,7 +67,7 @@ class Guarantee(Stored, Checked):
 
     >>> Guarantee(alpha=0.1, delta=0.1).least  # 0.9^22 is below 0.1
     22
-    >>> Guarantee(limit_db=-10.0).bad(np.array([0.05, 0.5]))
+    >>> Guarantee(limit_db=-10.0).is_bad(np.array([0.05, 0.5]))
     array([False,  True])
 
     Attributes:
@@ -86,7 +86,7 @@ class Guarantee(Stored, Checked):
         # n good ones by chance, though a share alpha is bad, have probability (1 - alpha)^n.
         return int(np.ceil(np.log(self.delta) / np.log1p(-self.alpha)))
 
-    def bad(self, relative_error: np.ndarray) -> np.ndarray:
+    def is_bad(self, relative_error: np.ndarray) -> np.ndarray:
         """Tell whether predictions (n,) are bad."""
         return relative_error > 10 ** (self.limit_db / 10)
 
@@ -241,7 +241,7 @@ class Trial:
     coverage: np.ndarray
     alpha: float
 
-    def facts(self) -> dict[str, Any]:
+    def summarise(self) -> dict[str, Any]:
         """Return figures over the draws; None of those that nothing was accepted in.
 
         `broken` is the share of draws with more than alpha bad ones, of the draws that accepted anybody, with
@@ -286,7 +286,7 @@ def split_evidence(
     return choose_on, calibrate, test
 
 
-def too_few(count: int, promise: Guarantee) -> str | None:
+def explain_too_few(count: int, promise: Guarantee) -> str | None:
     """Say what is missing for any promise on so many positions; None where there are enough."""
     needed = int(np.ceil(promise.least / SHARES[1]))
     if count >= needed:
@@ -317,11 +317,11 @@ def number_patches(position: np.ndarray) -> np.ndarray:
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
-def area_parts(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
+def area_contributions(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
     """Return what each of n samples adds to the area under risk-coverage, (n,), whose mean is the area.
 
     >>> score, loss = np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])
-    >>> bool(np.isclose(area_parts(score, loss).mean(), risk_coverage(score, loss).mean()))
+    >>> bool(np.isclose(area_contributions(score, loss).mean(), risk_coverage(score, loss).mean()))
     True
     """
     # The sample at rank r is in the means of r, r + 1, ..., n samples; equal scores share their ranks.
@@ -339,7 +339,7 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
     """
     # Bounded, so that a few fades do not decide which kind is the best.
     loss = bounded_loss(evidence.error[rows])
-    parts = {kind: area_parts(score[rows], loss) for kind, score in evidence.scores.items()}
+    parts = {kind: area_contributions(score[rows], loss) for kind, score in evidence.scores.items()}
     own, best = next(iter(parts)), min(parts, key=lambda kind: parts[kind].mean())
     gain = parts[own] - parts[best]
     # Both are of the same rows: their difference scatters less than either.
@@ -360,7 +360,7 @@ def calibrate_threshold(
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
-    score, bad = evidence.scores[used], promise.bad(evidence.error)
+    score, bad = evidence.scores[used], promise.is_bad(evidence.error)
     if apart_m > 0:  # neighbours err together and count as one
         calibrate = thin_rows(evidence.position, calibrate, apart_m, rng)
     # Divided at random, accepted positions are independent draws, and their counts are binomial.
@@ -387,7 +387,7 @@ def run_trials(
         seed: of the draws.
     """
     realised, coverage, kinds = [], [], []
-    bad = promise.bad(evidence.error)
+    bad = promise.is_bad(evidence.error)
     for draw in range(draws):
         used, threshold, test, _ = calibrate_threshold(
             evidence, promise, kind, how == "spatial", [seed, draw], apart_m
@@ -417,5 +417,5 @@ def calibration_facts(evidence: Evidence, trials: Sequence[Trial], promise: Guar
         facts |= {f"confidence/{kind}/{name}": value for name, value in own.items()}
     facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
     for trial in trials:
-        facts |= {f"trial/{trial.how}/{name}": value for name, value in trial.facts().items()}
+        facts |= {f"trial/{trial.how}/{name}": value for name, value in trial.summarise().items()}
     return facts

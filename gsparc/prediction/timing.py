@@ -113,10 +113,10 @@ def cycle_queries(methods: Mapping[Key, Method], queries: Sequence[Query]) -> di
     return {name: call(method) for name, method in methods.items()}
 
 
-def median_and_p95(times: np.ndarray) -> tuple[float, float]:
+def p50_p95(times: np.ndarray) -> tuple[float, float]:
     """Return median and 95th percentile of times (n,).
 
-    >>> median_and_p95(np.arange(101.0))
+    >>> p50_p95(np.arange(101.0))
     (50.0, 95.0)
     """
     return float(np.median(times)), float(np.quantile(times, 0.95))

@@ -42,10 +42,10 @@ class PseudoValues:
     settled: bool
 
 
-def truncated_normal_moments(z: Tensor) -> tuple[Tensor, Tensor]:
+def truncated_moments(z: Tensor) -> tuple[Tensor, Tensor]:
     """Return, of a standard normal cut off above z (n,), minus its mean, and the share of its variance lost.
 
-    >>> truncated_normal_moments(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
+    >>> truncated_moments(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
     (tensor([0.7979]), tensor([0.6366]))
     """
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
@@ -57,7 +57,7 @@ def truncated_normal_moments(z: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
 
 
-def expectation_propagation(
+def fit_by_ep(
     known: ConditionalGaussian,
     level: Tensor,
     side: Tensor | float = 1.0,
@@ -76,7 +76,7 @@ def expectation_propagation(
     for _ in range(MOST_SWEEPS):
         factor = Factor.of(covariance + torch.diag(variance), "raise")
         precision = factor.precision
-        weights = factor.solved((value - mean)[:, None])[:, 0]
+        weights = factor.solve((value - mean)[:, None])[:, 0]
         # The cavity: what all others say of an entry, its own stand-in taken out.
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
@@ -100,7 +100,7 @@ def expectation_propagation(
 def _sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor]:
     """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
     deviation = variance.sqrt()
-    ratio, lost = truncated_normal_moments(side * (level - mean) / deviation)
+    ratio, lost = truncated_moments(side * (level - mean) / deviation)
     return mean - side * deviation * ratio / lost, variance * (1 - lost) / lost
 
 
@@ -129,12 +129,12 @@ class ConditionalGaussian:
         known = ~unknown
         factor = Factor.of(gram[known][:, known], "raise")
         # Cross covariances and values in one solve.
-        white = factor.whitened(torch.cat([gram[known][:, unknown], values[known][:, None]], 1))
+        white = factor.whiten(torch.cat([gram[known][:, unknown], values[known][:, None]], 1))
         cross, white = white[:, :-1], white[:, -1]
         evidence = -0.5 * (white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi))
         return cls(cross.T @ white, gram[unknown][:, unknown] - cross.T @ cross, float(evidence))
 
-    def doubt(self, level: Tensor) -> Tensor:
+    def z_score(self, level: Tensor) -> Tensor:
         """Return deviations (m,) that entries lie below `level` (m,) by: beyond `CERTAIN` nothing is told."""
         return (level - self.mean) / self.covariance.diagonal().sqrt()
 
@@ -167,12 +167,12 @@ def log_evidence(
     unknown = side != 0
     if not unknown.any():
         factor = Factor.of(gram, "raise")
-        weights = factor.solved(values[:, None])[:, 0]
+        weights = factor.solve(values[:, None])[:, 0]
         value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     known = ConditionalGaussian.of(gram, values, unknown)
     begin, within = (last[0] if last else None), SETTLED if last is None else NEARLY
-    sites = expectation_propagation(known, values[unknown], side[unknown], begin, within)
+    sites = fit_by_ep(known, values[unknown], side[unknown], begin, within)
     if last is not None:
         last[:] = [sites]
     # A stand-in is a measurement whose noise is its own variance.

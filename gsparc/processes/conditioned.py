@@ -13,7 +13,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from gsparc.processes.factor import Factor, as_pairs
+from gsparc.processes.factor import Factor, solve_as_pairs
 from gsparc.processes.left_out import left_out_residuals, left_out_signal
 
 
@@ -22,7 +22,7 @@ class Conditioned:
     """n rows of R outputs that share their covariance.
 
     >>> rows = Conditioned.of(torch.tensor([[2.0, 1.0], [1.0, 2.0]]), torch.tensor([[3.0], [3.0]]))
-    >>> rows.mean(torch.tensor([[1.0, 1.0]])), rows.known(torch.tensor([[1.0, 1.0]]))
+    >>> rows.mean(torch.tensor([[1.0, 1.0]])), rows.explained_variance(torch.tensor([[1.0, 1.0]]))
     (tensor([[2.]]), tensor([0.6667]))
     >>> rows.left_out()[0].T  # 3 less the 1.5 that the other row says
     tensor([[1.5000, 1.5000]])
@@ -43,7 +43,7 @@ class Conditioned:
     ) -> Conditioned:
         """Condition values (n, R) with a covariance (n, n), noise included; see `Factor.of`."""
         factor = Factor.of(covariance, failing)
-        return cls(factor, values, factor.solved(values))
+        return cls(factor, values, factor.solve(values))
 
     @cached_property
     def nll(self) -> float:
@@ -68,9 +68,9 @@ class Conditioned:
         """Return the mean (m, R) at places whose covariances with the rows are (m, n)."""
         return weighted_sum(cross, self.weights)
 
-    def known(self, cross: Tensor) -> Tensor:
+    def explained_variance(self, cross: Tensor) -> Tensor:
         """Return what the rows take from the variance (m,) of places of covariances (m, n) with them."""
-        return self.factor.whitened(cross.mH).abs().square().sum(0)
+        return self.factor.whiten(cross.mH).abs().square().sum(0)
 
     def left_out(self, groups: Iterable[Tensor] | None = None) -> tuple[Tensor, Tensor]:
         """Return residuals (n, R) of rows left out, alone or in groups, and their variances (n,)."""
@@ -87,5 +87,5 @@ class Conditioned:
 def weighted_sum(cross: Tensor, weights: Tensor) -> Tensor:
     """Return `cross @ weights` (..., m, R); covariances (..., m, n) may be real and weights complex."""
     if weights.is_complex() and not cross.is_complex():
-        return as_pairs(lambda pairs: cross @ pairs, weights)
+        return solve_as_pairs(lambda pairs: cross @ pairs, weights)
     return cross @ weights

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gsparc.processes.censored import PseudoValues, log_evidence
-from gsparc.processes.factor import BLAS, Factor, NotPositiveDefiniteError
+from gsparc.processes.factor import BLAS, Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.worker import stop_when_late
 
@@ -103,7 +103,7 @@ class Profiled(torch.autograd.Function):
     def forward(ctx: Any, gram: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Score values (n, P) with a covariance (n, n) relative to the amplitude [nats per number]."""
         factor = Factor.of(gram.detach(), "raise")
-        weights, (count, outputs) = factor.solved(values), values.shape
+        weights, (count, outputs) = factor.solve(values), values.shape
         amplitude = (values * weights).mean().clamp_min(TINY)
         ctx.save_for_backward(
             (outputs * factor.inverse - weights @ weights.T / amplitude) / (2 * count * outputs)
@@ -159,7 +159,7 @@ def minimise(
         at = torch.from_numpy(point.copy()).requires_grad_()
         try:
             value = objective(at)
-        except NotPositiveDefiniteError:  # in float64: as bad as it gets
+        except NotDefiniteError:  # in float64: as bad as it gets
             return BAD, np.zeros(len(point))
         (slope,) = torch.autograd.grad(value, at)
         return float(value.detach()), slope.numpy()

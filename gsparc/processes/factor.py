@@ -32,7 +32,7 @@ FEW = 128  # rows below which torch is as quick
 BLAS = ThreadpoolController().select(user_api="blas")
 
 
-class NotPositiveDefiniteError(ValueError):
+class NotDefiniteError(ValueError):
     """A covariance has no Cholesky factor."""
 
 
@@ -41,12 +41,12 @@ class Factor:
     """`K = L L^H`.
 
     >>> factor = Factor.of(torch.tensor([[4.0, 2.0], [2.0, 3.0]]))
-    >>> factor.solved(torch.tensor([[8.0], [7.0]])).T
+    >>> factor.solve(torch.tensor([[8.0], [7.0]])).T
     tensor([[1.2500, 1.5000]])
     >>> Factor.of(torch.tensor([[1.0, 2.0], [2.0, 1.0]]), failing="raise")
     Traceback (most recent call last):
         ...
-    gsparc.processes.factor.NotPositiveDefiniteError: a covariance is not positive definite
+    gsparc.processes.factor.NotDefiniteError: a covariance is not positive definite
 
     Attributes:
         lower: L (..., n, n), real or complex.
@@ -69,14 +69,14 @@ class Factor:
                 of a batch of steps some may fail.
 
         Raises:
-            NotPositiveDefiniteError: it has no factor, nor with the largest ridge.
+            NotDefiniteError: it has no factor, nor with the largest ridge.
         """
         raise_if_cancelled()
         lower, failed = _factored(covariance)
         if not failed or failing == "ignore":
             return cls(lower)
         if failing == "raise" or covariance.dim() > 2:
-            raise NotPositiveDefiniteError("a covariance is not positive definite")
+            raise NotDefiniteError("a covariance is not positive definite")
         exact = covariance.to(torch.complex128 if covariance.is_complex() else torch.float64)
         exact = exact.clone() if exact is covariance else exact
         bound, added = ROUNDING * float(exact.diagonal().real.sum()), 0.0
@@ -88,16 +88,16 @@ class Factor:
             if not failed:
                 return cls(lower.to(covariance.dtype))
         most = RIDGES[-1] * ROUNDING * len(covariance)
-        raise NotPositiveDefiniteError(
+        raise NotDefiniteError(
             f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {most:.1e} of its "
             "mean variance as noise, more than rounding explains: "
             "look for rows that are not finite (gsparc check FILE)"
         )
 
-    def whitened(self, values: Tensor) -> Tensor:
+    def whiten(self, values: Tensor) -> Tensor:
         """Return `L^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
-            return as_pairs(self.whitened, values)
+            return solve_as_pairs(self.whiten, values)
         values = values.to(self.lower.dtype)
         if values.shape[-1] == 1 or not _alone(self.lower, values):
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
@@ -109,14 +109,14 @@ class Factor:
         # A band of rows ends at its diagonal: the zeros above are neither stored nor read.
         return [np.ascontiguousarray(root[i : i + step, : i + step]) for i in range(0, len(root), step)]
 
-    def solved(self, values: Tensor) -> Tensor:
+    def solve(self, values: Tensor) -> Tensor:
         """Return `K^-1 V` of values (..., n, R)."""
         if values.is_complex() and not self.lower.is_complex():
-            return as_pairs(self.solved, values)
+            return solve_as_pairs(self.solve, values)
         values = values.to(self.lower.dtype)
         if values.shape[-1] == 1 or not _alone(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
-        return self._triangular(self.whitened(values), adjoint=True)
+        return self._triangular(self.whiten(values), adjoint=True)
 
     def _triangular(self, values: Tensor, adjoint: bool) -> Tensor:
         """`L^-1 V`, or `L^-H V`."""
@@ -165,7 +165,7 @@ def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> lis
     Rounding moves their squares by 1e-6 where the noise is a hundredth of the signal's variance.
     """
     if is_differentiated(*values) or max(len(one.lower) for one in factors) > ALONE:
-        return [one.whitened(part) for one, part in zip(factors, values, strict=True)]
+        return [one.whiten(part) for one, part in zip(factors, values, strict=True)]
     single, result = [part.float().numpy() for part in values], []
     # OpenBLAS multiplies few columns in a third of torch's time.
     with BLAS.limit(limits=1):
@@ -174,7 +174,7 @@ def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> lis
     return [torch.from_numpy(part).to(values[0].dtype) for part in result]
 
 
-def as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
+def solve_as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
     """Solve for complex values (..., n, R) through a real factor, as twice as many real ones."""
     pairs = torch.view_as_real(values.resolve_conj()).flatten(-2)
     return torch.view_as_complex(solve(pairs).unflatten(-1, (-1, 2)).contiguous())

@@ -82,19 +82,17 @@ def whitened_features(rows: Tensor, length: float, noise: float, name: Correlati
         root = Factor.of(gram).root
         # C = L^-T, as C C^T is to be the inverse of the covariance.
         return Features(rows, root.T.contiguous(), root)
-    return features_at_places(
+    return place_features(
         rows[pivoted_rows(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name
     )
 
 
-def features_at_places(
-    places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation
-) -> Features:
+def place_features(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Features:
     """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened_features`."""
     own = correlation(places, places, length, name)
     own.diagonal().add_(JITTER)
     factor = Factor.of(own)
-    seen = factor.whitened(correlation(places, rows, length, name))
+    seen = factor.whiten(correlation(places, rows, length, name))
     size, turn = torch.linalg.eigh(seen @ seen.T)
     size = size.clamp_min(LEAST)
     # K_ZZ^-1 - (K_ZZ + K_ZX K_XZ / s)^-1 = L^-T U q / (s + q) U^T L^-1

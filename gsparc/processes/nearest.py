@@ -25,7 +25,7 @@ from gsparc.ops.queries import has_query_kernel, nearest_weights
 from gsparc.ops.transforms import to_numpy
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import TINY, fit_kernel
-from gsparc.processes.factor import Factor, NotPositiveDefiniteError
+from gsparc.processes.factor import Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.neighbourhood import (
     NEIGHBOURS,
@@ -54,7 +54,7 @@ def kriging_weights(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
         gram: (B, k, k) covariances of the near values, with their noise.
         cross: (B, k) of the places with them.
     """
-    weights = Factor.of(gram, "raise").solved(cross[..., None])[..., 0]
+    weights = Factor.of(gram, "raise").solve(cross[..., None])[..., 0]
     return weights, (weights * cross).sum(-1)
 
 
@@ -174,7 +174,7 @@ class Nearest(Posterior):
         if (lengths := kernel.compiled) and has_query_kernel(queries):
             result = nearest_weights(queries, self.places, self._solvable, index, lengths, kernel.shares)
             if result is None:
-                raise NotPositiveDefiniteError("a covariance of near rows is not positive definite")
+                raise NotDefiniteError("a covariance of near rows is not positive definite")
             return result
         return neighbour_weights(kernel, queries, self.places[index], self.noise[index])
 
@@ -189,7 +189,7 @@ class Nearest(Posterior):
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
-        return nearest_distance(self.near.every, queries)
+        return nearest_distance(self.near.tree, queries)
 
     def at(self, chosen: np.ndarray, seed: int) -> Self:
         """Return the same given the places `chosen` alone; the mean law's weights stay as all places say."""
@@ -259,7 +259,7 @@ def fit_trend_weights(
     first = min(FIRST, len(places))
     gram = kernel.between(at[:first], at[:first])
     gram.diagonal().add_(noise[:first])
-    white = [Factor.of(gram, "raise").whitened(both[:first])]
+    white = [Factor.of(gram, "raise").whiten(both[:first])]
     start = first
     while start < len(places):
         # The tree of the rows so far serves as many again: few trees for any number of rows.
@@ -275,7 +275,7 @@ def fit_trend_weights(
     terms, values = flat[:, outputs:], flat[:, :outputs]
     # Linear regression on white rows, whose weights have unit variance before.
     precision = Factor.of(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
-    return precision.solved(terms.T @ values), precision.inverse
+    return precision.solve(terms.T @ values), precision.inverse
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ class NeighbourSample:
         )
 
 
-def density_given_nearest(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Tensor]:
+def nearest_density(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Tensor]:
     """Return the negative log density, mean over rows [nats], and the best amplitude."""
     noise = kernel.noise
     gram = kernel.correlation(sample.apart) + torch.diag_embed(noise / sample.counts + JITTER)
@@ -319,7 +319,7 @@ def density_given_nearest(kernel: Kernel, sample: NeighbourSample) -> tuple[Tens
     return density + EXCESS * excess.square() / len(variance), amplitude
 
 
-def most_likely_given_nearest(starts: list[Kernel], sample: NeighbourSample, distance: np.ndarray) -> Kernel:
+def fit_kernel_nearest(starts: list[Kernel], sample: NeighbourSample, distance: np.ndarray) -> Kernel:
     """Find the kernel of largest density of rows given their neighbours, from the best of `starts`.
 
     Args:
@@ -328,7 +328,7 @@ def most_likely_given_nearest(starts: list[Kernel], sample: NeighbourSample, dis
         distance: between rows of the whole site [m], for bounds of lengths.
     """
     bounds = starts[0].bounds(torch.from_numpy(distance))
-    return fit_kernel(lambda one: density_given_nearest(one, sample), starts, bounds)[1]
+    return fit_kernel(lambda one: nearest_density(one, sample), starts, bounds)[1]
 
 
 def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:
@@ -365,6 +365,6 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
-    return most_likely_given_nearest(
+    return fit_kernel_nearest(
         starts, sample, scale
     ), f"{note} among {' and '.join(str(len(o)) for o in sets)}"

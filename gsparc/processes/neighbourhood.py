@@ -94,11 +94,11 @@ class Neighbourhood(Stored):
         return [(own, cKDTree(self.places[own])) for own in sets]
 
     @cached_property
-    def every(self) -> cKDTree:
+    def tree(self) -> cKDTree:
         """Of all places."""
         return cKDTree(self.places)
 
-    def shares(self, most: int) -> list[tuple[np.ndarray, int]]:
+    def split_by_density(self, most: int) -> list[tuple[np.ndarray, int]]:
         """Return rows (m,) of each set, the densest first, and how many of `most` neighbours are of it."""
         sparser = len(self._trees) - 1
         share = int(most * WIDER) // max(sparser, 1)
@@ -120,7 +120,7 @@ class Neighbourhood(Stored):
         result: list[np.ndarray] = []
         # One more is looked for, as the place itself is among the nearest.
         more = 0 if without is None else 1
-        for (own, count), (_, tree) in zip(self.shares(most), self._trees[::-1], strict=True):
+        for (own, count), (_, tree) in zip(self.split_by_density(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if without is not None:
                 # A stable sort puts the place itself last and keeps the others from near to far.

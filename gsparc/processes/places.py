@@ -34,16 +34,16 @@ def other_end(places: Places) -> Places:
     return places[..., 3:6]
 
 
-def beyond_ends(places: Places) -> Places:
+def extra_columns(places: Places) -> Places:
     """Return what else than both ends (..., D - 6) tells rows of places (..., D)."""
     return places[..., 6:]
 
 
-def of_both_ends(places: np.ndarray | Tensor) -> bool:
+def has_both_ends(places: np.ndarray | Tensor) -> bool:
     """Tell whether places (..., D) are of both ends."""
     return places.shape[-1] > len(ORIGIN)
 
 
-def on_floor(points: Places) -> Places:
+def horizontal(points: Places) -> Places:
     """Return horizontal coordinates (..., 2) of points (..., 3) [m]."""
     return points[..., :2]

@@ -56,7 +56,7 @@ class Exact(Posterior):
         """Condition on values (n, P) at places (n, D) float64 [m]; with their factor where it is known."""
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor
-        result = cls(prior, places, factor.solved(values - prior.mean(places)), extra)
+        result = cls(prior, places, factor.solve(values - prior.mean(places)), extra)
         result.__dict__["factor"] = factor  # as `cached_property` would keep it
         return result
 
@@ -76,7 +76,7 @@ class Exact(Posterior):
         cross, prior = self.cross(queries, own), self.prior.variance(own)
         if self._near is not None:
             return Answer(self._mean(queries, cross), self._near.answer(queries).left.minimum(prior))
-        known = self.factor.whitened(cross.T).square().sum(0)
+        known = self.factor.whiten(cross.T).square().sum(0)
         # Rounding may leave a variance below 0 at a row's place.
         return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
 
@@ -85,7 +85,7 @@ class Exact(Posterior):
         """What states the variance of many rows: exactly it costs their number squared for each place."""
         if len(self.rows) <= MANY or not self.prior.kernel.by_distance:
             return None
-        terms = self.factor.whitened(self._columns)
+        terms = self.factor.whiten(self._columns)
         # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.
         spread = torch.eye(terms.shape[1], dtype=terms.dtype) - terms.T @ terms
         none, noise = self.rows.new_zeros(len(self.rows), 1), self.prior.kernel.noise + self.extra
@@ -131,7 +131,7 @@ class Exact(Posterior):
     def covariance(self, queries: Tensor) -> Tensor:
         """Return the covariance (B, B) of the signal at places (B, D), in the kernel's units."""
         cross = self.cross(queries, self.prior.columns(queries))
-        white = self.factor.whitened(cross.T)
+        white = self.factor.whiten(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
 
 

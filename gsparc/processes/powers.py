@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.averages import mixture_moments
-from gsparc.processes.censored import CERTAIN, ConditionalGaussian, expectation_propagation
+from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
@@ -56,14 +56,14 @@ class PowerRows:
         return type(self)(*(part[chosen] for part in vars(self).values()))
 
     @property
-    def loud(self) -> Self:
+    def measured(self) -> Self:
         """Those that were measured."""
         return self.at(np.flatnonzero(~self.silent))
 
     @property
     def heard(self) -> Self:
         """Those that were measured, or all where none was."""
-        return self if self.silent.all() else self.loud
+        return self if self.silent.all() else self.measured
 
     def means_at_places(self) -> PlaceValues:
         """Return means (m, 1) [dB] over the rows of each place."""
@@ -75,7 +75,7 @@ class PowerRows:
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
         return distances(places, places), trend.columns(places), rest[:, None]
 
-    def drawn(self, most: int, seed: int) -> Self:
+    def draw(self, most: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
         return self.at(draw_rows(self.silent, most, seed))
 
@@ -205,8 +205,8 @@ def condition_on_powers(
         least: silent rows that are used where fewer were heard.
     """
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
-        return _exact(rows.drawn(MOST_ROWS, seed), prior, least)
-    loud = rows.loud
+        return _exact(rows.draw(MOST_ROWS, seed), prior, least)
+    loud = rows.measured
     values = loud.means_at_places()
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
@@ -214,7 +214,7 @@ def condition_on_powers(
     note = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
     if not rows.silent.any():
         return PowerProcess(condition_on_nearest(prior, values, seed), heard), (note,)
-    part = rows.drawn(MOST_ROWS, seed)
+    part = rows.draw(MOST_ROWS, seed)
     few, notes = _exact(part, prior, least)
     posterior = few.posterior
     assert isinstance(posterior, Exact)
@@ -254,7 +254,7 @@ def _with_pseudo_values(
     unit = (decibels - mean) / deviation
     known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
     side = torch.from_numpy(rows.side)[silent]
-    doubt = side * known.doubt(level)
+    doubt = side * known.z_score(level)
     near = (doubt < CERTAIN).nonzero()[:, 0]
     most = min(max(int((~silent).sum()), least), MOST_SILENT)
     if len(near) > most:
@@ -263,7 +263,7 @@ def _with_pseudo_values(
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
-        sites = expectation_propagation(known.at(near), level[near], side[near])
+        sites = fit_by_ep(known.at(near), level[near], side[near])
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import ExponentialShadowing, distances, to_number
-from gsparc.processes.places import Places, moving_end, on_floor, other_end
+from gsparc.processes.places import Places, horizontal, moving_end, other_end
 from gsparc.processes.term import Term
 from gsparc.processes.trend import Trend
 
@@ -66,13 +66,13 @@ class Sectors(Trend):
     unit: float = 1.0
 
     @cached_property
-    def which(self) -> tuple[Tensor, Tensor]:
+    def units(self) -> tuple[Tensor, Tensor]:
         """Return which of its site (T, R) each sector is, and of which band (T, bands), as units."""
         rank = (self.site[:, None] == self.site).tril(-1).sum(1)
         units = torch.nn.functional.one_hot
         return units(rank).double(), units(self.band, len(self.levels)).double()
 
-    def joined_by(self, sectors: Tensor) -> Sectors:
+    def add_sectors(self, sectors: Tensor) -> Sectors:
         """Return these and further ones (k, 5), see `table`, of a site of their own and the first band."""
         site = self.site.new_full((len(sectors),), int(self.site.max()) + 1)
         band, table = torch.cat([self.band, 0 * site]), torch.cat([self.table, sectors.double()])
@@ -99,7 +99,7 @@ class Sectors(Trend):
         shared = self.shared if shared is None else shared
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
         away = moving_end(places) - other_end(places)
-        flat = on_floor(away).norm(dim=1).clamp_min(1e-3)
+        flat = horizontal(away).norm(dim=1).clamp_min(1e-3)
         # From north and clockwise, as azimuths of sectors are given.
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
         down = torch.rad2deg(torch.atan2(-away[:, 2], flat))
@@ -124,7 +124,7 @@ class Sectors(Trend):
     def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
         """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
         slopes = self.slopes(places)[1] if slopes is None else slopes
-        bands = self.which[1][sector_of(places).long()]
+        bands = self.units[1][sector_of(places).long()]
         return torch.cat([slopes[:, : len(SHARED)], LEVEL_DB * bands], 1)
 
     def columns(self, places: Tensor) -> Tensor:
@@ -137,7 +137,7 @@ class Sectors(Trend):
         (mean, slopes), decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
-        own = (self.which[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
+        own = (self.units[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
         return mean, torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
 
 
@@ -159,7 +159,7 @@ class SectorShadowing(Term[Tensor]):
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return that (..., n, m) of places (..., n, 7) and (..., m, 7), see `Term`."""
         distance = distances(moving_end(a), moving_end(b))
-        ways = (on_floor(moving_end(at) - other_end(at)) for at in (a, b))
+        ways = (horizontal(moving_end(at) - other_end(at)) for at in (a, b))
         towards = [torch.nn.functional.normalize(way, dim=-1) for way in ways]
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = (towards[0] / BEARING**2 @ towards[1].mT - 1 / BEARING**2).exp()

@@ -43,7 +43,7 @@ class Block:
         deviation = process_deviation(process.prior)
         # L^T K^-1 y = L^-1 y, for covariances in units of the amplitude.
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
-        return cls(process, process.factor.whitened(columns) / deviation, values)
+        return cls(process, process.factor.whiten(columns) / deviation, values)
 
 
 class SharedTermsPosterior:
@@ -99,7 +99,7 @@ class SharedTermsPosterior:
             left = left.index_add(0, at, spread + shared.square().sum(2)[there])
         return mean, left
 
-    def together(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    def predict_joint(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
         own = self.never.columns(flat)
@@ -150,12 +150,12 @@ class SharedTermsPosterior:
             if rounded:
                 white = [one.T for one in whitened_rounded(factors, parts)]
             else:
-                white = [one.whitened(part).T for one, part in zip(factors, parts, strict=True)]
+                white = [one.whiten(part).T for one, part in zip(factors, parts, strict=True)]
             if len(self.mean):
                 told = [one.double() @ block.columns for one, block in zip(white, blocks, strict=True)]
                 shared = shared - torch.cat(told)
         if len(self.mean):
-            shared = self.factor.whitened(shared.T).T
+            shared = self.factor.whiten(shared.T).T
         return prior, more, white, shared.unflatten(0, queries.shape[:2])
 
     def _stack(self, asked: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
@@ -166,7 +166,7 @@ class SharedTermsPosterior:
                 block, process = self.block(one), self.processes[one]
                 rest = (block.values - block.columns @ self.mean)[:, None]
                 # The rest is whitened: K^-1 L rest = L^-T rest.
-                weights = process.factor.solved(process.factor.lower @ rest)
+                weights = process.factor.solve(process.factor.lower @ rest)
                 parts.append((process.rows, process.prior.columns(process.rows), weights))
             padded = (pad_sequence(list(part), batch_first=True) for part in zip(*parts, strict=True))
             self._stacks[asked, dtype] = tuple(part.to(dtype) for part in padded)
@@ -178,7 +178,7 @@ class SharedTermsPosterior:
         block = self.block(number)
         root = block.process.factor.root / process_deviation(block.process.prior)
         # Diagonal of `L^-T (1 - V C V^T) L^-1`, C the covariance of the weights (Woodbury).
-        known = self.factor.whitened((root.T @ block.columns).T).square().sum(0)
+        known = self.factor.whiten((root.T @ block.columns).T).square().sum(0)
         rest = block.values - block.columns @ self.mean
         return left_out_residuals(root.square().sum(0) - known, root.T @ rest)
 
@@ -196,7 +196,7 @@ def shared_weights(blocks: list[Block]) -> tuple[Factor, Tensor]:
     precision = sum(grams, torch.eye(size, dtype=torch.float64))
     factor = Factor.of(precision, "raise")
     right = torch.stack([block.columns.T @ block.values for block in blocks]).sum(0)
-    return factor, factor.solved(right[:, None])[:, 0]
+    return factor, factor.solve(right[:, None])[:, 0]
 
 
 def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
@@ -207,9 +207,9 @@ def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
     factor, mean = shared_weights(blocks)
     result = []
     for block in blocks:
-        known = factor.whitened(block.columns.T)
+        known = factor.whiten(block.columns.T)
         lower = block.process.factor.lower * process_deviation(block.process.prior)
         inner = Factor.of(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
-        error = inner.solved((block.values - block.columns @ mean)[:, None])[:, 0]
-        result.append((lower @ error, inner.whitened(lower.T).square().sum(0)))
+        error = inner.solve((block.values - block.columns @ mean)[:, None])[:, 0]
+        result.append((lower @ error, inner.whiten(lower.T).square().sum(0)))
     return result

@@ -25,7 +25,7 @@ def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
         setattr(_asked, name, before)
 
 
-def cancelled_by(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
+def cancel_when(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
     """Make `raise_if_cancelled` raise, within, as soon as `unwanted`, or who surrounds it, says so."""
     return _within("unwanted", unwanted)
 
@@ -38,10 +38,10 @@ def raise_if_cancelled() -> None:
         raise Cancelled
 
 
-def ending_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
+def end_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
     """Make `out_of_time` say, within, what `over`, or who surrounds it, says, in this thread.
 
-    >>> with ending_when(lambda: True):
+    >>> with end_when(lambda: True):
     ...     out_of_time()
     True
     >>> out_of_time()
@@ -50,7 +50,7 @@ def ending_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
     return _within("over", over)
 
 
-def after_steps(most: int) -> Callable[[], bool]:
+def step_limit(most: int) -> Callable[[], bool]:
     """Return a call: whether this thread has made `most` further factors and blocks of candidates."""
     end = getattr(_asked, "steps", 0) + most
     return lambda: getattr(_asked, "steps", 0) >= end

@@ -14,7 +14,7 @@ from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import ARRAYS, Paths, group_offsets
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -67,7 +67,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
 def assemble(
     campaign: Campaign,
     survey: Survey,
-    effects: PropagationEffects,
+    effects: Effects,
     choice: Choice | None,
     convergence: Convergence | None,
     seconds: float,
@@ -141,11 +141,7 @@ def join_shards(shards: Shards, rows: int) -> Rows:
 
 
 def _arrays(
-    campaign: Campaign,
-    survey: Survey,
-    effects: PropagationEffects,
-    whole: Mapping[str, np.ndarray],
-    paths: Paths,
+    campaign: Campaign, survey: Survey, effects: Effects, whole: Mapping[str, np.ndarray], paths: Paths
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, survey.engine.wavelength
     csi = whole["csi"]
@@ -198,7 +194,7 @@ def _ends(survey: Survey) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _provenance(campaign: Campaign, engine: Engine, effects: PropagationEffects) -> dict[str, Any]:
+def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[str, Any]:
     """Attributes of the file: what it is and how it was made."""
     return {
         "name": campaign.scene.name,

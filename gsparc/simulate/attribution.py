@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
@@ -83,7 +83,7 @@ class Probe:
     """
 
     paths: Paths
-    effects: PropagationEffects
+    effects: Effects
     frequency_hz: np.ndarray
     wavelength: float
     elements: np.ndarray
@@ -107,7 +107,7 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def shares(self, remaining: PropagationEffects | Paths) -> np.ndarray:
+    def shares(self, remaining: Effects | Paths) -> np.ndarray:
         """Return the share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
@@ -116,7 +116,7 @@ class Probe:
         full = self.paths.received_power()
         return 1 - self._rest(remaining).received_power() / np.where(full > 0, full, 1)
 
-    def nmse(self, remaining: PropagationEffects | Paths) -> np.ndarray:
+    def nmse(self, remaining: Effects | Paths) -> np.ndarray:
         """Return the NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full, rest = self._channels, self._responses(self._rest(remaining))
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
@@ -125,7 +125,7 @@ class Probe:
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)
 
-    def errors(self, remaining: PropagationEffects | Paths, deliverable: Deliverable) -> np.ndarray:
+    def errors(self, remaining: Effects | Paths, deliverable: Deliverable) -> np.ndarray:
         """Return the deliverable's error at each receiver (R,), in the unit of its tolerance."""
         # Losing everything is infinite in decibels, and would spoil every quantile.
         least = 10 ** (-SILENCE_DB / 10)
@@ -139,9 +139,9 @@ class Probe:
         error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
         return error / np.maximum(nearest, 1e-12)
 
-    def _rest(self, remaining: PropagationEffects | Paths) -> Paths:
+    def _rest(self, remaining: Effects | Paths) -> Paths:
         # Nothing is traced again: without an effect the solver would draw other rays.
-        return remaining if isinstance(remaining, Paths) else self.paths.under(remaining)
+        return remaining if isinstance(remaining, Paths) else self.paths.keep_effects(remaining)
 
     def _responses(self, paths: Paths) -> np.ndarray:
         return paths.responses(self.frequency_hz, self.elements, self.wavelength)
@@ -150,11 +150,11 @@ class Probe:
         return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
 
 
-def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
+def list_removals(full: Effects) -> dict[str, Effects]:
     """Return what can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation.
 
-    >>> full = PropagationEffects(depth=2).without("refraction", "diffraction", "diffuse")
-    >>> list(removals(full))
+    >>> full = Effects(depth=2).without("refraction", "diffraction", "diffuse")
+    >>> list(list_removals(full))
     ['line_of_sight', 'specular', 'depth > 1', 'polarisation']
     """
     names = [*full.on, *(f"depth > {depth}" for depth in range(full.depth - 1, 0, -1))]
@@ -162,15 +162,15 @@ def removals(full: PropagationEffects) -> dict[str, PropagationEffects]:
     return {name: less for name in names if (less := _without(full, name)) is not None}
 
 
-def combinations(full: PropagationEffects, removable: tuple[str, ...]) -> list[PropagationEffects]:
-    """List every set of switches without some of `removable` (named as in `removals`); `full` first."""
+def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
+    """List every set of switches without some of `removable` (named as in `list_removals`); `full` first."""
     sets = {full}
     for name in removable:
         sets |= {less for less in (_without(one, name) for one in sets) if less is not None}
     return sorted(sets, key=lambda s: (len(full.on) - len(s.on), full.depth - s.depth, not s.polarisation))
 
 
-def _without(effects: PropagationEffects, name: str) -> PropagationEffects | None:
+def _without(effects: Effects, name: str) -> Effects | None:
     """None when nothing would be left."""
     if name.startswith("depth > "):
         return replace(effects, depth=min(effects.depth, int(name[8:])))

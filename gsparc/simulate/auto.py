@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.attribution import Deliverable, Probe, combinations, list_removals
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
 
 # Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
@@ -45,7 +45,7 @@ class AutoSettings:
     confidence: float = 0.85
     held_back: int = 64
     rays: float = 0.3
-    full: PropagationEffects = field(default_factory=lambda: PropagationEffects(depth=5))
+    full: Effects = field(default_factory=lambda: Effects(depth=5))
 
     def __post_init__(self) -> None:
         if self.probes < 16 or self.held_back < 16:
@@ -120,7 +120,7 @@ class Choice:
         verdict: filled by `verify`.
     """
 
-    effects: PropagationEffects
+    effects: Effects
     deliverable: str
     table: tuple[EffectRow, ...]
     probes: int
@@ -138,7 +138,7 @@ class Choice:
         """Invert `dataclasses.asdict`."""
         verdict = None if stored["verdict"] is None else Verification(**stored["verdict"])
         table = tuple(EffectRow(**row) for row in stored["table"])
-        effects = PropagationEffects(**stored["effects"])
+        effects = Effects(**stored["effects"])
         return Choice(**{**stored, "effects": effects, "table": table, "verdict": verdict})
 
 
@@ -154,9 +154,9 @@ def decide(probe: Probe, settings: AutoSettings) -> Choice:
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
     most = settings.allowed_failures(heard)
-    rows = [_row(name, probe, less, required) for name, less in removals(full).items()]
+    rows = [_row(name, probe, less, required) for name, less in list_removals(full).items()]
 
-    def holds(effects: PropagationEffects) -> bool:
+    def holds(effects: Effects) -> bool:
         errors = probe.errors(effects, required)[probe.reached]
         return bool((errors > required.tolerance).sum() <= most)
 
@@ -194,7 +194,7 @@ def fewer_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Pat
     return replace(choice, table=table, samples=samples if enough else None)
 
 
-def keep_everything(choice: Choice, full: PropagationEffects) -> Choice:
+def keep_everything(choice: Choice, full: Effects) -> Choice:
     """Return all effects where held-back receivers refute a choice; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
@@ -220,10 +220,10 @@ def allowed_failures(count: int, quantile: float, confidence: float) -> int:
     return max(most - int(binom.cdf(most, count, wrong) > risk), 0)
 
 
-def relative_cost(effects: PropagationEffects, full: PropagationEffects, rays: float = 1.0) -> float:
+def relative_cost(effects: Effects, full: Effects, rays: float = 1.0) -> float:
     """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
 
-    >>> full = PropagationEffects(depth=5)
+    >>> full = Effects(depth=5)
     >>> relative_cost(full, full), relative_cost(full.without("diffuse"), full) < 1
     (1.0, True)
     """
@@ -233,11 +233,9 @@ def relative_cost(effects: PropagationEffects, full: PropagationEffects, rays: f
     return bounces * math.prod(1 - PRICE[name] for name in off) * (1 - RAYS + RAYS * rays)
 
 
-def _cheapest(
-    sets: list[PropagationEffects], holds: Callable[[PropagationEffects], bool], full: PropagationEffects
-) -> PropagationEffects:
+def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effects) -> Effects:
     """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
-    enough: list[PropagationEffects] = []
+    enough: list[Effects] = []
     for effects in sets:
         if enough and relative_cost(effects, full) > (1 + SIMILAR) * relative_cost(enough[0], full):
             break
@@ -246,7 +244,7 @@ def _cheapest(
     return min(enough, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
 
 
-def _row(name: str, probe: Probe, less: PropagationEffects | Paths, required: Deliverable) -> EffectRow:
+def _row(name: str, probe: Probe, less: Effects | Paths, required: Deliverable) -> EffectRow:
     """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
     share, error = (
         part[probe.reached] for part in (np.abs(probe.shares(less)), probe.errors(less, required))

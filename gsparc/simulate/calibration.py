@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer
 
 log = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ def used_materials(tracer: RayTracer) -> dict[str, Material]:
     """Return materials of the scene's surfaces, as the tracer has them."""
     return {
         name: Material(float(one.relative_permittivity[0]), float(one.conductivity[0]))
-        for name, one in sorted(tracer.surfaces().items())
+        for name, one in sorted(tracer.radio_materials().items())
     }
 
 
@@ -90,7 +90,7 @@ def apply_materials(tracer: RayTracer, materials: Mapping[str, Material]) -> Non
     import drjit as dr
     import mitsuba as mi
 
-    there = tracer.surfaces()
+    there = tracer.radio_materials()
     for name, material in materials.items():
         if name in there:
             # Plain numbers are constants of kernels: every other value would compile all of them anew.
@@ -104,7 +104,7 @@ class Replay:
     The tracer's present materials decide which paths are tried.
     """
 
-    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: PropagationEffects) -> None:
+    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: Effects) -> None:
         self.tracer, self._count = tracer, len(receivers)
         self._parts: list[tuple[dict[str, Any], Any]] = []
         first = 0
@@ -131,7 +131,7 @@ class Replay:
         import drjit as dr
         import mitsuba as mi
 
-        there, free = self.tracer.surfaces(), []
+        there, free = self.tracer.radio_materials(), []
         for name, logarithms in materials.items():
             pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply_materials`
             for one in pair:
@@ -176,7 +176,7 @@ class Replay:
 
 
 def _field_arguments(
-    tracer: RayTracer, solution: Any, effects: PropagationEffects, first: int
+    tracer: RayTracer, solution: Any, effects: Effects, first: int
 ) -> tuple[dict[str, Any], Any]:
     """Arguments of the field calculator, and the receivers of the paths, from `first` on."""
     import mitsuba as mi

@@ -16,7 +16,7 @@ from gsparc.simulate.assembly import SECONDS, Assembled, assemble, join_shards, 
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.convergence import Convergence, measure_convergence
 from gsparc.simulate.deciding import Changed, Decision
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -41,7 +41,7 @@ class Outcome:
 
     dataset: Assembled
     survey: Survey
-    effects: PropagationEffects
+    effects: Effects
     choice: Choice | None
     changed: Changed | None
     convergence: Convergence | None
@@ -105,7 +105,7 @@ class _Tracing:
     """Traces and stores shards; where it is sent to, it builds the scene once, which cannot be pickled."""
 
     campaign: Campaign
-    effects: PropagationEffects
+    effects: Effects
     shards: Shards
     survey: Survey | None
 
@@ -123,7 +123,7 @@ class _Tracing:
         self.shards.put(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
 
 
-def _trace_all(campaign: Campaign, survey: Survey, effects: PropagationEffects, shards: Shards) -> None:
+def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> None:
     """Trace what is missing."""
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]

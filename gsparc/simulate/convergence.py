@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import spectra
 from gsparc.simulate.survey import Survey
@@ -42,7 +42,7 @@ class Convergence:
 def measure_convergence(
     campaign: Campaign,
     survey: Survey,
-    effects: PropagationEffects,
+    effects: Effects,
     traced: Mapping[str, np.ndarray],
     left_out: np.ndarray,
 ) -> Convergence | None:
@@ -57,7 +57,7 @@ def measure_convergence(
     if count == 0 or not survey.engine.random:
         return None
     # So many that enough remain when those traced otherwise are taken out.
-    rows = survey.spread(count + len(left_out), campaign.scene.seed + 1)
+    rows = survey.spread_rows(count + len(left_out), campaign.scene.seed + 1)
     rows = np.sort(rows[~np.isin(rows, left_out)][:count])
     again = survey.trace(rows, effects, campaign.sampling.seed + 1)
     csi, spectrum, power = (traced[name][rows] for name in ("csi", "spectrum", "received_power"))

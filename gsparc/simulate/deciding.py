@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Probe
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.scenes.receivers import nearest_rows
 from gsparc.simulate.settings import Campaign
@@ -55,7 +55,7 @@ class Decision:
     """
 
     choice: Choice
-    effects: PropagationEffects
+    effects: Effects
     samples: int | None = None
     changed: Changed | None = None
     rows: np.ndarray | None = None
@@ -72,7 +72,7 @@ class Decision:
         """Invert `note`."""
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
-        effects = PropagationEffects(**note["effects"])
+        effects = Effects(**note["effects"])
         return Decision(Choice.from_dict(note["choice"]), effects, note.get("samples"), changed)
 
 
@@ -111,12 +111,12 @@ class Decider:
         if self.survey.engine.random and 0 < saved <= COMPILING:
             log.info("auto: everything is simulated: for %d receivers, compiling costs more", self.left)
             effects, samples = self.full, None
-        return Decision(choice, effects, samples, changed, self.rows, self.paths.under(effects))
+        return Decision(choice, effects, samples, changed, self.rows, self.paths.keep_effects(effects))
 
     def _groups(self) -> tuple[np.ndarray, np.ndarray]:
         """Probes and held-back rows, both spread out."""
         wanted = self.settings.probes + self.settings.held_back
-        chosen = self.survey.spread(wanted, self.campaign.scene.seed)
+        chosen = self.survey.spread_rows(wanted, self.campaign.scene.seed)
         share = self.settings.probes / wanted
         # Farthest-point order: taking every so many leaves both groups spread out.
         turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
@@ -136,7 +136,7 @@ class Decider:
         array, tones = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
         return Probe(self._of(rows), self.full, tones, wavelength, array, campaign.spectrum, near)
 
-    def _verified(self, choice: Choice, less: PropagationEffects | Paths) -> tuple[Choice, Changed]:
+    def _verified(self, choice: Choice, less: Effects | Paths) -> tuple[Choice, Changed]:
         held = self._probe(self.held_back)
         errors = held.errors(less, self.settings.required)
         verified = auto.verify(choice, self.settings, errors[held.reached])

@@ -24,7 +24,7 @@ MECHANISMS = ("line_of_sight", *BITS)
 
 
 @dataclass(frozen=True)
-class PropagationEffects:
+class Effects:
     """What is simulated; off means not computed.
 
     Attributes:
@@ -66,10 +66,10 @@ class PropagationEffects:
         """Names of the mechanisms that are computed."""
         return tuple(name for name in MECHANISMS if getattr(self, name))
 
-    def without(self, *names: str) -> PropagationEffects:
+    def without(self, *names: str) -> Effects:
         """Return the same with some switched off, and with what needs them.
 
-        >>> PropagationEffects().without("diffraction").on  # edges need it
+        >>> Effects().without("diffraction").on  # edges need it
         ('line_of_sight', 'specular', 'refraction', 'diffuse')
         """
         needs = {"specular": "diffuse", "diffraction": "edge_diffraction"}
@@ -79,7 +79,7 @@ class PropagationEffects:
     def allows(self, mechanisms: np.ndarray, order: np.ndarray) -> np.ndarray:
         """Tell which paths exist under these switches: (P,) bool.
 
-        >>> effects = PropagationEffects(refraction=False, depth=2)
+        >>> effects = Effects(refraction=False, depth=2)
         >>> effects.allows(np.array([0, SPECULAR, REFRACTION, SPECULAR], np.uint8), np.array([0, 1, 1, 3]))
         array([ True,  True, False, False])
 
@@ -97,10 +97,10 @@ class PropagationEffects:
         return ", ".join([name.replace("_", " ") for name in self.on] + extra)
 
 
-def from_config(config: Mapping[str, Any]) -> PropagationEffects:
+def from_config(config: Mapping[str, Any]) -> Effects:
     """Return switches from the config group `effects`.
 
     Raises:
         ValueError: a switch that does not exist, or a contradiction.
     """
-    return from_settings(PropagationEffects, config, "effects", "effect")
+    return from_settings(Effects, config, "effects", "effect")

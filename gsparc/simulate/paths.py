@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Paths:
         rows = first + np.arange(counts.sum())
         return Paths(group_offsets(counts), *(getattr(self, name)[rows] for name in ARRAYS))
 
-    def under(self, effects: PropagationEffects) -> Paths:
+    def keep_effects(self, effects: Effects) -> Paths:
         """Return what remains of a full simulation under these switches."""
         selected = self.select(effects.allows(self.mechanisms, self.order))
         return selected if effects.polarisation else replace(selected, gain=selected.gain[:, :1])

@@ -21,7 +21,7 @@ import torch
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
-from gsparc.simulate.effects import DIFFRACTION, EDGE, PropagationEffects
+from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
 from gsparc.simulate.paths import Paths, join_receivers
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
 from gsparc.simulate.scenes.solid import Solid
@@ -104,9 +104,7 @@ class RayTracer(Engine):
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         self._arrays: list[tuple[int, str]] = []  # what the scene's antennas are, shared by `at`
         self.retried = 0  # batches traced again because candidates were cut off
-        self._buffer_factor: dict[
-            PropagationEffects, int
-        ] = {}  # enlargement of the candidate buffer by effects
+        self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
 
     def at(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
         """Return the same scene with the transmitter elsewhere."""
@@ -138,12 +136,12 @@ class RayTracer(Engine):
             for name, m in self.scene.radio_materials.items()
         }
 
-    def surfaces(self) -> dict[str, Any]:
+    def radio_materials(self) -> dict[str, Any]:
         """Return Sionna's materials (`sionna.rt.RadioMaterial`) of the scene's objects, by name."""
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
-    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Trace paths to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
 
         Raises:
@@ -162,7 +160,7 @@ class RayTracer(Engine):
         return join_receivers(parts)
 
     def solutions(
-        self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None
+        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
     ) -> Iterator[tuple[Any, int]]:
         """Yield Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
 
@@ -172,9 +170,7 @@ class RayTracer(Engine):
         for first in range(0, len(receivers), size):
             yield from self._batch(receivers[first : first + size], effects, rays)
 
-    def _batch(
-        self, receivers: np.ndarray, effects: PropagationEffects, seed: int
-    ) -> Iterator[tuple[Any, int]]:
+    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Iterator[tuple[Any, int]]:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
         # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
@@ -200,7 +196,7 @@ class RayTracer(Engine):
         for part in (receivers[:half], receivers[half:]):
             yield from self._batch(part, effects, seed)
 
-    def _solve(self, receivers: np.ndarray, effects: PropagationEffects, seed: int, limit: int) -> Any | None:
+    def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Any | None:
         """Sionna's paths, or None when the solver ran into `limit` and left some out."""
         import sionna.rt as rt
         from sionna.rt.path_solvers import sb_candidate_generator as shooting

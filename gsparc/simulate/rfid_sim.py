@@ -42,10 +42,10 @@ ROOM = Room(
 )
 
 
-def hand_moved(count: int, seed: int) -> np.ndarray:
+def draw_hand_moved(count: int, seed: int) -> np.ndarray:
     """Draw tag positions (count, 3) [m] along smooth curves in the release's box, about 1.1 cm apart.
 
-    >>> hand_moved(100, seed=0).shape
+    >>> draw_hand_moved(100, seed=0).shape
     (100, 3)
     """
     rng = np.random.default_rng(seed)
@@ -64,7 +64,7 @@ def hand_moved(count: int, seed: int) -> np.ndarray:
 
 def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     """Write `count` spectra in the release's layout; the folder must not exist."""
-    positions = hand_moved(count, seed)
+    positions = draw_hand_moved(count, seed)
     array, frequency = planar_array() @ Rotation.from_quat(ORIENTATION).as_matrix().T, LIGHT / WAVELENGTH
     vectors = trace_room(
         ROOM, positions, GATEWAY, frequency, max_order=MAX_ORDER, array=array, snr_db=SNR_DB, seed=seed

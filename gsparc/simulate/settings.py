@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gsparc.simulate.auto import AutoSettings
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.scenes.build import SceneSettings
 from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
@@ -28,7 +28,7 @@ class Campaign:
     """
 
     scene: SceneSettings
-    effects: PropagationEffects | AutoSettings
+    effects: Effects | AutoSettings
     sampling: Sampling = field(default_factory=Sampling)
     spectrum: SpectrumSettings = field(default_factory=SpectrumSettings)
     csi: ArraySettings = field(default_factory=ArraySettings)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.effects import SPECULAR, PropagationEffects
+from gsparc.simulate.effects import SPECULAR, Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.survey import Engine
 
@@ -248,7 +248,7 @@ class ShoeboxEngine(Engine):
         if not room.contains(self.transmitter):
             raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
 
-    def supported(self, effects: PropagationEffects) -> PropagationEffects:
+    def supported(self, effects: Effects) -> Effects:
         """Keep line of sight and specular reflection; walls do not transmit, edges do not diffract."""
         return replace(
             effects.without("diffuse", "diffraction", "refraction"),
@@ -257,7 +257,7 @@ class ShoeboxEngine(Engine):
             depth=effects.depth if effects.specular else 0,
         )
 
-    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Trace paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = mirror_images(self.room, effects.depth)
         seen = visible_images(self.room, mirrored, self.transmitter[None], receivers)

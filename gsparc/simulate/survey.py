@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from gsparc.data.links.georeference import Georeference
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths, join_receivers
 from gsparc.simulate.scenes.receivers import farthest_points
 
@@ -59,7 +59,7 @@ class Survey:
         """Return the same with so many rays of a call."""
         return replace(self, engines=[engine.thinned(samples) for engine in self.engines])
 
-    def spread(self, count: int, seed: int) -> np.ndarray:
+    def spread_rows(self, count: int, seed: int) -> np.ndarray:
         """Choose at most `count` rows far apart, transmitters by turns."""
         order, turns = farthest_points(self.places, min(count, len(self.places)), seed), len(self.engines)
         # Place i with transmitter i, then every place with the next one: all have their turn.
@@ -68,7 +68,7 @@ class Survey:
         ]
         return np.concatenate(rounds)[:count]
 
-    def trace(self, rows: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
+    def trace(self, rows: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Trace paths of rows (n,), in their order."""
         owner, place = np.divmod(rows, len(self.places))
         # Stable: rows of a transmitter stay in the order in which they are traced.
@@ -94,13 +94,13 @@ class Engine(Protocol):
     wavelength: float
     random: bool
 
-    def trace(self, receivers: np.ndarray, effects: PropagationEffects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Trace paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Return material properties of the scene, for provenance and physical expectations."""
 
-    def supported(self, effects: PropagationEffects) -> PropagationEffects:
+    def supported(self, effects: Effects) -> Effects:
         """Return these switches without what the engine cannot compute."""
         return effects
 

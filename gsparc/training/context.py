@@ -44,7 +44,7 @@ class FitReport:
 
     def with_cost(self, cost: Cost) -> FitReport:
         """Return the report with its stages, which are logged."""
-        log.info("cost: %s", cost.described(self.limited_by))
+        log.info("cost: %s", cost.describe(self.limited_by))
         return replace(self, cost=cost)
 
 
@@ -114,7 +114,7 @@ class FitContext:
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
             )
 
-    def within(self, folder: str, **changes: Any) -> FitContext:
+    def for_part(self, folder: str, **changes: Any) -> FitContext:
         """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
         if self.loggers:
             from gsparc.training.tracking import PartLogger  # imports Lightning
@@ -123,7 +123,7 @@ class FitContext:
         # No folder stays none: below an empty path lies the working directory.
         return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
 
-    def curve(
+    def log_curve(
         self, seconds: float, what: str, error: float | None = None, step: int | None = None, **figures: Any
     ) -> None:
         """Add a point to the learning curve, in the folder and the loggers; see `curve.curve_row`."""

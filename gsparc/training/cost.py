@@ -41,7 +41,7 @@ class Cost:
         """Return the sum over stages without weight [s]."""
         return sum(self.unused.values())
 
-    def described(self, limited_by: Clock | None) -> str:
+    def describe(self, limited_by: Clock | None) -> str:
         """Return one line."""
         parts = []
         for name, spent in self.stages.items():

@@ -46,7 +46,7 @@ class Race:
         missed = (mean - target).detach()
         return cls(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
-    def looked(self, what: str, rows: np.ndarray, missed: Tensor, before: float = 0.0) -> float:
+    def log_candidate(self, what: str, rows: np.ndarray, missed: Tensor, before: float = 0.0) -> float:
         """Return the mean squared error of another candidate, where both left rows out.
 
         Args:

@@ -140,12 +140,12 @@ class TimeBudget:
         """Count on from now, with what was counted as spent before: what another process goes on from."""
         self._before, self._since = self.counted, self._now()
 
-    def moved(self) -> None:
+    def restart_processor(self) -> None:
         """Count on in another process, whose processor time began with it."""
         # The wall's clock is the machine's; a new process's own begins at 0.
         self._since = Spent(self._since.wall, 0.0)
 
-    def over(self) -> bool:
+    def is_spent(self) -> bool:
         """Whether it is spent; whoever asks then ends what it does."""
         result = self.spent > self.seconds
         # For good: what it ended stays ended, though time may be charged later.

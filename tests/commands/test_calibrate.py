@@ -113,7 +113,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
 @pytest.mark.parametrize("how", ["random", "spatial"])
 def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
     trial = run_trials(_evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how, 200)
-    facts = trial.facts()
+    facts = trial.summarise()
     assert trial.kind == "learned" and trial.coverage.mean() > 0.2
     # Resampled from one pool: the share itself scatters by about 0.02.
     # Test cells are few and unlike: what is realised in them scatters more than the promise's own doubt.
@@ -135,10 +135,12 @@ MUTE = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1)
 
 def test_nobody_accepted_is_no_promise_kept() -> None:
     """A draw that accepts nobody says nothing: it is counted by itself, not among the kept."""
-    facts = Trial("learned", "random", np.array([np.nan, 0.05, 0.2]), np.array([0.0, 0.5, 0.5]), 0.1).facts()
+    facts = Trial(
+        "learned", "random", np.array([np.nan, 0.05, 0.2]), np.array([0.0, 0.5, 0.5]), 0.1
+    ).summarise()
     assert facts["silent"] == 1 / 3 and facts["broken"] == 0.5 and facts["broken_of_all"] == 1 / 3
     assert facts["broken_low"] < 0.5 < facts["broken_high"]
-    facts = MUTE.facts()
+    facts = MUTE.summarise()
     assert facts["broken"] is facts["broken_low"] is facts["realised"] is None and facts["silent"] == 1
 
 

@@ -134,9 +134,7 @@ def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway,
 def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
     """Files that are none of `halfway`'s."""
     folder = tmp_path_factory.mktemp("others")
-    files = {
-        "rx": spectra(folder / "rx.npz", moving="rx"),
-    }
+    files = {"rx": spectra(folder / "rx.npz", moving="rx")}
     _, nearest = train(plain(spectra_file, "nearest"), folder / "nearest")
     return files | {"model": halfway.checkpoints[0], "nearest": nearest.checkpoints[0]}
 

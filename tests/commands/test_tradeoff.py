@@ -137,7 +137,7 @@ def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
 
 
 def test_a_model_of_several_stations_could_not_be_timed():
-    ask = gsparc.load(town_model()).cycling(np.array([[10.0, 20.0, 1.5], [30.0, 20.0, 1.5]]))
+    ask = gsparc.load(town_model()).cycle_places(np.array([[10.0, 20.0, 1.5], [30.0, 20.0, 1.5]]))
     assert np.isfinite(ask(0)) and ask(1) != ask(2)
 
 
@@ -147,5 +147,5 @@ def test_a_model_of_two_moving_ends_could_not_be_timed():
     predictor = gsparc.fit(
         tx=tx, rx=rx, rssi=-40 - 20 * np.log10(np.linalg.norm(tx - rx, axis=1)), model="mean"
     )
-    ask = predictor.cycling(np.c_[tx, rx] - np.tile(predictor.site.origin, 2))
+    ask = predictor.cycle_places(np.c_[tx, rx] - np.tile(predictor.site.origin, 2))
     assert np.isfinite(ask(0)).all()

@@ -92,11 +92,11 @@ def nvcc_of(folder: Path, *knows: str) -> str:
 
 def test_a_gpu_newer_than_the_compiler_gets_code_that_the_driver_translates(tmp_path):
     nvcc = nvcc_of(tmp_path, "compute_75", "compute_90", "compute_90a", "compute_100")
-    assert cuda_library.target(nvcc, "90") == "-gencode=arch=compute_90,code=sm_90"
-    assert cuda_library.target(nvcc, "120") == "-gencode=arch=compute_100,code=compute_100"
+    assert cuda_library.arch_option(nvcc, "90") == "-gencode=arch=compute_90,code=sm_90"
+    assert cuda_library.arch_option(nvcc, "120") == "-gencode=arch=compute_100,code=compute_100"
     with pytest.raises(cuda_library.LibraryUnavailable, match=r"sm_70 and .* builds for sm_75 and newer"):
-        cuda_library.target(nvcc, "70")
-    assert cuda_library.target(nvcc_of(tmp_path), "61") == "-gencode=arch=compute_61,code=sm_61"
+        cuda_library.arch_option(nvcc, "70")
+    assert cuda_library.arch_option(nvcc_of(tmp_path), "61") == "-gencode=arch=compute_61,code=sm_61"
 
 
 def test_every_gpu_of_the_machine_is_built_for(monkeypatch):

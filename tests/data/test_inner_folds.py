@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
-from gsparc.data.inner_folds import NOT_TESTED, cut_inner_folds, inner_folds
+from gsparc.data.inner_folds import NOT_TESTED, cut_folds, inner_folds
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
 from gsparc.models.per_station import UNHEARD, station_site
@@ -126,7 +126,7 @@ def test_of_stations_learned_together_squares_are_those_of_what_moves():
     outer = make_split(data.moving, settings, place=data.place, station=data.station).folds[0]
     together = data.subset(np.arange(len(data)), station_site(data.site, UNHEARD))
     assert together.moving.shape[1] == 6
-    inner, plain = (cut_inner_folds(d, outer, settings, 3, 0) for d in (together, data))
+    inner, plain = (cut_folds(d, outer, settings, 3, 0) for d in (together, data))
     assert inner.name == "blocks"
     assert all(np.array_equal(a.test, b.test) for a, b in zip(inner.folds, plain.folds, strict=True))
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsparc.data.own import interpret
-from gsparc.data.tables.heads import understand_head
-from gsparc.data.tables.read import understand_table
+from gsparc.data.tables.heads import parse_head
+from gsparc.data.tables.read import parse_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
 STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
@@ -30,7 +30,7 @@ STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
     ],
 )  # fmt: skip
 def test_usual_heads(head, role, unit):
-    found = understand_head(head)
+    found = parse_head(head)
     assert found.role == role and (unit is None or found.unit.name == unit)
 
 
@@ -52,7 +52,7 @@ def test_usual_heads(head, role, unit):
     ],
 )  # fmt: skip
 def test_the_same_table_in_other_forms(write, content, name):
-    arrays = understand_table(write(content, name)).arrays
+    arrays = parse_table(write(content, name)).arrays
     np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81.5])
     assert name != "plain.csv" or arrays["row_name"].tolist() == ["line 2", "line 3"]
@@ -62,7 +62,7 @@ def test_units_are_converted_and_said(write):
     text = (
         "x [mm],y [cm],z_km,power [mW],frequency (MHz)\n1000,200,0.003,1e-6,2400\n2000,300,0.004,2e-6,2400\n"
     )
-    table = understand_table(write(text))
+    table = parse_table(write(text))
     arrays = table.arrays
     np.testing.assert_allclose(arrays["rx_position"], [[1, 2, 3], [2, 3, 4]])
     np.testing.assert_allclose(arrays["rssi"], [1e-9, 2e-9])
@@ -74,7 +74,7 @@ def test_units_are_converted_and_said(write):
 
 
 def test_every_guess_is_said_and_what_is_not_used(write):
-    notes = understand_table(write("lat,lng,RSRP [dBm],SINR,battery\n40,8,-80,3,1\n40.1,8,-81,3,1\n")).notes
+    notes = parse_table(write("lat,lng,RSRP [dBm],SINR,battery\n40,8,-80,3,1\n40.1,8,-81,3,1\n")).notes
     assert set(notes) >= {
         "column 'RSRP [dBm]' taken as rssi_db [dBm]",
         "column 'lat' taken as latitude [deg]",
@@ -82,22 +82,22 @@ def test_every_guess_is_said_and_what_is_not_used(write):
         "not used: columns 'SINR', 'battery'",
         "no height of the receiver: taken as 0 m",
     }
-    arrays = understand_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).arrays
+    arrays = parse_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).arrays
     assert arrays["rssi_db"].tolist() == [4, 8]
 
 
 def test_levels_without_a_unit_were_said_to_be_in_dbm(write):
     """A map of the same levels said dB."""
-    table = understand_table(write("x,y,z,RSRP\n1,2,3,-80\n4,5,6,-81\n"))
+    table = parse_table(write("x,y,z,RSRP\n1,2,3,-80\n4,5,6,-81\n"))
     assert "column 'RSRP' taken as rssi_db [dB]" in table.notes
     assert interpret(table, "table").data.site.level_unit == "dB"
 
 
 def test_many_transmitters_did_not_become_one_without_a_word(write):
     rows = "".join(f"A{i % 3},{i},{i * i},2,-{60 + i % 7}\n" for i in range(24))
-    notes = understand_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes
+    notes = parse_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes
     assert sum("'Transmitter ID' speaks of a station and is not used" in note for note in notes) == 1
-    other = understand_table(write("Operator ID,x,y,z,rssi\n" + rows)).notes
+    other = parse_table(write("Operator ID,x,y,z,rssi\n" + rows)).notes
     assert not any("stations?" in note for note in other)
 
 
@@ -105,21 +105,19 @@ def test_what_is_said_wins_over_guesses(write, refused):
     text = "lat,lon,px,py,RSRP,RSSI\n40,8,1,2,-80,-60\n40,9,3,4,-81,-61\n"
     said = {"rssi_db": "rsrp", "tx_x": "px", "tx_y": "py", "tx_z": 1.5, "rx_x": 0, "rx_y": 0, "rx_z": 2}
     # lat and lon are of an end without a name, which is a third one: it must be said to be none
-    refused("expected two ends", understand_table, write(text), said)
-    arrays = understand_table(write(text.replace("lat,lon", "a,b")), said).arrays
+    refused("expected two ends", parse_table, write(text), said)
+    arrays = parse_table(write(text.replace("lat,lon", "a,b")), said).arrays
     np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81])
     np.testing.assert_array_equal(arrays["tx_position"], [[1, 2, 1.5], [3, 4, 1.5]])
     np.testing.assert_array_equal(arrays["rx_position"], [0, 0, 2])
-    degrees = understand_table(
-        write(text), {"lat": "lat", "lon": "lon", "rssi_db": "RSSI", "height": 1.5}
-    ).arrays
+    degrees = parse_table(write(text), {"lat": "lat", "lon": "lon", "rssi_db": "RSSI", "height": 1.5}).arrays
     assert degrees["latitude"].tolist() == [40, 40] and degrees["rx_height"] == 1.5
 
 
 def test_long_layout_with_places_in_columns(write):
     text = "x,y,z,rssi,gateway,gateway_x,gateway_y,gateway_z\n"
     text += "1,1,1,-80,g7,9,9,3\n1,1,1,-85,12,0,0,3\n2,1,1,-81,g7,9,9,3\n"
-    arrays = understand_table(write(text)).arrays
+    arrays = parse_table(write(text)).arrays
     assert arrays["station"].tolist() == [0, 1, 0] and arrays["station_name"].tolist() == ["g7", "12"]
     np.testing.assert_array_equal(arrays["station_position"], [[9, 9, 3], [0, 0, 3]])
     assert "tx_position" in arrays and "rx_position" not in arrays  # gateways listen
@@ -129,7 +127,7 @@ def test_long_layout_with_a_second_file(write, caplog):
     listed = "Name;lat;lon;height [m];sensitivity_db;frequency [MHz]\n33;40,1;8,1;10;-120;800\n"
     listed += "212;40,2;8,2;20;-110;1800\n5;41;8;3;-110;800\n"
     stations = write(listed, "stations.csv")
-    table = understand_table(write("lat,lon,rssi,pci\n40,8,-80,212\n40,8,-90,33\n"), {}, stations)
+    table = parse_table(write("lat,lon,rssi,pci\n40,8,-80,212\n40,8,-90,33\n"), {}, stations)
     arrays = table.arrays
     assert arrays["station_name"].tolist() == ["33", "212", "5"] and arrays["station"].tolist() == [1, 0]
     np.testing.assert_array_equal(arrays["station_latitude"], [40.1, 40.2, 41])
@@ -147,7 +145,7 @@ def test_long_layout_with_a_second_file(write, caplog):
 ])  # fmt: skip
 def test_wide_layout(write, heads, columns):
     text = f"x,y,z,{heads}\n1,2,3,-80,-90\n4,5,6,,-91\n"
-    arrays = understand_table(write(text), columns, write(STATIONS, "stations.csv")).arrays
+    arrays = parse_table(write(text), columns, write(STATIONS, "stations.csv")).arrays
     assert arrays["station_name"].tolist() == ["b", "a"] and "station" not in arrays
     np.testing.assert_array_equal(arrays["rssi_db"], [[-80, -90], [np.nan, -91]])
     np.testing.assert_array_equal(arrays["station_position"], [[2, 3, 4], [1, 2, 3]])
@@ -156,11 +154,11 @@ def test_wide_layout(write, heads, columns):
 def test_channels(write):
     text = "tx_x,tx_y,tx_z,h_re_0,h_im_0,h_re_1,h_im_1\n1,2,3,1,2,3,4\n2,2,3,5,6,,\n"
     said = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "2.4e9:2.5e9"}
-    arrays = understand_table(write(text), said).arrays
+    arrays = parse_table(write(text), said).arrays
     assert arrays["csi"][0].tolist() == [1 + 2j, 3 + 4j] and arrays["frequency_hz"].tolist() == [2.4e9, 2.5e9]
     assert arrays["mask"].tolist() == [[True, True], [True, False]]
     one = "x,y,z,tx_x,tx_y,tx_z,real,imag,frequency_ghz\n1,2,3,0,0,0,1,2,2.4\n2,2,3,0,0,0,5,6,2.4\n"
-    raw = understand_table(write(one))
+    raw = parse_table(write(one))
     assert raw.arrays["frequency_hz"] == 2.4e9 and raw.arrays["csi"].shape == (2,)
     assert interpret(raw, "drive.csv").data.site.kind == "csi"
 
@@ -173,7 +171,7 @@ def test_negative_numbers_of_tones_lost_their_sign(write, refused):
     heads = [f"csi_{part}_{tone}" for tone in (1, -2, 2, -1) for part in ("re", "im")]
     text = ",".join(["x,y,z", *heads]) + "\n1,2,3,1,0,-2,0,2,0,-1,0\n4,5,6,1,9,-2,8,2,7,-1,6\n"
     for said in ({}, {"csi_re": "csi_re_*", "csi_im": "csi_im_*"}):
-        table = understand_table(write(text), {**ENDS, **said})
+        table = parse_table(write(text), {**ENDS, **said})
         assert table.arrays["csi"].real.tolist() == [[-2, -1, 1, 2]] * 2
         assert table.arrays["csi"][1].imag.tolist() == [8, 6, 9, 7]
         assert table.arrays["frequency_hz"].tolist() == [1e9, 2e9, 4e9, 5e9]
@@ -184,24 +182,24 @@ def test_negative_numbers_of_tones_lost_their_sign(write, refused):
         ("csi_re_m1", "'csi_re_m1': .* is no number of a tone"),
         ("csi_re_0_1", "'csi_re_0_1': .* is no number of a tone"),
     ):
-        refused(says, understand_table, write(text.replace("csi_re_-1", head)), ENDS)
+        refused(says, parse_table, write(text.replace("csi_re_-1", head)), ENDS)
 
 
 def test_runs_and_names_of_rows(write):
-    arrays = understand_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).arrays
+    arrays = parse_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).arrays
     assert arrays["run"].tolist() == ["7", "8"] and arrays["row_name"].tolist() == ["p", "q"]
 
 
 def test_two_ends_in_degrees_become_stations(write):
     text = "rx_lat,rx_lon,tx_lat,tx_lon,rsrp\n40,8,40.1,8,-80\n40,8.1,40.1,8,-80\n40,8.2,40.3,8,-80\n"
-    arrays = understand_table(write(text + "40,8.3,40.3,8,-80\n")).arrays
+    arrays = parse_table(write(text + "40,8.3,40.3,8,-80\n")).arrays
     assert arrays["station_latitude"].tolist() == [40.1, 40.3] and arrays["station"].tolist() == [0, 0, 1, 1]
     assert arrays["longitude"].tolist() == [8, 8.1, 8.2, 8.3]
 
 
 def test_line_breaks_in_quoted_cells_were_refused(write):
     heads = '"Latitude\n(deg)",lon,"RSRP\r\n[dBm]",note'
-    table = understand_table(write(heads + '\n48.1,16,-80,"a\nb ""c"", d"\n48.2,16,"-81",\n'))
+    table = parse_table(write(heads + '\n48.1,16,-80,"a\nb ""c"", d"\n48.2,16,"-81",\n'))
     assert table.arrays["rssi_db"].tolist() == [-80, -81]
     assert table.arrays["row_name"].tolist() == ["line 4", "line 6"]
     assert any("'RSRP [dBm]' taken as rssi_db" in note for note in table.notes)
@@ -273,7 +271,7 @@ def test_a_spoilt_table_is_refused_in_a_line(write, refused, name, monkeypatch, 
     content, columns, says = SPOILT[name]
     write(content)
     monkeypatch.chdir(tmp_path)
-    problems = refused("", understand_table, "drive.csv", columns).problems
+    problems = refused("", parse_table, "drive.csv", columns).problems
     assert says in problems[0] and len(problems) <= 3, problems
     assert all("drive.csv" in p or "dataset." in p for p in problems)
 
@@ -281,13 +279,13 @@ def test_a_spoilt_table_is_refused_in_a_line(write, refused, name, monkeypatch, 
 def test_channels_of_several_tones_and_stations(write):
     """They were refused with the advice to take one tone."""
     text = "x,y,station,station_x,station_y,csi_re_1,csi_im_1,csi_re_0,csi_im_0\n1,2,a,0,0,1,2,3,4\n1,2,b,5,5,5,6,7,8\n"
-    arrays = understand_table(write(text), {"frequency_hz": "1e9:2e9"}).arrays
+    arrays = parse_table(write(text), {"frequency_hz": "1e9:2e9"}).arrays
     assert arrays["csi"].tolist() == [[3 + 4j, 1 + 2j], [7 + 8j, 5 + 6j]]
 
 
 def test_all_bad_cells_are_listed_at_once(write, refused):
     rows = "".join(f"{i},{'?!' if i % 2 else i},-8x\n" for i in range(20))
-    said = "\n".join(refused("line 2: '-8x'", understand_table, write("x,y,rssi\n" + rows)).problems)
+    said = "\n".join(refused("line 2: '-8x'", parse_table, write("x,y,rssi\n" + rows)).problems)
     assert "line 3: '?!'" in said
     assert "the same in 15 more rows" in said and "the same in 5 more rows" in said
 
@@ -302,19 +300,19 @@ def test_all_bad_cells_are_listed_at_once(write, refused):
 ])  # fmt: skip
 def test_a_spoilt_list_of_stations(write, refused, listed, words):
     rows = write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n")
-    refused(words, understand_table, rows, {}, write(listed, "stations.csv"))
+    refused(words, parse_table, rows, {}, write(listed, "stations.csv"))
 
 
 def test_names_of_files(write, refused, tmp_path):
-    refused("no such file", understand_table, tmp_path / "nothing.csv")
-    refused("expected a name ending in .csv", understand_table, write(PLAIN, "drive.xlsx"))
+    refused("no such file", parse_table, tmp_path / "nothing.csv")
+    refused("expected a name ending in .csv", parse_table, write(PLAIN, "drive.xlsx"))
 
 
 def test_marks_between_thousands_were_decimal_commas(write, refused):
     """\"448,262\" in quotes between commas was 448.262 m."""
     marked = write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n')
-    refused("line 2: '448,262': is no finite number; .* no marks between thousands", understand_table, marked)
-    some = understand_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n'))
+    refused("line 2: '448,262': is no finite number; .* no marks between thousands", parse_table, marked)
+    some = parse_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n'))
     np.testing.assert_array_equal(some.arrays["rx_position"], [[448.262, 412.1], [448.263, 412.25]])
 
 
@@ -322,9 +320,9 @@ def test_access_points_that_receive_were_transmitters(write):
     """Stations whose places are called rx_x, ... receive: the other end is the transmitter, and moves."""
     lines = [f"{i},{i % 7},1,{'ab'[i % 2]},{50 * (i % 2)},0,3,{-50 - i % 13}" for i in range(40)]
     path = write("\n".join(["x,y,z,ap,rx_x,rx_y,rx_z,rssi", *lines]))
-    arrays = understand_table(path).arrays
+    arrays = parse_table(path).arrays
     assert "tx_position" in arrays and "rx_position" not in arrays
-    assert "rx_position" in understand_table(write(path.read_text().replace("rx_", "tx_"))).arrays
+    assert "rx_position" in parse_table(write(path.read_text().replace("rx_", "tx_"))).arrays
 
 
 def test_parquet(tmp_path, write, refused):
@@ -336,16 +334,16 @@ def test_parquet(tmp_path, write, refused):
     frame = pd.DataFrame({**columns, "cell_lat": [41.0, 42.0], "cell_lon": [8.0, 8.0]})
     for index in (None, ["pci"], ["pci", "lat"]):
         (frame if index is None else frame.set_index(index)).to_parquet(tmp_path / "drive.parquet")
-        arrays = understand_table(tmp_path / "drive.parquet").arrays
+        arrays = parse_table(tmp_path / "drive.parquet").arrays
         assert arrays["station_name"].tolist() == ["7", "8"] and arrays["row_name"][1] == "row 1"
         assert arrays["rssi_db"][0] == -80 and np.isnan(arrays["rssi_db"][1])
         assert arrays["latitude"].tolist() == [40.0, 40.1]
-    refused("damaged or not a Parquet file", understand_table, write(b"PAR1" + bytes(20), "bad.parquet"))
+    refused("damaged or not a Parquet file", parse_table, write(b"PAR1" + bytes(20), "bad.parquet"))
 
 
 @pytest.mark.parametrize("head", ["RSRP [dBm]", "RSRP [dBW]", "rssi_mW", "power (W)"])
 def test_powers_of_a_table_come_back_in_its_unit(write, head):
-    data = interpret(understand_table(write(f"x,y,z,{head}\n1,2,3,7\n4,5,6,8.5\n")), "drive").data
+    data = interpret(parse_table(write(f"x,y,z,{head}\n1,2,3,7\n4,5,6,8.5\n")), "drive").data
     unit = data.site.power_unit()
     assert head.strip("])").endswith(unit.name)
     assert data.site.level_unit == ("dBm" if "RSRP" in head else "dBW")  # what pictures say
@@ -355,4 +353,4 @@ def test_powers_of_a_table_come_back_in_its_unit(write, head):
 def test_parquet_without_pyarrow(write, refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     says = r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"
-    refused(says, understand_table, write(b"PAR1", "drive.parquet"))
+    refused(says, parse_table, write(b"PAR1", "drive.parquet"))

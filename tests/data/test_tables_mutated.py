@@ -15,7 +15,7 @@ import numpy as np
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
 from gsparc.data.schema import Measurements
-from gsparc.data.tables.read import understand_table
+from gsparc.data.tables.read import parse_table
 
 COUNT = 18  # places
 STATIONS = ("roof", "#2", "7", "mast east", "-1", "1")
@@ -259,7 +259,7 @@ def load(drive: Drive, folder) -> Measurements:
     if drive.listed is not None:
         stations = folder / "stations.csv"
         stations.write_text("\n".join(Drive(drive.listed, ";", ",", 9).lines()))
-    return interpret(understand_table(folder / "a.csv", drive.said, stations), "a.csv").data
+    return interpret(parse_table(folder / "a.csv", drive.said, stations), "a.csv").data
 
 
 def rows_of(data: Measurements) -> list[tuple]:

@@ -8,7 +8,7 @@ import pytest
 from gsparc.data.files import read_csv
 from gsparc.data.own import interpret
 from gsparc.data.tables import opening
-from gsparc.data.tables.read import understand_table
+from gsparc.data.tables.read import parse_table
 
 PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
 
@@ -16,17 +16,17 @@ PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
 def test_stations_of_unknown_place_could_not_be_read(write, refused):
     """The schema had them, of powers, and methods estimate where they are."""
     text = "x,y,rssi,cell\n1,2,-80,b\n2,3,-81,a\n4,4,-82,b\n9,4,-83,a\n"
-    table = understand_table(write(text))
+    table = parse_table(write(text))
     assert any("no places of the stations: unknown" in note for note in table.notes)
     data = interpret(table, "drive").data
     assert data.site.stations.name == ("b", "a") and np.isnan(data.site.stations.position).all()
     assert data.station.tolist() == [0, 1, 0, 1] and np.isfinite(data.site.box).all()
     for one, axes in ((text, "x,y"), (text.replace("x,y", "lat,lon"), "lat,lon")):
-        some = understand_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv"))
+        some = parse_table(write(one), {}, write(f"name,{axes}\na,3,4\nb,,\n", "stations.csv"))
         known = np.isfinite(interpret(some, "drive").data.site.stations.position).all(axis=1)
         assert known.tolist() == [True, False]
     listed = write("name,x,y\na,3,4\nb,1,\n", "stations.csv")
-    refused("column 'y', line 3: no value; station_y is needed", understand_table, write(text), {}, listed)
+    refused("column 'y', line 3: no value; station_y is needed", parse_table, write(text), {}, listed)
 
 
 @pytest.mark.parametrize("mark", ["#", "%", "//"])
@@ -36,35 +36,35 @@ def test_rows_that_begin_like_comments_vanished(write, mark):
         f"{name},{i},{i * i},-{60 + i}\n" for i, name in enumerate([mark + "1", mark + "2", "A"] * 9)
     )
     listed = write(f"name,x,y\nA,0,0\n{mark}1,9,9\n{mark}2,5,5\n", "stations.csv")
-    table = understand_table(write("station,x,y,rssi\n" + rows), {}, listed)
+    table = parse_table(write("station,x,y,rssi\n" + rows), {}, listed)
     assert table.arrays["rssi_db"].tolist() == [-60.0 - i for i in range(27)]
     assert table.arrays["station"].tolist() == [1, 2, 0] * 9
     assert f"18 rows begin with '{mark}1' or the like, the first in line 2" in table.notes
 
 
 def test_comments_below_the_heads_are_said(write):
-    table = understand_table(write(PLAIN + "# turned back here, see notes\n7,8,9,-70\n"))
+    table = parse_table(write(PLAIN + "# turned back here, see notes\n7,8,9,-70\n"))
     assert table.arrays["rssi_db"].tolist() == [-80, -81.5, -70]
     assert "1 comments below the heads, the first in line 4" in table.notes
 
 
 def test_a_no_break_space_between_columns(write):
     """Cells were counted by one rule and parsed by another: KeyError: 3."""
-    arrays = understand_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).arrays
+    arrays = parse_table(write("x y z rssi\n1 2\xa03 -80\n4 5 6 -81.5\n", "drive.txt")).arrays
     np.testing.assert_array_equal(arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
 
 
 @pytest.mark.parametrize("x, asked", [("448,262", True), ("448,26", False)])
 def test_thousands_between_semicolons_were_decimals_without_a_question(write, x, asked):
     """x of 448,262 m and y of 5412013 m: a drive 1000 times shorter to the east."""
-    notes = understand_table(write(f"x;y;rssi\n{x};5412013;-80\n448,291;5412100;-81\n")).notes
+    notes = parse_table(write(f"x;y;rssi\n{x};5412013;-80\n448,291;5412100;-81\n")).notes
     said = [note for note in notes if note.startswith("decimal commas")]
     assert len(said) == 1 and ("448,262 is 448.262; if commas stand between thousands" in said[0]) == asked
 
 
 def test_a_comment_mark_after_an_empty_cell_was_a_crash(write, refused):
     table = write("x\ty\trssi\n1\t2\t-70\n\t# 3\t-70\n", "a.tsv")
-    refused(r"line 3: begins with '# 3.*: a row, or a comment\?", understand_table, table)
+    refused(r"line 3: begins with '# 3.*: a row, or a comment\?", parse_table, table)
 
 
 @pytest.mark.parametrize(
@@ -87,10 +87,10 @@ def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch
     """A line of 200 MB took 10.4 GiB; 1e8 cells of a head did not end in a minute."""
     monkeypatch.setattr(opening, "MOST_CELLS", 30_000)
     start = time.process_time()
-    refused(says, understand_table, write(content))
+    refused(says, parse_table, write(content))
     assert time.process_time() - start < 5
     monkeypatch.setattr(opening, "MOST_BYTES", 1000)
-    refused("a table of text of more than 1,000 bytes; write it as Parquet", understand_table, write(content))
+    refused("a table of text of more than 1,000 bytes; write it as Parquet", parse_table, write(content))
 
 
 def test_other_tables_of_text_have_lines_as_long(write, refused):

@@ -10,7 +10,7 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.data.tables.read import understand_table
+from gsparc.data.tables.read import parse_table
 from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
 from gsparc.evaluation.scores import score_methods
@@ -55,7 +55,7 @@ def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power)
     (tmp_path / "drive.csv").write_text(heads + "".join(rows))
     given = {"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0] - 30 * (model == "dBW")}
     data = from_arrays(given, {"level_unit": model})
-    table = understand_table(tmp_path / "drive.csv")
+    table = parse_table(tmp_path / "drive.csv")
     other = from_arrays({**table.arrays, "tx_position": POSTS[0]}, table.attributes)
     same = align_to_site(other, data.site)
     np.testing.assert_allclose(same.target, data.target, rtol=1e-5)

@@ -1,6 +1,6 @@
 import torch
 
-from gsparc.field.confidence import Confidence, ConfidenceSettings, confidence_weighted_loss
+from gsparc.field.confidence import Confidence, ConfidenceSettings, weighted_loss
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -15,10 +15,10 @@ def test_the_best_confidence_is_alpha_over_loss():
     """Of the paper's loss, which hard_cases/test_confidence_overflow.py compares with its formula."""
     g = torch.linspace(-9, 9, 20001)
     for loss in (0.01, 0.05, 0.1):
-        best = 1 + g[confidence_weighted_loss(torch.tensor(loss), g, 0.3).argmin()].exp()
+        best = 1 + g[weighted_loss(torch.tensor(loss), g, 0.3).argmin()].exp()
         assert abs(float(best) - 0.3 / loss) < 0.02 * 0.3 / loss
     # Above alpha the floor C = 1 is best: a poor sample still counts once.
-    assert confidence_weighted_loss(torch.tensor(0.5), g, 0.3).argmin() == 0
+    assert weighted_loss(torch.tensor(0.5), g, 0.3).argmin() == 0
 
 
 def test_the_range_comes_from_calibration_and_is_not_moved_by_queries():

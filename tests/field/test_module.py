@@ -5,7 +5,7 @@ import pytest
 import torch
 from modules import module
 
-from gsparc.field.confidence import confidence_weighted_loss
+from gsparc.field.confidence import weighted_loss
 
 
 def test_the_loss_is_weighted_by_confidence_per_sample(campaign, tmp_path):
@@ -14,7 +14,7 @@ def test_the_loss_is_weighted_by_confidence_per_sample(campaign, tmp_path):
     sure = module(data, tmp_path)
     task = sure.task_loss(sure.model(batch.tx, batch.rx).mean, batch)
     exponent = sure.model.confidence.exponent(batch.tx)
-    assert torch.allclose(sure.training_step(batch, 0), confidence_weighted_loss(task, exponent, 0.3).mean())
+    assert torch.allclose(sure.training_step(batch, 0), weighted_loss(task, exponent, 0.3).mean())
     plain = module(data, tmp_path, confidence=False)
     assert torch.allclose(plain.training_step(batch, 0), task.mean())
 

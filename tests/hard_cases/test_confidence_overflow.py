@@ -8,7 +8,7 @@ Tolerance against float64 inside the clamp: 1e-6 relative to 1 + C.
 import pytest
 import torch
 
-from gsparc.field.confidence import Confidence, ConfidenceSettings, confidence_weighted_loss
+from gsparc.field.confidence import Confidence, ConfidenceSettings, weighted_loss
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
@@ -26,7 +26,7 @@ def test_finite_whatever_the_network_says(g, dtype):
     task = torch.tensor([0.0, 0.3, 10.0], requires_grad=True)
     with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
         exponent = sure.exponent(torch.rand(3, 3))
-        loss = confidence_weighted_loss(task, exponent, 0.3)
+        loss = weighted_loss(task, exponent, 0.3)
     assert exponent.dtype == torch.float32  # half precision would round 1 + exp(-8) to 1
     loss.sum().backward()
     assert loss.isfinite().all() and task.grad.isfinite().all()
@@ -38,6 +38,6 @@ def test_finite_whatever_the_network_says(g, dtype):
 @pytest.mark.parametrize("g", [-10.0, -3.0, 0.0, 3.0, 10.0])
 def test_right_inside_the_clamp(g):
     loss = torch.tensor([0.0, 0.3, 10.0])
-    got = confidence_weighted_loss(loss, torch.full((3,), g), 0.3).double()
+    got = weighted_loss(loss, torch.full((3,), g), 0.3).double()
     c = 1 + torch.full((3,), g, dtype=torch.float64).exp()
     assert torch.allclose(got, c * loss.double() - 0.3 * c.log(), atol=float(1e-6 * (1 + c[0]) * 10))

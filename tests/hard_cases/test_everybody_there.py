@@ -27,7 +27,7 @@ def test_a_giant_equals_float64(backend, projection, sigma):
 def test_one_giant_covers_every_strip():
     scene = one([1.0, 0.0, 1.0], sigma=40.0, opacity=0.5)
     plan = make_plan(*scene.model, origin(), GRID)
-    assert plan.buffers[6].numel() == operators.strips(GRID.height)
+    assert plan.buffers[6].numel() == operators.count_strips(GRID.height)
     image = render(scene, origin(), GRID)["image"]
     assert torch.isfinite(image).all() and (image > 0.1).double().mean() > 0.8
 

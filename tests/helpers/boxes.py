@@ -5,7 +5,7 @@ from shoeboxes import scatter
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
@@ -19,7 +19,7 @@ def room_of_spectra(count: int = 160, power: bool = False) -> Measurements:
     """`count` receivers over the floor; of powers in place of amplitudes."""
     engine = ShoeboxEngine(ROOM, TRANSMITTER, 2.4e9)
     receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
-    paths = engine.trace(receivers, engine.supported(PropagationEffects(depth=2)))
+    paths = engine.trace(receivers, engine.supported(Effects(depth=2)))
     pictures, _ = spectra(paths, SETTINGS, TONES, engine.wavelength)
     pictures = pictures**2 if power else pictures
     return from_arrays(

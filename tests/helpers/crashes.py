@@ -75,7 +75,7 @@ def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
 
 def small_campaign(rows: int):
     """`rows` receivers in a box, four to a shard; spectra of 18 x 36."""
-    from gsparc.simulate.effects import PropagationEffects
+    from gsparc.simulate.effects import Effects
     from gsparc.simulate.scenes.build import SceneSettings
     from gsparc.simulate.settings import Campaign
     from gsparc.simulate.spectrum import SpectrumSettings
@@ -85,7 +85,7 @@ def small_campaign(rows: int):
         num_receivers=rows, carrier_hz=2.4e9, bandwidth_hz=40e6, subcarriers=4,
         room={"size_m": [6, 5, 3], "reflection": -0.6, "boxes_m": [[[2.6, 2.2, 0], [3.0, 2.6, 3]]]},
     )  # fmt: skip
-    effects = PropagationEffects(
+    effects = Effects(
         refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
     )
     spectrum = SpectrumSettings(height=18, width=36, rows=4, columns=4)

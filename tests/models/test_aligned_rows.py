@@ -14,7 +14,7 @@ from gsparc.models import aligned_rows, fitting
 from gsparc.models.aligned_rows import align_phases, align_rows
 from gsparc.models.gsparc import Gsparc
 from gsparc.physics import row_factors
-from gsparc.physics.row_factors import alignment_factors
+from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext
 
 pytestmark = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")
@@ -76,7 +76,7 @@ def test_a_free_gain_is_a_unit_row(logged):
     fold = packets.shares(free, 0)
     target = align_phases(free, fold)[0].target[fold.train]
     assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(np.abs(free.target[fold.train]).mean((1, 2)))
-    told = alignment_factors(target, target * 2, np.zeros(target.shape[2]), "phase+delay+gain")
+    told = align_factors(target, target * 2, np.zeros(target.shape[2]), "phase+delay+gain")
     assert np.allclose(np.abs(told), 2, rtol=1e-3)
 
 
@@ -126,7 +126,7 @@ def test_packets_of_one_place_are_averaged(logged):
     turned, rows = align_phases(several, fold)
     assert len(rows.train) == len(np.unique(row[fold.train])) and (rows.test == fold.test).all()
     mean, own = turned.target[rows.train], own[rows.train]
-    missed = own - mean * alignment_factors(mean, own, tones, "phase+delay")[:, None]
+    missed = own - mean * align_factors(mean, own, tones, "phase+delay")[:, None]
     assert (np.abs(missed) ** 2).sum() < 0.09 * (np.abs(own) ** 2).sum()  # of one packet .18
 
 

@@ -169,7 +169,7 @@ def test_threads_of_a_query(monkeypatch, name, places, inside):
 def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.Tensor:
     """What a user is answered at the places of rows (n,), in stored units."""
     places = data.moving[rows] + data.site.origin
-    return predictor.linear(**{data.site.moving_end: places}).mean / data.site.target_scale
+    return predictor.predict_linear(**{data.site.moving_end: places}).mean / data.site.target_scale
 
 
 @pytest.mark.parametrize("name", [name for name in methods() if name != "calibrated_raytracer"])

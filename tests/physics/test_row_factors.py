@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.physics.row_factors import alignment_factors, resolvable_delays
+from gsparc.physics.row_factors import align_factors, resolvable_delays
 
 TONES = 312.5e3 * np.r_[-26:0, 1:27]
 
@@ -24,16 +24,16 @@ def test_what_was_put_on_rows_is_taken_off(freedom):
     if "gain" in freedom:
         put_on = put_on * gain[:, None]
     logged = true * put_on[:, None]
-    found = alignment_factors(logged, true, TONES, freedom)
+    found = align_factors(logged, true, TONES, freedom)
     missed = np.abs(logged * found[:, None] - true) ** 2
     assert missed.sum() < 1e-3 * (np.abs(true) ** 2).sum()
 
 
 def test_nothing_free_turns_nothing_and_silent_rows_stay():
     true = rows()
-    assert (alignment_factors(true, true, TONES, "none") == 1).all()
-    assert np.isfinite(alignment_factors(0 * true, true, TONES, "phase+delay+gain")).all()
-    assert np.isfinite(alignment_factors(true, 0 * true, TONES, "phase+delay+gain")).all()
+    assert (align_factors(true, true, TONES, "none") == 1).all()
+    assert np.isfinite(align_factors(0 * true, true, TONES, "phase+delay+gain")).all()
+    assert np.isfinite(align_factors(true, 0 * true, TONES, "phase+delay+gain")).all()
 
 
 def test_delays_cover_what_tones_tell_apart_and_no_more():

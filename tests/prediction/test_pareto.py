@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsparc.evaluation.experiment.tradeoff import beaten_by
-from gsparc.prediction.pareto import Point, front, worded
+from gsparc.evaluation.experiment.tradeoff import find_better
+from gsparc.prediction.pareto import Point, describe_point, pareto_front
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 
@@ -15,7 +15,7 @@ PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1
 @given(PAIRS)
 def test_nobody_on_the_front_is_beaten_and_everybody_else_is(pairs):
     latency, score = zip(*pairs, strict=True)
-    kept = front(latency, score)
+    kept = pareto_front(latency, score)
     for i in range(len(pairs)):
         beaten = any(
             latency[j] <= latency[i]
@@ -29,9 +29,9 @@ def test_nobody_on_the_front_is_beaten_and_everybody_else_is(pairs):
 
 
 def test_settings_are_said_in_words():
-    assert worded({}) == "as trained"
+    assert describe_point({}) == "as trained"
     assert (
-        worded({"keep": 0.25, "stride": 3, "confidence": False})
+        describe_point({"keep": 0.25, "stride": 3, "confidence": False})
         == "25% kept, 1 of 3 x 3 pixels, no confidence"
     )
 
@@ -43,5 +43,5 @@ def other(psnr_db: float, ms: float) -> Point:
 def test_a_point_that_another_method_beats_is_said():
     point = Point("p", {}, 1, {"psnr_db": 20.0}, 0.0, np.full(3, 1.0))
     others = {"nearest": other(26.0, 0.5), "gp": other(29.0, 2.0), "mean": other(15.0, 0.1)}
-    assert beaten_by(point, others, "psnr_db") == "nearest"
-    assert beaten_by(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None
+    assert find_better(point, others, "psnr_db") == "nearest"
+    assert find_better(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None

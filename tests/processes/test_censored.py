@@ -8,19 +8,13 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from gsparc.processes import censored
-from gsparc.processes.censored import (
-    CERTAIN,
-    ConditionalGaussian,
-    expectation_propagation,
-    log_evidence,
-    truncated_normal_moments,
-)
+from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep, log_evidence, truncated_moments
 from gsparc.processes.powers import draw_rows
 
 
 def test_moments_of_a_truncated_normal():
     z = torch.tensor([-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0], dtype=torch.float64)
-    ratio, lost = truncated_normal_moments(z)
+    ratio, lost = truncated_moments(z)
     for one, mean, share in zip(z.tolist(), ratio.tolist(), lost.tolist(), strict=True):
         with mpmath.workdps(60):
             exact = mpmath.npdf(one) / mpmath.ncdf(one)
@@ -28,8 +22,7 @@ def test_moments_of_a_truncated_normal():
         assert mean == pytest.approx(float(exact), rel=1e-7)
         assert 1 - share == pytest.approx(float(kept), rel=1e-5)
     assert all(
-        part.isfinite().all()
-        for part in truncated_normal_moments(torch.tensor([-1e8, 1e8], dtype=torch.float64))
+        part.isfinite().all() for part in truncated_moments(torch.tensor([-1e8, 1e8], dtype=torch.float64))
     )
 
 
@@ -45,7 +38,7 @@ def small_vector(count: int = 8):
 def test_evidence_and_means_are_those_of_sampling(side):
     gram, values, unknown = small_vector()
     told, sides = ConditionalGaussian.of(gram, values, unknown), torch.tensor(side, dtype=torch.int8)
-    sites = expectation_propagation(told, values[unknown], sides)
+    sites = fit_by_ep(told, values[unknown], sides)
     normal = multivariate_normal(told.mean, told.covariance, seed=1)
     assert sites.settled
     drawn = normal.rvs(400_000)
@@ -86,9 +79,9 @@ def test_rows_certain_to_be_silent_change_nothing():
     gram, values, unknown = small_vector()
     level = values[unknown] + torch.tensor([0.0, 60.0, 0.0])
     told = ConditionalGaussian.of(gram, values, unknown)
-    kept = told.doubt(level) < CERTAIN
+    kept = told.z_score(level) < CERTAIN
     assert kept.tolist() == [True, False, True]
-    every, rest = expectation_propagation(told, level), expectation_propagation(told.at(kept), level[kept])
+    every, rest = fit_by_ep(told, level), fit_by_ep(told.at(kept), level[kept])
     assert np.allclose(every.value[kept], rest.value, atol=1e-2)
     assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsparc.processes.density import LeftOutDensity, covariance_of, minimise
-from gsparc.processes.factor import NotPositiveDefiniteError
+from gsparc.processes.factor import NotDefiniteError
 from gsparc.processes.kernel import Kernel
 
 KERNELS = (Kernel.matern((0.3,), (1.0,), 0.1), Kernel.matern((0.1, 0.5), (0.3, 0.7), 0.1))
@@ -60,7 +60,7 @@ def test_kernels_are_their_parameters():
 def test_a_walk_starts_at_the_best_and_goes_round_what_has_no_factor():
     def objective(at: torch.Tensor) -> torch.Tensor:
         if at[0].item() > 2:
-            raise NotPositiveDefiniteError
+            raise NotDefiniteError
         return (at[0] - 1).square()
 
     best, value = minimise(objective, [np.array([3.0]), np.array([-1.0])], [(-5.0, 5.0)], 40, 1e-9)

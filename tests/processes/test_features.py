@@ -6,7 +6,7 @@ import torch
 from sklearn.gaussian_process.kernels import Matern
 
 from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior, unknown_share
-from gsparc.processes.features import correlation, features_at_places, pivoted_rows, whitened_features
+from gsparc.processes.features import correlation, pivoted_rows, place_features, whitened_features
 
 LENGTH, NOISE, NAME = 0.4, 0.01, "smooth_rough"
 
@@ -44,7 +44,7 @@ def test_features_of_all_rows_are_the_posterior():
     known, asked, values = rows(60), rows(20, 1), torch.randn(60, 3, dtype=torch.float64)
     for features in (
         whitened_features(known, LENGTH, NOISE, NAME, 60),
-        features_at_places(known, known, LENGTH, NOISE, NAME),
+        place_features(known, known, LENGTH, NOISE, NAME),
     ):
         for found, wanted in zip(told(features, values, asked), posterior(known, values, asked), strict=True):
             torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)

@@ -55,7 +55,7 @@ def test_the_only_place_was_its_own_neighbour():
     one = neighbourhood.Neighbourhood.of(np.zeros((1, 3)), 0)
     assert one.nearest(np.zeros((2, 3)), np.zeros(2, int)).shape == (2, 0)
     assert one.nearest(np.ones((1, 3))).tolist() == [[0]]
-    assert np.allclose(neighbourhood.nearest_distance(one.every, torch.ones(1, 3).double()), 3**0.5)
+    assert np.allclose(neighbourhood.nearest_distance(one.tree, torch.ones(1, 3).double()), 3**0.5)
 
 
 def test_rows_of_one_place_are_its_mean_and_lose_nothing():

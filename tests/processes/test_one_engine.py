@@ -10,7 +10,7 @@ FACTORING = {
     "cholesky", "cholesky_ex", "cho_factor", "potrf", "dpotrf", "zpotrf", "cho_solve", "cholesky_solve",
     "cholesky_inverse", "solve_triangular", "trsm", "trtri", "dtrtri", "trtrs", "potri", "dpotri", "potrs",
 }  # fmt: skip
-DEFINED = ("left_out_group", "expectation_propagation")
+DEFINED = ("left_out_group", "fit_by_ep")
 
 
 def called(node: ast.Call) -> str:
@@ -29,4 +29,4 @@ def test_each_operation_is_in_its_place_alone():
                 where["factor"].add(name)
     assert where["factor"] == {"gsparc/processes/factor.py"}
     assert where["left_out_group"] == {"gsparc/processes/left_out.py"}
-    assert where["expectation_propagation"] == {"gsparc/processes/censored.py"}
+    assert where["fit_by_ep"] == {"gsparc/processes/censored.py"}

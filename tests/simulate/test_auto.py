@@ -11,12 +11,12 @@ from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.deciding import Decision
-from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, PropagationEffects
+from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings
 from gsparc.simulate.survey import Engine
 
-FULL = PropagationEffects(depth=2, polarisation=False)
+FULL = Effects(depth=2, polarisation=False)
 RECORD = [(0, 0, 1.0), (SPECULAR, 1, 0.5), (REFRACTION, 1, 0.6), (DIFFRACTION, 1, 0.01),
           (SPECULAR | DIFFUSE, 2, 0.02), (SPECULAR, 2, 0.05)]  # fmt: skip
 
@@ -41,7 +41,7 @@ class Invented(Engine):
             np.tile([m for m, _, _ in self.record], count).astype(np.uint8),
             np.tile([o for _, o, _ in self.record], count).astype(np.uint8),
         )  # fmt: skip
-        return whole.under(effects)
+        return whole.keep_effects(effects)
 
 
 def heard(count, record=RECORD):

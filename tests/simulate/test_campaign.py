@@ -26,7 +26,7 @@ from gsparc.simulate import campaign as campaigns
 from gsparc.simulate.assembly import SECONDS, assemble, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.report import choice_table, describe_choice, summary_facts
 from gsparc.simulate.scenes.build import SceneSettings, build_survey
 from gsparc.simulate.shards import ROWS, Shards
@@ -35,7 +35,7 @@ from gsparc.simulate.spectrum import ArraySettings
 
 BOX = small_campaign(60)
 SCENE, MIRROR, SMALL = BOX.scene, BOX.effects, BOX.spectrum
-FEW_PROBES = AutoSettings(probes=16, held_back=20, full=PropagationEffects(depth=4))
+FEW_PROBES = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
 
 
 def plan(**changes):
@@ -195,7 +195,7 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     """Interrupted and resumed; a place is tested on with all transmitters or with none."""
     both = plan(
         scene=replace(SCENE, transmitter_m=None, transmitters=MASTS),
-        effects=replace(FEW_PROBES, full=PropagationEffects(depth=3)),
+        effects=replace(FEW_PROBES, full=Effects(depth=3)),
     )
     interrupted(ShoeboxEngine, "trace", both, tmp_path / "two.h5", after(5))
     assert (tmp_path / "two.h5.parts").exists()

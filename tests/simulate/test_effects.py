@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, PropagationEffects, from_config
+from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, Effects, from_config
 from gsparc.simulate.paths import Paths, join_receivers
 
-EVERYTHING = PropagationEffects(depth=3)
+EVERYTHING = Effects(depth=3)
 
 
 def paths_of(mechanisms, order, owner=None, ports=1):
@@ -29,8 +29,8 @@ def test_path_needs_all_its_mechanisms_and_depth():
     assert left(EVERYTHING.without("specular")) == [True, False, False, True, True]
     assert left(EVERYTHING.without("diffuse")) == [True, True, False, True, True]
     assert left(EVERYTHING.without("diffraction")) == [True, True, True, True, False]
-    assert left(PropagationEffects(depth=1)) == [True, True, False, True, True]
-    assert left(PropagationEffects(depth=0)) == [True, False, False, False, False]
+    assert left(Effects(depth=1)) == [True, True, False, True, True]
+    assert left(Effects(depth=0)) == [True, False, False, False, False]
 
 
 @pytest.mark.parametrize("config, words", [
@@ -48,7 +48,7 @@ def test_contradictions_are_refused(config, words):
 
 def test_receivers_that_lose_everything_stay():
     found = paths_of([0, SPECULAR, SPECULAR], [0, 1, 1], owner=[0, 0, 1])
-    less = found.under(PropagationEffects(depth=3).without("specular"))
+    less = found.keep_effects(Effects(depth=3).without("specular"))
     assert less.offsets.tolist() == [0, 1, 1] and less.received_power().tolist() == [1.0, 0.0]
     both = join_receivers([found, less])
     assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]

@@ -13,7 +13,7 @@ from gsparc.data.load import load
 from gsparc.simulate import llvm, raytracer
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
-from gsparc.simulate.effects import BITS, PropagationEffects
+from gsparc.simulate.effects import BITS, Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import SceneSettings, build_survey, from_config
 from gsparc.simulate.scenes.conference import conference_room
@@ -27,9 +27,7 @@ pytestmark = pytest.mark.slow
 TOWN = Path(__file__).parents[2] / "examples" / "town.osm"
 TRANSMITTER = np.array([3.1, 6.2, 3.7])
 QUICK = Sampling(samples=20_000, batch=100)
-PLAIN = PropagationEffects(
-    diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2
-)
+PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
 CONFERENCE = SceneSettings(
     name="conference_room", builder="conference_room", transmitter_m=tuple(TRANSMITTER),
     area_m=((0.3, 0.3), (13.7, 9.7)), height_m=(1.1, 1.5), num_receivers=40,
@@ -77,9 +75,7 @@ def test_one_thread_is_deterministic():
 
 
 def test_line_of_sight_is_friis(room, places):
-    paths = room.trace(
-        places, PropagationEffects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0})
-    )
+    paths = room.trace(places, Effects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0}))
     seen = np.diff(paths.offsets)
     assert set(seen) == {0, 1} and seen.mean() > 0.5
     distance = np.linalg.norm(places - TRANSMITTER, axis=1)[seen == 1]
@@ -122,7 +118,7 @@ def test_attribution_equals_a_run_without(room, places):
     full = replace(PLAIN, depth=3)
     whole = room.trace(places, full)
     for less in (replace(full, depth=1), full.without("refraction")):
-        kept, alone = whole.under(less).received_power(), room.trace(places, less).received_power()
+        kept, alone = whole.keep_effects(less).received_power(), room.trace(places, less).received_power()
         strong = alone > 0.01 * alone.max()
         assert np.median(np.abs(10 * np.log10(kept[strong] / alone[strong]))) < 0.1
     assert set(np.unique(whole.mechanisms)) <= {0, BITS["specular"], BITS["refraction"], 5}
@@ -146,10 +142,10 @@ def test_chains_share_no_hash(places):
     """All chains of a call share a hash table: with edges on, a tenth of the paths was lost, and single
     reflections, which every seed finds, differed by 2e-3 for 60 receivers and 3e-2 for 100."""
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, Sampling(samples=100_000, batch=100))
-    full = PropagationEffects(diffuse=False, polarisation=False, depth=3)
+    full = Effects(diffuse=False, polarisation=False, depth=3)
     first, second = (
         room.trace(places, full, seed)
-        .under(replace(PLAIN, depth=1))
+        .keep_effects(replace(PLAIN, depth=1))
         .responses(CONFERENCE.frequency_hz, np.zeros((1, 3)), room.wavelength)
         for seed in (1, 2)
     )
@@ -181,7 +177,7 @@ def test_other_places_compile_nothing(places):
 
 
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
-    paths = room.trace(places[:10], PropagationEffects(depth=2))
+    paths = room.trace(places[:10], Effects(depth=2))
     assert paths.gain.shape[1] == 2 and np.abs(paths.gain[:, 1]).max() > 0
     for name, bit in BITS.items():
         assert ((paths.mechanisms & bit) > 0).any(), name
@@ -240,7 +236,7 @@ def test_scene_file_of_the_user(tmp_path):
 
 
 def test_auto_in_the_conference_room(tmp_path):
-    asked = AutoSettings(probes=16, held_back=16, full=PropagationEffects(depth=2))
+    asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
     plan = Campaign(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
     outcome = simulate(plan, tmp_path / "room.h5")
     assert outcome.choice is not None and outcome.choice.verdict is not None

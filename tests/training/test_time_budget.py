@@ -17,16 +17,16 @@ def test_processor_time_does_not_count_what_others_do():
     torch.set_num_threads(1)
     wall, own = TimeBudget(0.05), TimeBudget(0.05, "processor")
     time.sleep(0.1)
-    assert wall.over() and wall.limited and not own.over() and not own.limited
+    assert wall.is_spent() and wall.limited and not own.is_spent() and not own.limited
     until = time.process_time() + 0.1
     while time.process_time() < until:
         pass
-    assert own.over() and own.limited
+    assert own.is_spent() and own.limited
 
 
 def test_what_was_spent_before_counts():
     budget = TimeBudget(100.0, before=Spent(wall=70.0))
-    assert 70 <= budget.spent < 71 and 29 < budget.left_s <= 30 and not budget.over()
+    assert 70 <= budget.spent < 71 and 29 < budget.left_s <= 30 and not budget.is_spent()
 
 
 def test_what_is_charged_counts_by_both_clocks(monkeypatch):
@@ -37,9 +37,9 @@ def test_what_is_charged_counts_by_both_clocks(monkeypatch):
     budget.restart()
     assert budget.spent == pytest.approx(2.0, abs=0.01) and budget.counted.wall == pytest.approx(50, abs=0.01)
     budget.charge(Spent(wall=1.0, processor=7.0))
-    assert not budget.over() and budget.limited_by is None
+    assert not budget.is_spent() and budget.limited_by is None
     clocks.process_time.wind(1.1)
-    assert budget.over() and budget.limited_by == "processor"
+    assert budget.is_spent() and budget.limited_by == "processor"
 
 
 def test_of_two_clocks_the_wall_is_less_repeatable():

@@ -16,9 +16,9 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
-from gsparc.physics.row_factors import alignment_factors
+from gsparc.physics.row_factors import align_factors
 from gsparc.prediction.channels import interpolate_tones
-from gsparc.prediction.confidence import errors_and_scores, rival_scores
+from gsparc.prediction.confidence import errors_and_scores, position_scores
 from gsparc.prediction.risk import Evidence
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
 def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     error, own = errors_and_scores(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
-    return Evidence(rows, data.moving[rows], error, own | rival_scores(data, fold, rows))
+    return Evidence(rows, data.moving[rows], error, own | position_scores(data, fold, rows))
 
 
 @lru_cache(maxsize=1)
@@ -117,7 +117,7 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     heard = uplink[rows].astype(np.complex128) * site.target_scale
     # Simulated streets know the channel, but each snapshot was turned by its own phase and timing.
     clean = there.response(site.uplink_hz, rows)
-    coarse = alignment_factors(heard, clean, site.uplink_hz, "phase+delay")
+    coarse = align_factors(heard, clean, site.uplink_hz, "phase+delay")
     # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
     rest = (heard * coarse[:, None] * clean.conj()).sum(1)
     away = site.uplink_hz - site.uplink_hz.mean()

@@ -41,7 +41,7 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
 
     def surprise(point: np.ndarray) -> float:
         trust, pairs = of(point), zip(snapshots, places, strict=True)
-        return -float(np.mean([one.posterior(trust).at(place) for one, place in pairs]))
+        return -float(np.mean([one.posterior(trust).log_density_at(place) for one, place in pairs]))
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
@@ -53,7 +53,7 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
 
 def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
     """Return the trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
-    levels = [one.posterior(trust).level(place) for one, place in zip(snapshots, places, strict=True)]
+    levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.

@@ -36,7 +36,7 @@ class Cells:
         """Return the cells `chosen`."""
         return Cells(self.centre[chosen], self.edge[chosen])
 
-    def halved(self) -> Cells:
+    def halve(self) -> Cells:
         """Return the cells halved along every axis."""
         corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), -1).reshape(-1, 3)
         live = self.edge.max(0) > 0

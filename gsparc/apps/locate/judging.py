@@ -25,13 +25,13 @@ from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
-from gsparc.evaluation.console import plain
+from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Table
-from gsparc.prediction.predictor import keep
+from gsparc.prediction.predictor import update_extra
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +132,7 @@ def locate_by_model(
     Raises:
         ValueError: the model states no variance, or does not name its settings.
     """
-    run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
+    run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
@@ -148,7 +148,7 @@ def locate_by_model(
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
         if config.store:
-            keep(config.ckpt, locating.trust_state(trust, unknown, share))
+            update_extra(config.ckpt, locating.trust_state(trust, unknown, share))
     heard, placed = _snapshots(config, run)
     located, trained, origin = locator.locate(heard), group_snapshots(data, learned), data.site.origin
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
@@ -156,7 +156,7 @@ def locate_by_model(
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     pairs = zip(located, heard.place, strict=True)
-    inside = np.array([one.posterior.level(at) <= level for one, at in pairs]) if placed else None
+    inside = np.array([one.posterior.mass_above(at) <= level for one, at in pairs]) if placed else None
     places = np.array([one.place for one in located])
     about: dict[str, list[Any]]
     about = {"area_m2": [one.area for one in located], "modes": [one.modes for one in located]}

@@ -54,7 +54,7 @@ class Located:
     @classmethod
     def of(cls, posterior: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Self:
         """Return what is known at a place (3,) [m, local], with the area of cells of a mass `level`."""
-        area = float(posterior.cells.size[posterior.within(level)].sum())
+        area = float(posterior.cells.size[posterior.densest_cells(level)].sum())
         return cls(place, area, len(posterior.modes(level)), posterior, seconds)
 
 
@@ -79,7 +79,7 @@ class Locator:
     @cached_property
     def _coarse(self) -> Moments:
         """Computed once: most of the time of the first snapshot."""
-        return self.field.at(torch.from_numpy(self.cells.centre))
+        return self.field.moments_at(torch.from_numpy(self.cells.centre))
 
     def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
         """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
@@ -92,8 +92,8 @@ class Locator:
             if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
                 break
             chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
-            finer = cells.at(chosen).halved()
-            more = compute_misfit(heard, self.field.at(torch.from_numpy(finer.centre)), self.unknown)
+            finer = cells.at(chosen).halve()
+            more = compute_misfit(heard, self.field.moments_at(torch.from_numpy(finer.centre)), self.unknown)
             rest = np.setdiff1d(np.arange(len(cells)), chosen)
             others = current.misfit.at(torch.from_numpy(rest))
             current = Search(cells.at(rest).join(finer), others + more)
@@ -123,10 +123,10 @@ def learn_trust(
     pairs: list[tuple[Locator, Snapshots]] = []
     data, seed = learned.data, learned.context.seed
     rng = np.random.default_rng(seed)
-    inner_folds = learned.cut(folds, seed).folds
+    inner_folds = learned.cut_folds(folds, seed).folds
     for number, inner in enumerate(inner_folds):
         log.info("calibration %d of %d: without %d rows", number + 1, len(inner_folds), len(inner.test))
-        method = learned.refit(inner, learned.context.within(f"group{number}"))
+        method = learned.refit(inner, learned.context.for_part(f"group{number}"))
         field, trained = SiteField(Predictor(method, data.site)), np.union1d(inner.train, inner.val)
         without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
         heard = group_snapshots(data, inner.test)

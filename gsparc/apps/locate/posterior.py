@@ -58,7 +58,7 @@ class Posterior:
         """Of each cell (G,)."""
         return np.exp(self.log_density) * self.cells.size
 
-    def at(self, place: np.ndarray) -> float:
+    def log_density_at(self, place: np.ndarray) -> float:
         """Log density at a place (3,) itself, not of its cell."""
         here = self.cells.index_of(place)
         if not self.spread:
@@ -66,9 +66,9 @@ class Posterior:
         rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
         return float(np.log(self._density(place[None])[0] + rest + LEAST))
 
-    def level(self, place: np.ndarray) -> float:
+    def mass_above(self, place: np.ndarray) -> float:
         """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
-        here, mass = self.at(place), self.mass
+        here, mass = self.log_density_at(place), self.mass
         # Half of those as likely, so that equal densities have a level in the middle of their mass.
         return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
 
@@ -112,13 +112,13 @@ class Posterior:
                 break
         return place
 
-    def within(self, share: float) -> np.ndarray:
+    def densest_cells(self, share: float) -> np.ndarray:
         """Return the most likely cells (c,) that hold a share of the mass, most likely first."""
         return densest_cells(self.log_density, self.cells.size, share)
 
     def modes(self, share: float) -> list[np.ndarray]:
         """Cells of each connected part of the area that holds a share of the mass, heaviest first."""
-        some = self.within(share)
+        some = self.densest_cells(share)
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
         # Cells touch where centres are no farther apart than half the sum of edges, 1 % for rounding.

@@ -47,7 +47,7 @@ class SiteField:
         self.count = 1 if site.stations is None else len(site.stations)
 
     @torch.no_grad()
-    def at(self, places: Tensor) -> Moments:
+    def moments_at(self, places: Tensor) -> Moments:
         """Return what would be heard at places (G, 3) float64 [m, local].
 
         Raises:
@@ -60,7 +60,7 @@ class SiteField:
         site = self.site
         station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
         query = Query.at(site, places.float().repeat_interleave(self.count, 0), station)
-        prediction = self.predictor.asked(query)
+        prediction = self.predictor.predict_query(query)
         if prediction.variance is None:
             name = self.predictor.method.name
             raise ValueError(f"locate: {name} states no variance, and has no likelihood of a place")

@@ -58,7 +58,7 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     measured = measured.to(torch.complex128) if measured.is_complex() else measured.double()
     if site.kind == "rssi":
         measured = _decibels(measured)
-    side = torch.from_numpy(data.side(rows))
+    side = torch.from_numpy(data.censored_side(rows))
     if data.mask is not None:
         mask = flatten_targets(torch.from_numpy(data.mask[rows])) | (side != 0)[:, None]
         measured = torch.where(mask, measured, torch.full_like(measured, np.nan))

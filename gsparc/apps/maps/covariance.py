@@ -37,7 +37,7 @@ class ErrorCovariance:
         column = self.covariance[:, place].copy()
         self.covariance -= np.outer(column, column / (column[place] + self.noise))
 
-    def gains(self, targets: np.ndarray) -> np.ndarray:
+    def variance_reductions(self, targets: np.ndarray) -> np.ndarray:
         """Return what a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
         explained = (self.weight * targets) @ self.covariance**2
         return explained / (np.maximum(self.covariance.diagonal(), 0) + self.noise)

@@ -89,7 +89,7 @@ class FieldMap:
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
 
-    def in_unit(self, decibels: float, unit: str) -> FieldMap:
+    def to_unit(self, decibels: float, unit: str) -> FieldMap:
         """Return the same map with levels so many decibels higher, which is in another unit."""
         # Errors and probabilities do not change with the unit, differences of levels neither.
         levels = {name: getattr(self, name) + np.float32(decibels) for name in OF_STATIONS[:3]}
@@ -114,7 +114,7 @@ class FieldMap:
         with whole_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
-    def figures(self) -> dict[str, float | int | str | None]:
+    def summarise(self) -> dict[str, float | int | str | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""
         known = self.grid.inside & ~self.refused
 

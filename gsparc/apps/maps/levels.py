@@ -45,10 +45,10 @@ def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> 
 
 
 def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and `Measurements.side` of these."""
+    """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and which side they are censored on."""
     target = np.abs(data.target[rows].reshape(len(rows), -1)).astype(np.float64) * data.site.target_scale
     power = target if data.site.kind == "rssi" else target**2
-    side = data.side(rows)
+    side = data.censored_side(rows)
     if data.mask is not None:
         # Censored rows are masked out as targets, but their levels are known.
         seen = data.mask[rows].reshape(power.shape) | (side != 0)[:, None]
@@ -71,7 +71,7 @@ def joint_levels(predictor: Predictor, places: np.ndarray, stations: np.ndarray)
     Returns:
         None where each station is by itself.
     """
-    known = predictor.joint(places, stations)
+    known = predictor.predict_joint(places, stations)
     if known is None:
         return None
     level, covariance, _ = known

@@ -143,7 +143,7 @@ def predict_map(
         grid, **values, share=share, calibrated=promise is not None,
         threshold_db=threshold_db, extra=extra, places=np.unique(known, axis=0), notes=tuple(notes),
         unit=site.level_unit, **about,
-    ).in_unit(level.raised_db, level.name)  # fmt: skip
+    ).to_unit(level.raised_db, level.name)  # fmt: skip
 
 
 def uncalibrated(share: float) -> Calibration:
@@ -245,7 +245,7 @@ def predict_levels(
     parts = []
     for part in _chunks(places, CHUNK):
         ends = query_ends(predictor.site, part, other, station)
-        parts.append(predicted_levels(predictor.linear(**ends), predictor.site.kind))
+        parts.append(predicted_levels(predictor.predict_linear(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 

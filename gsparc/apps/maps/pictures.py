@@ -207,7 +207,7 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
     from_above.set_bounds(axis, (left, low), (right, high), title=title)
-    draw_measured_and_stations(axis, field)
+    draw_measured_places(axis, field)
     from_above.scale_bar(axis)
     if field.refused.any():
         axis.plot([], [], "s", color="0.82", label="too far from what was measured")
@@ -255,7 +255,7 @@ def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
-def draw_measured_and_stations(axis: Any, field: FieldMap) -> None:
+def draw_measured_places(axis: Any, field: FieldMap) -> None:
     """Measured points and stations; those outside the map are left out."""
     left, right, low, high = field.grid.extent
     from_above.draw_measured(axis, field.places)

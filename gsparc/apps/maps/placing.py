@@ -191,7 +191,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
-        parts.append(held_out_evidence(learned.without(inner), data, inner, np.full(int(own.sum()), one)))
+        parts.append(held_out_evidence(learned.forget(inner), data, inner, np.full(int(own.sum()), one)))
     parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
     if not parts:
         return NewStationError()
@@ -223,7 +223,7 @@ def _new(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
     sectors = antenna.sectors()
-    known = predictor.elsewhere(cells, place, sectors)
+    known = predictor.predict_new(cells, place, sectors)
     if known is None and antenna.azimuth is not None:
         raise DataError(f"antenna.azimuth: {predictor.method.name} knows no patterns; model=gsparc does")
     if known is None:
@@ -238,7 +238,7 @@ def _new(
 def assumption(site: Site, height: float, antenna: Antenna) -> str:
     """Return in words what a new station is taken to be, `height` [m] high."""
     carrier = None if site.stations is None else site.stations.carrier_hz
-    # The first band is the lowest: see `gsparc.processes.sectors.Sectors.joined_by`.
+    # The first band is the lowest: see `gsparc.processes.sectors.Sectors.add_sectors`.
     band = "" if carrier is None or np.ptp(carrier) == 0 else f" in the band of {carrier.min() / 1e6:g} MHz"
     return f"assumed: {height:.4g} m high{band}, {antenna} (see station_height_m, antenna)"
 

@@ -212,8 +212,8 @@ def choose_greedily(
     error = _expected(unknown, wanted)
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
-        gains = np.sum([one.gains(wanted)[first:] for one in unknown], axis=0)
-        possible = free & tour.addable()[: len(free)]
+        gains = np.sum([one.variance_reductions(wanted)[first:] for one in unknown], axis=0)
+        possible = free & tour.reachable()[: len(free)]
         if not possible.any():
             why = "no place is left" if not free.any() else "no other place fits in the walk"
             return chosen, expected, f"{why} after {len(chosen)} places"

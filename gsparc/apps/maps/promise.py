@@ -18,7 +18,7 @@ from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models.method import Method, predict_in_batches
-from gsparc.prediction.predictor import keep
+from gsparc.prediction.predictor import update_extra
 from gsparc.prediction.refit import Learned
 
 KEY = "map"
@@ -76,9 +76,9 @@ class Promise:
         """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
         return intervals.nearest_distances(self.known, self.station, places, np.full(len(places), station))
 
-    def keep(self, path: str | Path) -> None:
+    def store(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
-        keep(path, {KEY: asdict(self)})
+        update_extra(path, {KEY: asdict(self)})
 
 
 def read_promise(extra: Mapping[str, Any]) -> Promise | None:
@@ -115,9 +115,9 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         # Every second fold with sides twice as long, for evidence at larger distances.
         wide = side * SIDES[number % len(SIDES)]
         split = SplitSettings("blocks", side_m=wide, share=SHARE_OUT, val_fraction=0.1)
-        cut = learned.cut(1, settings.seed + number // len(SIDES), split)
-        inner = learned.answerable(cut.folds[0])
-        less = learned.without(inner, split)
+        cut = learned.cut_folds(1, settings.seed + number // len(SIDES), split)
+        inner = learned.drop_unlearned(cut.folds[0])
+        less = learned.forget(inner, split)
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Blocks of two folds are never one, though they may hold the same rows.

@@ -41,7 +41,7 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
     log.info("testing the intervals of maps: fits without blocks of places")
     promise = gather_promise(learned, how)
     promise.coverage(how.share)  # too little evidence is said before anything is stored
-    promise.keep(path)
+    promise.store(path)
     return promise
 
 
@@ -67,7 +67,7 @@ def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
 def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     """Return what a reader of the map must know."""
     notes = [*field.notes]
-    figures = field.figures()
+    figures = field.summarise()
     share = figures["map/server_unsure"]
     if share and len(field.stations) > 1:
         notes.append(f"best_server: in {share:.1%} of the cells (hatched) it is more likely another, or none")

@@ -116,7 +116,7 @@ class Tour:
         """Return what has been walked at each stop (n,) [m]."""
         return np.cumsum(self.length[self.walk[:-2], self.walk[1:-1]])
 
-    def addable(self) -> np.ndarray:
+    def reachable(self) -> np.ndarray:
         """Return which places can be added, (S,) bool."""
         if self.longest is None:
             return np.ones(len(self.length) - 1, bool)

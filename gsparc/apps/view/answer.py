@@ -60,7 +60,7 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
         ValueError: a place that cannot be.
     """
     site, kind = predictor.site, predictor.site.kind
-    prediction = predictor.linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
+    prediction = predictor.predict_linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
     mean = prediction.mean[0].numpy()
     still: dict[str, np.ndarray] = {}
     if site.static_end is not None and site.static_position is not None:

@@ -45,7 +45,7 @@ def build_scene(
 ) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
     points = [viewed.box()]  # where was measured, and the ends that stand
-    points += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
+    points += [place[None] for name in viewed.stations if (place := viewed.static_place(name)) is not None]
     if viewed.site.static_end is None:
         points.append(viewed.site.box + viewed.site.origin)
     frame = Frame.around(np.concatenate(points))
@@ -61,7 +61,7 @@ def build_scene(
     if measured is not None:
         parts.append(_measured_part(measured, legends, extent))
     for name in viewed.stations:
-        place = viewed.still(name)
+        place = viewed.static_place(name)
         if place is not None:
             named = len(viewed.stations) <= MOST_NAMES or name == station
             text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
@@ -169,7 +169,7 @@ class Sphere:
         return Legend("", 0.0, 1.0, "inferno").of(spectrum[self.rows, self.columns])
 
 
-def ray_parts(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
+def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     """Paths as lines from the receiver towards where they come from, as long as their delays, and the sources
     at the ends of those that are drawn whole.
 

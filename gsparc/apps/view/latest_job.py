@@ -27,14 +27,14 @@ class LatestJobQueue:
         self._thread = threading.Thread(target=self._work, name="gsparc view", daemon=True)
         self._thread.start()
 
-    def ask(self, key: Hashable, job: Job, urgent: bool = False) -> None:
+    def put(self, key: Hashable, job: Job, urgent: bool = False) -> None:
         """Have a job done in place of the key's present one; returns at once."""
         with self._wake:
             self._jobs.pop(key, None)
             self._jobs[key] = urgent, job()
             self._wake.notify_all()
 
-    def forget(self, client: Hashable) -> None:
+    def drop_client(self, client: Hashable) -> None:
         """Drop the jobs whose keys begin with a client."""
         with self._wake:
             for key in [key for key in self._jobs if isinstance(key, tuple) and key[0] == client]:

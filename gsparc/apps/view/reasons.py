@@ -57,7 +57,7 @@ def _paths(answer: Answer) -> list[str]:
 ENDS = {"tx": "transmitter", "rx": "receiver"}
 
 
-def headline(answer: Answer, unit: str = "dB") -> str:
+def summarise_answer(answer: Answer, unit: str = "dB") -> str:
     """Level and confidence in one line."""
     sure = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}"
     if answer.level_db is None:
@@ -68,7 +68,7 @@ def headline(answer: Answer, unit: str = "dB") -> str:
 
 def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
     """Return an answer and why, for a panel."""
-    lines = [f"**{headline(answer, unit)}**", ""]
+    lines = [f"**{summarise_answer(answer, unit)}**", ""]
     lines += [
         f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"
         for end in moving  # + 0.0: no minus before nought

@@ -78,13 +78,13 @@ class SiteView:
                     self._made[name] = self._make(name)
         return self._made[name]
 
-    def has(self, name: str | None) -> bool:
+    def has_station(self, name: str | None) -> bool:
         """Return whether a station was made."""
         return name in self._made
 
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed
-        measured = viewed.measured(name)
+        measured = viewed.measured_at(name)
         scene = build_scene(viewed, self.plan, name, measured)
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
         tree = None

@@ -70,7 +70,7 @@ class Viewed:
         """Return the predictor of a station."""
         return self.predictor if station is None else self.predictor.at(station)
 
-    def still(self, station: str | None) -> np.ndarray | None:
+    def static_place(self, station: str | None) -> np.ndarray | None:
         """Return the world place (3,) [m] of the static end; None where it is unknown or moves."""
         site = self.site if station is None else self.predictor.at(station).site
         place = site.static_position
@@ -97,7 +97,7 @@ class Viewed:
         number = self.site.stations.name.index(station)
         return np.flatnonzero(self.data.station == number)
 
-    def measured(self, station: str | None) -> Measured | None:
+    def measured_at(self, station: str | None) -> Measured | None:
         """Return values of a station; None without data."""
         if self.data is None:
             return None

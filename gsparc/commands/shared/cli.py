@@ -26,7 +26,7 @@ from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release_folders
 from gsparc.data.files import check_yaml
 from gsparc.data.instantiate import GROUPS, plugins
-from gsparc.evaluation.console import CONFIGS, FULL_ERROR, choices, config_folder, error_in_one_line
+from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
 from gsparc.models import registry
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
@@ -177,7 +177,7 @@ def help_text(answers: str, config: str) -> str:
         kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
         file = config_folder() / "kind" / f"{[groups['kind'], *kinds][-1]}.yaml"
         texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
-    named = {group: {*choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
+    named = {group: {*list_choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
     texts.append("\n".join(f"  {group}={'|'.join(sorted(names))}" for group, names in named.items()))
     return "\n\n".join(texts) + f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
 

@@ -16,7 +16,7 @@ from gsparc.data import executor
 from gsparc.data.executor import Engine
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
-from gsparc.evaluation.console import plain as plain
+from gsparc.evaluation.console import to_dict as to_dict
 from gsparc.models.registry import all_methods
 
 

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
-from gsparc.data.spacing import nearest_neighbour_distance
-from gsparc.physics.row_factors import FREEDOMS, Freedom, alignment_factors, freedom_words, resolvable_delays
+from gsparc.data.spacing import neighbour_distance
+from gsparc.physics.row_factors import FREEDOMS, Freedom, align_factors, freedom_words, resolvable_delays
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         second, _ = _correlation(values[near[:, 2]], middle)
         measured = np.sqrt(abs((first * second.conj()).mean()))
     a, b = middle, values[near[:, 1]]
-    turned = a * alignment_factors(a, b, rows.tones, "phase+delay")[:, None]
+    turned = a * align_factors(a, b, rows.tones, "phase+delay")[:, None]
     phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
     levels = 10 * np.log10(size[:, 0] / size[:, 1])
     scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
@@ -119,7 +119,7 @@ def set_freedom(data: Measurements, align: str) -> Measurements:
             return data
         freedom = found.freedom
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
-        if (apart := nearest_neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
+        if (apart := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
             what = "neighbours tell levels, not the shape over subcarriers"
             log.warning("places are %.3g wavelengths apart: %s", apart, what)
     return replace(data, site=replace(data.site, freedom=freedom))

@@ -88,7 +88,7 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(heard.places), 1, 1))
     ends = heard.places, np.tile(middle, (len(heard.places), 1)), turned
     site = replace(data.site, array=stations.position[heard.stations] - middle)
-    return Measurements(site, *ends, heard.values, heard.arranged(measured) != 0), heard.run
+    return Measurements(site, *ends, heard.values, heard.arrange(measured) != 0), heard.run
 
 
 def _drawn(data: Measurements) -> np.ndarray:

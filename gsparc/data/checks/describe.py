@@ -9,7 +9,7 @@ from gsparc.data.checks.coherence import estimate_coherence
 from gsparc.data.errors import list_first
 from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, Measurements, Site
-from gsparc.data.spacing import nearest_neighbour_distance
+from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
 
@@ -26,14 +26,14 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         data.site.convergence_error,
     )
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
-    weak, strong = (int((data.side(np.arange(len(data))) == side).sum()) for side in (1, -1))
+    weak, strong = (int((data.censored_side(np.arange(len(data))) == side).sum()) for side in (1, -1))
     paths, scale = data.directions, site.target_scale
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
-        ("neighbours", describe_spacing(distinct_places(data), site.wavelength)),
+        ("neighbours", spacing_words(distinct_places(data), site.wavelength)),
         *(("units?", hint) for hint in suspicious_values(data)),
         *(("outliers?", warning) for warning in outliers.outlier_warnings(data)),
         ("carrier", _carrier(site)),
@@ -91,12 +91,12 @@ def _targets(data: Measurements) -> str:
     return f"{count} received powers"
 
 
-def describe_spacing(positions: np.ndarray, wavelength: float | None) -> str:
+def spacing_words(positions: np.ndarray, wavelength: float | None) -> str:
     """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
     different, counts = np.unique(positions, axis=0, return_counts=True)
     if len(different) < 2:
         return "one place alone"
-    distance, same = nearest_neighbour_distance(different), int(counts[counts > 1].sum())
+    distance, same = neighbour_distance(different), int(counts[counts > 1].sum())
     text = f"the nearest other place is {distance:.3g} m away (median)"
     text += "" if wavelength is None else f", {distance / wavelength:.2g} wavelengths"
     return text + (f"; {same} rows share their place with another" if same else "")
@@ -211,7 +211,7 @@ ROUND = (1.0, 2.0, 3.0, 5.0, 10.0)
 APART = 3.0  # least side of a square, in distances of neighbours
 
 
-def propose_block_side(data: Measurements) -> float | None:
+def propose_side(data: Measurements) -> float | None:
     """Return a side [m] for `split=blocks`: a tenth of the site, several neighbours wide, round.
 
     None where the places are too few to hold squares of them out.
@@ -220,14 +220,14 @@ def propose_block_side(data: Measurements) -> float | None:
     extent = float(np.ptp(places, axis=0).max())
     if extent == 0:
         return None
-    least = max(extent / 10, APART * nearest_neighbour_distance(places))
+    least = max(extent / 10, APART * neighbour_distance(places))
     decade = 10 ** np.floor(np.log10(least))
     # At 0.99 a least side of 2.01 m still may be 2 m.
     side = next(float(decade * step) for step in ROUND if decade * step >= 0.99 * least)
     return side if side < extent / 2 else None
 
 
-def rows_in_test_blocks(data: Measurements, side: float) -> np.ndarray:
+def test_block_rows(data: Measurements, side: float) -> np.ndarray:
     """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
@@ -240,7 +240,7 @@ def rows_in_test_blocks(data: Measurements, side: float) -> np.ndarray:
 def propose_split(data: Measurements) -> str:
     """Propose a split, in one sentence for `gsparc check`."""
     between = "split=random asks about places between these"
-    side = propose_block_side(data)
-    if side is None or not len(rows_in_test_blocks(data, side)):
+    side = propose_side(data)
+    if side is None or not len(test_block_rows(data, side)):
         return f"{between}; too few places to hold out squares of floor"
     return f"{between}; split=blocks split.side_m={side:g} about holes of {side:g} m"

@@ -109,10 +109,10 @@ def _precision(places: np.ndarray, level: np.ndarray, regressors: np.ndarray) ->
         for nugget in NUGGETS:
             shape = _covariance(distance[np.ix_(some, some)], reach * extent, nugget)
             factor = Factor.of(torch.from_numpy(shape))
-            weighed = factor.solved(torch.from_numpy(regressors[some])).numpy()
+            weighed = factor.solve(torch.from_numpy(regressors[some])).numpy()
             mean = np.linalg.lstsq(regressors[some].T @ weighed, weighed.T @ level[some], rcond=None)[0]
             rest = level[some] - regressors[some] @ mean
-            white = factor.whitened(torch.from_numpy(rest)[:, None])
+            white = factor.whiten(torch.from_numpy(rest)[:, None])
             variance = float(white.square().sum()) / len(some)
             likelihood = -0.5 * (len(some) * math.log(variance) + float(factor.log_determinant))
             best = max(best, (float(likelihood), reach, nugget, variance))

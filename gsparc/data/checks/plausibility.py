@@ -31,7 +31,7 @@ FEW = 0.005  # of a station's rows: fewer are no sign of a limit
 WEAK_DB = 6.0  # above the weakest value: heard only just
 
 
-def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Return all warnings about levels at places.
 
     Args:
@@ -39,12 +39,7 @@ def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelSt
         steps: `find_level_steps` them.
     """
     warnings = level_warnings(levels.level_db) + duplicate_warnings(levels)
-    return [
-        *warnings,
-        *outlier_row_warnings(levels),
-        *level_step_warnings(levels, steps),
-        *gap_warnings(levels),
-    ]
+    return [*warnings, *outlier_row_warnings(levels), *step_warnings(levels, steps), *gap_warnings(levels)]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -91,7 +86,7 @@ def find_saturation(values: np.ndarray) -> float | None:
     return float(different[-1]) if piled else None
 
 
-def find_not_heard_marks(values: np.ndarray) -> list[float]:
+def find_marks(values: np.ndarray) -> list[float]:
     """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
     At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
@@ -168,7 +163,7 @@ def find_outlier_rows(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]
     return outliers
 
 
-def level_step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Warn of stations whose level changes at a row, unexplained by places (`level_steps`)."""
     names, rows, warnings = levels.names, levels.rows, []
     for t, step in steps:
@@ -294,7 +289,7 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
     link, called = which.reshape(-1) * count + station, data.row_names
-    rows = np.flatnonzero(data.side(np.arange(len(data))) <= 0)
+    rows = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
     absent = np.zeros(0, np.int64)
     # What was not heard is known to be weak; a file with a station for each place has no empty cells.
     if data.censored is None and len(first) < len(data):

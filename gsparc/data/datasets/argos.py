@@ -32,11 +32,7 @@ FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets
 
 
 def load_argos(
-    root: str | Path,
-    *,
-    antenna: int | str = 0,
-    positions: str | bool = "encoder",
-    align: bool = True,
+    root: str | Path, *, antenna: int | str = 0, positions: str | bool = "encoder", align: bool = True
 ) -> Measurements:
     """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, 26) complex64.
 

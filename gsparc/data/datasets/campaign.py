@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.describe import suspicious_values
-from gsparc.data.checks.plausibility import find_level_steps, link_levels, plausibility_warnings
+from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import SeveralFiles, read_text
@@ -85,11 +85,7 @@ def _implausible(data: Measurements) -> list[str]:
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data)
-    return (
-        convention_warnings(data)
-        if levels is None
-        else plausibility_warnings(levels, find_level_steps(levels))
-    )
+    return convention_warnings(data) if levels is None else sanity_warnings(levels, find_level_steps(levels))
 
 
 class StandIn(Protocol):
@@ -242,12 +238,14 @@ def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -
     """
     check = Checker(raw, str(source))
     for name, of in layout.items():
-        array = check.array(name, of.shape, kinds=of.kinds)
+        array = check.read_array(name, of.shape, kinds=of.kinds)
         if array is not None:
             letters = zip(of.shape, array.shape, strict=True)
             check.sizes |= {letter: size for letter, size in letters if isinstance(letter, str)}
             if of.place:
-                check_positions(check.problems, check.where(name), array, [*numbered_rows(len(array))])
+                check_positions(
+                    check.problems, check.describe_array(name), array, [*numbered_rows(len(array))]
+                )
         elif name not in raw.arrays and not of.optional:
             shape = str(of.shape).replace("'", "")
             check.refuse(name, f"missing; expected {KIND_WORDS[of.kinds]} {shape}")

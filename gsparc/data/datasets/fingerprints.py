@@ -14,7 +14,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from gsparc.data.datasets.campaign import Expected, check_layout
-from gsparc.data.errors import DataError, list_first, readable, suggest_nearest
+from gsparc.data.errors import DataError, list_first, readable, suggest_name
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
@@ -156,7 +156,7 @@ def split_fingerprints(
         DataError: there is no such split, or one part of it is empty.
     """
     if how not in get_args(How):
-        hint = suggest_nearest(str(how), get_args(How))
+        hint = suggest_name(str(how), get_args(How))
         raise DataError(f"split: {how!r} is none of {', '.join(get_args(How))}{hint}")
     if how in ("released", "later"):
         test = rows.test if how == "released" else rows.campaign > rows.campaign.min()

@@ -171,6 +171,6 @@ def read_file_or_table(
         for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
-    from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
+    from gsparc.data.tables.read import parse_table  # here, as pandas takes half a second to import
 
-    return understand_table(path, columns or {}, stations_file, cell_m)
+    return parse_table(path, columns or {}, stations_file, cell_m)

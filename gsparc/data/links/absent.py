@@ -44,11 +44,11 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.of(moment, of[heard], levels[heard], moving, count)
-    if not lists.recognised():
+    if not lists.are_strongest():
         return
     # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
     floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
-    of_list, station, below = lists.unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
+    of_list, station, below = lists.bound_unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     check.notes.append(

@@ -67,7 +67,7 @@ def _selected(check: Checker, measured: str, stations: Stations | None, part: Se
     """Leave out what `part` does not hold, and number runs and places anew; the stations that are left."""
     arrays, stations, notes = select(check.raw.arrays, measured, stations, part, check.source)
     check.raw, check.notes = replace(check.raw, arrays=arrays), [*check.notes, *notes]
-    runs = check.array("run", arrays[measured].shape[:1])
+    runs = check.read_array("run", arrays[measured].shape[:1])
     arrays |= {} if runs is None else {"run": np.unique(runs, return_inverse=True)[1].reshape(-1)}
     arrays |= {} if "place" not in arrays else {"place": number_places(arrays["place"])}
     return stations
@@ -75,18 +75,18 @@ def _selected(check: Checker, measured: str, stations: Stations | None, part: Se
 
 def _without_table(check: Checker, measured: str, part: Selection) -> Links | None:
     """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
-    for name in check.given(*STATION_FIELDS):
+    for name in check.present(*STATION_FIELDS):
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
     _selected(check, measured, None, part)
     arrays = check.raw.arrays
     rows = len(arrays[measured])
     # Powers alone can be learned without the transmitter's place: channels and spectra need both ends.
-    if measured in POWERS and not check.given("tx_position") and "rx_position" in arrays:
+    if measured in POWERS and not check.present("tx_position") and "rx_position" in arrays:
         check.notes.append("no tx_position: the transmitter's place is unknown")
         arrays["tx_position"] = np.full(3, np.nan)
         links, moving = Links("tx", unknown_transmitter=True), arrays["rx_position"]
     else:
-        ends = [check.real(f"{end}_position", (3,), (rows, 3)) for end in ("rx", "tx")]
+        ends = [check.read_real(f"{end}_position", (3,), (rows, 3)) for end in ("rx", "tx")]
         if any(end is None for end in ends):
             return Links("tx")  # what is missing is said where positions are read
         rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
@@ -102,7 +102,7 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
     before = len(check.problems)
     stations = read_station_table(check, measured in (*POWERS, "csi"))
-    ends = check.given("rx_position", "tx_position")
+    ends = check.present("rx_position", "tx_position")
     if len(ends) != 1:
         names = " and ".join(ends) or "neither"
         wanted = "expected rx_position or tx_position, of the end that moves"
@@ -121,8 +121,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
         )  # fmt: skip
     station = read_station_of_row(check, rows, count) if long else np.tile(np.arange(count), rows)
     row = np.repeat(np.arange(rows), 1 if long else count)
-    stated = {name: check.real(name, (), (count,), (rows,)) for name in ("carrier_hz", "sensitivity_db")}
-    positions = check.real(ends[0], (rows, 3))
+    stated = {name: check.read_real(name, (), (count,), (rows,)) for name in ("carrier_hz", "sensitivity_db")}
+    positions = check.read_real(ends[0], (rows, 3))
     if static == "tx" and stations.rotation is not None:
         check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
     if len(check.problems) > before or station is None or positions is None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.blocks import is_big
-from gsparc.data.checks.plausibility import find_not_heard_marks, find_saturation
+from gsparc.data.checks.plausibility import find_marks, find_saturation
 from gsparc.data.errors import Caution
 from gsparc.data.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.own_checks import Checker
@@ -105,7 +105,7 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
 
 def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarray | None:
     """The level (S,) [dB] below which the file says that nothing is heard; None without, or of no use."""
-    level = check.real("sensitivity_db", (), (1,), values.shape[:1])
+    level = check.read_real("sensitivity_db", (), (1,), values.shape[:1])
     saturates = not isinstance(check.raw.attributes.get("saturation_db", "auto"), str)
     for name, said in (("sensitivity_db", level is not None), ("dataset.saturation_db", saturates)):
         if said and measured != "rssi_db":
@@ -133,7 +133,7 @@ def _note_floor(
     if below.any():
         row = int(np.flatnonzero(below)[0])
         of_row = replace(links, station=check.raw.arrays.get("station"))
-        named = of_row.named([*map(str, check.raw.arrays["row_name"])])[row]
+        named = of_row.name_rows([*map(str, check.raw.arrays["row_name"])])[row]
         wrong = f"{named}: rssi_db is {values[row]:.4g}, below {floor[row]:.4g}"
         return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
     # Levels may be whole numbers, among which there is no infinity.
@@ -149,11 +149,7 @@ def _note_floor(
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
     """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
     given = check.raw.attributes.get("not_heard")
-    marks = (
-        find_not_heard_marks(values)
-        if given is None
-        else np.atleast_1d(np.asarray(given, np.float64)).tolist()
-    )
+    marks = find_marks(values) if given is None else np.atleast_1d(np.asarray(given, np.float64)).tolist()
     # `not_heard=[]` keeps minus infinity as a level, too.
     silent = np.isin(values, marks) | ((values == -np.inf) & (given is None or len(marks) > 0))
     floor = "sensitivity_db"

@@ -33,7 +33,7 @@ def _without_fix(check: Checker, measured: str) -> None:
     """Leave out rows at exactly 0, 0 where all others are elsewhere; stations there are at unknown places."""
     arrays = check.raw.arrays
     degrees = "latitude" in arrays
-    for name in ("latitude",) if degrees else check.given("rx_position", "tx_position"):
+    for name in ("latitude",) if degrees else check.present("rx_position", "tx_position"):
         pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
         rows = len(arrays[measured])
         if any(p.ndim != 2 - degrees or len(p) != rows for p in pair):
@@ -82,7 +82,7 @@ def _heights(check: Checker) -> bool:
         if height not in arrays:
             check.refuse(name, f"two coordinates; expected three, or the height above ground as {height} [m]")
             continue
-        above = check.real(height, (), (len(arrays[name]),) if arrays[name].ndim == 2 else ())
+        above = check.read_real(height, (), (len(arrays[name]),) if arrays[name].ndim == 2 else ())
         if above is None:
             continue
         place = arrays[name].astype(np.float64)
@@ -95,7 +95,7 @@ def _heights(check: Checker) -> bool:
 def _in_metres(check: Checker) -> Georeference | None:
     """Degrees in `check.raw` replaced by positions (n, 2) [m]; None without any, or with a fault (noted)."""
     for prefix in ("", "station_"):
-        pair = check.given(f"{prefix}latitude", f"{prefix}longitude")
+        pair = check.present(f"{prefix}latitude", f"{prefix}longitude")
         if len(pair) == 1:
             return check.refuse(pair[0], "given alone; expected latitude and longitude")
     arrays, before = check.raw.arrays, len(check.problems)
@@ -139,8 +139,8 @@ def _stated(check: Checker) -> Georeference | None:
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
-    latitude = check.real(f"{prefix}latitude", (None,))
-    longitude = None if latitude is None else check.real(f"{prefix}longitude", latitude.shape)
+    latitude = check.read_real(f"{prefix}latitude", (None,))
+    longitude = None if latitude is None else check.read_real(f"{prefix}longitude", latitude.shape)
     if latitude is None or longitude is None:
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
@@ -153,4 +153,4 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _moving(check: Checker) -> str:
     """The end that degrees are of: the one with a height, or the one without a position; the receiver."""
-    return "tx" if check.given("tx_height", "rx_position") else "rx"
+    return "tx" if check.present("tx_height", "rx_position") else "rx"

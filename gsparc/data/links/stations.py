@@ -68,23 +68,23 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
     positions = arrays["station_position"]
     lost = np.isnan(positions[:, :2]).all(axis=1) & may_miss
     arrays["station_position"] = np.where(lost[:, None], 0, positions)
-    places = check.position("station_position", None)
+    places = check.read_positions("station_position", None)
     if places is None:
         return None
     count = len(places)
     places[lost] = np.nan
     names, label = (check.raw.arrays.get(f"station_{what}") for what in ("name", "label"))
     for what, texts in (("station_name", names), ("station_label", label)):
-        if texts is not None and not check.fits(what, texts, (count,)):
+        if texts is not None and not check.has_shape(what, texts, (count,)):
             return None
     called = tuple(map(str, range(count) if names is None else names))
     for name in sorted({name for name in called if called.count(name) > 1}):
         return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
-    turned = check.real("station_orientation", (count, 4))
-    rotation = None if turned is None else check.turned("station_orientation", turned, called)
+    turned = check.read_real("station_orientation", (count, 4))
+    rotation = None if turned is None else check.to_matrices("station_orientation", turned, called)
     if turned is not None and rotation is None:
         return None
-    parts = [check.real(name, (count,)) for name in SECTOR]
+    parts = [check.read_real(name, (count,)) for name in SECTOR]
     sector = None
     if any(part is not None for part in parts):
         sector = np.stack([np.full(count, np.nan) if part is None else part for part in parts], 1)
@@ -97,7 +97,7 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
 
 def read_station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
     """Return the station (S,) int64 of every row."""
-    index = check.array("station", (rows,))
+    index = check.read_array("station", (rows,))
     if index is None:
         return None
     out = np.flatnonzero((index < 0) | (index >= count))

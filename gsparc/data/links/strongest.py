@@ -76,7 +76,7 @@ class StrongestLists:
         """(M,) bool."""
         return np.isfinite(self.level).sum(1) == self.length
 
-    def recognised(self) -> bool:
+    def are_strongest(self) -> bool:
         """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak."""
         moments_, count = self.level.shape
         sizes = np.isfinite(self.level).sum(1)
@@ -92,7 +92,7 @@ class StrongestLists:
         above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
 
-    def unlisted(self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int) -> Silent:
+    def bound_unlisted(self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int) -> Silent:
         """Return moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong

@@ -14,7 +14,7 @@ from urllib.parse import quote
 import yaml
 from filelock import FileLock
 
-from gsparc.data.errors import DataError, explain_error, suggest_nearest
+from gsparc.data.errors import DataError, explain_error, suggest_name
 from gsparc.data.files import platform_cache, read_shipped_table
 
 log = logging.getLogger(__name__)
@@ -147,7 +147,7 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
     known = public_sets()
     if name not in known:
         raise DataError(
-            f"no public set is called {name!r}{suggest_nearest(name, known)}; `gsparc data` lists them"
+            f"no public set is called {name!r}{suggest_name(name, known)}; `gsparc data` lists them"
         )
     wanted = known[name]
     if not wanted.sources:

@@ -1,6 +1,6 @@
 """Tables of measurements (CSV, TSV, Parquet): one row for each place, or for each place and station.
 
-`read.understand_table` reads one; it is not imported here, as pandas takes half a second.
+`read.parse_table` reads one; it is not imported here, as pandas takes half a second.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, list_first, suggest_nearest
+from gsparc.data.errors import Caution, list_first, suggest_name
 from gsparc.data.tables import heads
 from gsparc.data.tables.heads import ENDS, KINDS, LISTS, Head, unit_of, unit_suits, words_of
 from gsparc.data.tables.sheet import Sheet
@@ -84,7 +84,7 @@ def choose_columns(
     used_heads = {column.head for columns in chosen.values() for column in columns}
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = heads.understand_head(head) if head not in used_heads else Head()
+        meaning = heads.parse_head(head) if head not in used_heads else Head()
         if head not in used_heads and head in labelled:
             meaning = Head("rssi_db", label=head, word="station")
         role = meaning.role
@@ -209,7 +209,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
-        hint = suggest_nearest(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
+        hint = suggest_name(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
         return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
     head = _head(sheet, text)
@@ -239,7 +239,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
         return (Column(role, value=numbers),)
-    hint = suggest_nearest(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
+    hint = suggest_name(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
 
 
@@ -346,7 +346,7 @@ def schema_unit(column: Column) -> str:
     return "dB" if unit == "dBm" and (column.unit is None or column.unit.name == "dB") else unit
 
 
-def as_station_column(column: Column) -> Column:
+def rename_for_stations(column: Column) -> Column:
     """Return the same column of a list of stations, where ends need not be named."""
     axis = next((a for a in heads.AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
     return column if axis is None else replace(column, role=f"station_{axis}")

@@ -73,7 +73,7 @@ def topic_of(head: str) -> str | None:
     return None if LISTS["accuracy"] & set(words) else next(topics, None)
 
 
-def understand_head(text: str) -> Head:
+def parse_head(text: str) -> Head:
     """Read a head such as `RSRP [dBm]`, `tx_x_mm`, `Latitude (deg)`, `rssi_gateway7` or `csi_re_3`."""
     plain, unit, strange = unit_of(text)
     words = words_of(plain)

@@ -18,7 +18,7 @@ from fsspec.core import url_to_fs
 from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
 from gsparc.data.files import SeveralFiles, check_line_length
 from gsparc.data.tables import TABLE_SUFFIXES
-from gsparc.data.tables.heads import SHEET, understand_head
+from gsparc.data.tables.heads import SHEET, parse_head
 from gsparc.data.tables.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
     for delimiter in DELIMITERS:
         cells = [_cells(lines[n], delimiter) for n in numbers]
         usual = Counter(map(len, cells)).most_common(1)[0][0]
-        named = {cell: bool(understand_head(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
+        named = {cell: bool(parse_head(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
         roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
         above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
@@ -218,7 +218,7 @@ def _delimiter(lines: list[str], comment: str) -> str | None:
     def suits(delimiter: str) -> tuple[bool, bool, bool, float, int]:
         count = len(_cells(sample[0], delimiter))
         named = _cells(comment, delimiter) if comment else []
-        heads = len(named) == count and any(understand_head(cell).role for cell in named)
+        heads = len(named) == count and any(parse_head(cell).role for cell in named)
         agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
         return count > 1, heads, delimiter != " ", agree, count  # spaces may stand in cells
 
@@ -230,7 +230,7 @@ def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Line
     """The lines, the first of them heads; a comment before values is taken for them where it fits."""
     first = _cells(lines[min(lines)], delimiter)
     heads = _cells(comment, delimiter) if comment else []
-    named = [sum(understand_head(cell).role is not None for cell in cells) for cells in (heads, first)]
+    named = [sum(parse_head(cell).role is not None for cell in cells) for cells in (heads, first)]
     fits = len(heads) == len(first) and not all(map(_is_number, heads))
     values = all(map(_is_number, first))
     if not values and not (fits and named[0] > named[1]):

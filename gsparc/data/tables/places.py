@@ -9,8 +9,8 @@ import numpy as np
 
 from gsparc.data.errors import Caution, list_first
 from gsparc.data.links.stations import PER_STATION, SECTOR
-from gsparc.data.tables.columns import Chosen, as_station_column, choose_columns
-from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, understand_head, words_of
+from gsparc.data.tables.columns import Chosen, choose_columns, rename_for_stations
+from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, parse_head, words_of
 from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.data.tables.sheet import Sheet
 
@@ -106,7 +106,7 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
         hint = "; are latitude and longitude swapped?" if i == 0 and swapped else ""
         rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in outside[i])
         fault = f"{role} is outside {low} to {high} degrees{hint}"
-        sheet.problems.add_rows(sheet.where(heads[i]), rows, fault)
+        sheet.problems.add_rows(sheet.describe_column(heads[i]), rows, fault)
     return None
 
 
@@ -163,7 +163,7 @@ class StationList:
     repeated: dict[str, tuple[str, ...]] = field(default_factory=dict)
     label: tuple[str, ...] | None = None
 
-    def shared(self, words: np.ndarray) -> str | None:
+    def shared_name_problem(self, words: np.ndarray) -> str | None:
         """Return what is wrong where words (S,) are of a column whose names several stations share."""
         known = set(words.tolist())
         for head, names in self.repeated.items():
@@ -174,14 +174,14 @@ class StationList:
                 return f"{head} {twice[0]} names {list_first(which)} of the list of stations; {advice}"
         return None
 
-    def called(self, words: np.ndarray) -> StationList:
+    def use_names_of(self, words: np.ndarray) -> StationList:
         """Return the same under the names that most of words (S,) are of, its own first."""
         known = set(words.tolist())
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
         return replace(self, names=names, label=None if names == self.names else self.names)
 
-    def with_lacking(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
+    def add_missing(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
         """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""
         names = [word for word in dict.fromkeys(words.tolist()) if word]
         lost = [word for word in names if word not in self.names]
@@ -206,7 +206,7 @@ class StationList:
 def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
-    naming = [head for head in sheet.heads if understand_head(head).role == "station"]
+    naming = [head for head in sheet.heads if parse_head(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
     # What is of a beam is no measurement, whatever its head says besides.
@@ -215,7 +215,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {}
     )
     chosen = {
-        columns[0].role: columns for columns in (tuple(map(as_station_column, c)) for c in chosen.values())
+        columns[0].role: columns for columns in (tuple(map(rename_for_stations, c)) for c in chosen.values())
     }
     said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if sector_quantity(head))]
     notes = [type(note)(f"{sheet.source}: {note}") for note in notes if not note.startswith(tuple(said))]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, list_first, suggest_nearest
+from gsparc.data.errors import Caution, list_first, suggest_name
 from gsparc.data.files import SeveralFiles
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
@@ -44,7 +44,7 @@ from gsparc.data.tables.slots import unfold_slots
 NOTHING: Mapping[str, object] = {}
 
 
-def understand_table(
+def parse_table(
     path: str | Path,
     columns: Mapping[str, object] = NOTHING,
     stations_file: str | Path | None = None,
@@ -187,7 +187,7 @@ class Builder:
         tones: dict[int, Column] = {}
         for column in self.chosen.get(part, ()):
             label = column.label.strip(" _.:()[]")
-            where = self.sheet.where(column.head or "")
+            where = self.sheet.describe_column(column.head or "")
             # A sign belongs to the number: tones -1 and 1 lie on both sides of the carrier.
             if not re.fullmatch(r"[-+]?\d+|", label):
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
@@ -275,7 +275,7 @@ class Builder:
         words, head = self.sheet.joined(c.head for c in columns), columns[0].head or ""
         if self.listed is not None:
             plain = self.sheet.words(head)
-            listed, joined = self.listed.called(plain), self.listed.called(words)
+            listed, joined = self.listed.use_names_of(plain), self.listed.use_names_of(words)
             exact = columns[0].label == JOINED and bool(columns[0].word)
             # Where the list knows the names without what other columns add to them, these are taken.
             words = plain if exact and set(plain) <= set(listed.names) else words
@@ -338,17 +338,17 @@ class Builder:
     def _all_listed(self, words: np.ndarray, head: str | None) -> None:
         """Refuse names that the list of stations does not have."""
         assert self.listed is not None
-        if (wrong := self.listed.shared(words)) is not None:
+        if (wrong := self.listed.shared_name_problem(words)) is not None:
             return self.refuse(wrong)
         lacking: list[str] = []
         if head is not None:
-            self.listed, lacking, said = self.listed.with_lacking(words)
+            self.listed, lacking, said = self.listed.add_missing(words)
             self.notes += said
         known = {"", *self.listed.names, *lacking}
         for word in [word for word in dict.fromkeys(words.tolist()) if word not in known]:
             row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
             place = "the heads" if head is None else f"column {head!r}, {row}"
-            fault = f"{word!r} is no listed station{suggest_nearest(word, self.listed.names)}"
+            fault = f"{word!r} is no listed station{suggest_name(word, self.listed.names)}"
             self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:

@@ -56,17 +56,17 @@ class Sheet:
         """Return the first heads, for messages."""
         return ", ".join(map(repr, self.heads[:8]))
 
-    def where(self, head: str) -> str:
+    def describe_column(self, head: str) -> str:
         """Say how messages name a column."""
         return f"{self.source}, column {head!r}"
 
     def refuse(self, what: str, head: str | None = None) -> Any:
         """Note what is wrong with the table, or with a column; returns None."""
-        return self.problems.add(self.source if head is None else self.where(head), what)
+        return self.problems.add(self.source if head is None else self.describe_column(head), what)
 
     def refuse_rows(self, head: str | None, rows: np.ndarray, what: str) -> Any:
         """Note `what` for rows (n,) of a column; returns None."""
-        return self.problems.add_rows(self.where(head or ""), (self.rows[i] for i in rows), what)
+        return self.problems.add_rows(self.describe_column(head or ""), (self.rows[i] for i in rows), what)
 
     def words(self, head: str) -> np.ndarray:
         """Return text (S,) of a column, without surrounding spaces; empty where there is no value."""
@@ -132,7 +132,7 @@ class Sheet:
             mark = "commas" if self.decimal == "," else "points, and no marks between thousands"
             hint = f"; this table has decimal {mark}" if any("," in c or "." in c for c in cells) else ""
             what = f"is no finite number{hint}; or leave it empty"
-            return self.problems.add_rows(self.where(head), rows, what)
+            return self.problems.add_rows(self.describe_column(head), rows, what)
         return values
 
     def _read(self, text: str, count: int, suits: Callable[[Unit], bool], head: str) -> float | None:
@@ -148,7 +148,7 @@ class Sheet:
         if measured and unit is not None and (not measured[2] or suits(unit)):
             return float(unit.convert(np.array(float(measured[1]))))
         if measured and unit is not None and unit.kind == "quality" and suits(UNITS["dbm"]):
-            fault = f"{self.where(head)}: cells are in %: {PERCENT}"
+            fault = f"{self.describe_column(head)}: cells are in %: {PERCENT}"
             self.problems.extend([] if fault in self.problems else [fault])
             return np.nan  # said once, not of every row
         parts = SEXAGESIMAL.fullmatch(text) if suits(UNITS["deg"]) else None

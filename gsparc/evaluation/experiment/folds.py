@@ -17,7 +17,7 @@ from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.console import plain
+from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import fitting
@@ -50,7 +50,7 @@ def fit_context(config: DictConfig, **others: Any) -> FitContext:
 def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return what of a context decides how much is searched, and on which rows; it makes no object."""
     split = config.get("split")
-    own = split if split is None or isinstance(split, dict) else plain(split)
+    own = split if split is None or isinstance(split, dict) else to_dict(split)
     return {
         # `get`: configurations of other commands, and older ones, lack some of these keys.
         "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
@@ -93,7 +93,7 @@ class FoldFits:
 
 def fold_contexts(whole: FitContext, split: Split) -> list[FitContext]:
     """Return the contexts of its folds, each with a folder and series of figures of its own."""
-    return [whole.within(f"fold{number}") for number in range(len(split.folds))]
+    return [whole.for_part(f"fold{number}") for number in range(len(split.folds))]
 
 
 def fit_folds(

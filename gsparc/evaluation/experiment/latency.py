@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.problem import Problem
+from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction.timing import (
@@ -17,7 +17,7 @@ from gsparc.prediction.timing import (
     ClockSettings,
     cycle_queries,
     draw_queries,
-    median_and_p95,
+    p50_p95,
     reference_copy,
     time_interleaved,
 )
@@ -63,7 +63,7 @@ def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, La
         times = time_interleaved({COPY: reference_copy(), **{name: calls[name] for name in names}}, clock)
         copy = float(np.median(times.pop(COPY)))
         for name, values in times.items():
-            found[name] = Latency(*median_and_p95(values), float(np.median(values)) / copy, len(values))
+            found[name] = Latency(*p50_p95(values), float(np.median(values)) / copy, len(values))
 
     # By speed, before any takes a share of the rounds; a first call may make what later ones keep.
     timed(calls, ONCE)

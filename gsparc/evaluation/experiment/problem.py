@@ -18,11 +18,11 @@ from gsparc.data.load import load, split_for
 from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
-from gsparc.evaluation.console import plain
+from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment.done import measurements_hash
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.registry import fill_defaults
-from gsparc.simulate.scenes.build import names_scene
+from gsparc.simulate.scenes.build import has_known_scene
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ class Problem:
     @property
     def scene(self) -> bool:
         """Whether the measurements name a scene that a ray tracer loads."""
-        return names_scene(self.data.provenance)
+        return has_known_scene(self.data.provenance)
 
 
 def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
@@ -125,9 +125,9 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
             config = compose(settings, chosen, draw)
             # Measurements are read once: splits and draws choose rows of the same arrays.
             if read is None:
-                data = load(plain(config.dataset))
+                data = load(to_dict(config.dataset))
                 read = data, measurements_hash(data)
-            folds = split_for(plain(config.split), read[0])
+            folds = split_for(to_dict(config.split), read[0])
             problems.append(Problem(name, split.name, chosen, read[0], folds, read[1], draw))
     return problems
 

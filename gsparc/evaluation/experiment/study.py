@@ -25,13 +25,7 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import move_rows
 from gsparc.prediction.pareto import defined_figure
-from gsparc.prediction.timing import (
-    ClockSettings,
-    cycle_queries,
-    draw_queries,
-    median_and_p95,
-    time_interleaved,
-)
+from gsparc.prediction.timing import ClockSettings, cycle_queries, draw_queries, p50_p95, time_interleaved
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -76,7 +70,7 @@ class Condition:
         names = {"figure": facts["figure"], "model": str(self.model(folder))}
         return {**asdict(self), **names, **facts_under(facts, str(self))}
 
-    def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
+    def change_training(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
         """Return data and rows of a fold under this condition."""
         if self.what == "keep":
             return data, thin_fold(fold, self.amount, seed)
@@ -89,7 +83,7 @@ class Condition:
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
 
-    def tested_on(self, data: Measurements, split: Split, seed: int) -> Measurements:
+    def change_test(self, data: Measurements, split: Split, seed: int) -> Measurements:
         """Return data whose test rows are asked about."""
         return add_position_errors(
             data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed
@@ -184,7 +178,7 @@ class Study:
                 contexts = fold_contexts(
                     replace(context, run_dir=learned.model(folder).parent, seed=seed), split
                 )
-                learned_from = partial(learned.learned_from, seed=seed)
+                learned_from = partial(learned.change_training, seed=seed)
                 made = fit_folds(self.variants[variant](), data, split, contexts, learned=learned_from)
                 fits[learned] = made.with_scores(data, split)
                 extra = {"fold": 0, "split_sha256": split.sha256}
@@ -192,10 +186,10 @@ class Study:
                 checkpoint.save(learned.model(folder), made.methods[0], "", extra)
             outcome = fits[learned]
             if condition.what == "query":
-                outcome = outcome.with_scores(condition.tested_on(data, split, seed), split)
+                outcome = outcome.with_scores(condition.change_test(data, split, seed), split)
             # Where rows were silent they count, as in every other table.
             figure = WITH_SILENT if WITH_SILENT in outcome.figures else DECIDING[data.site.scored]
-            folds = [condition.learned_from(data, fold, seed)[1] for fold in split.folds]
+            folds = [condition.change_training(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
                 "value": defined_figure(outcome.figures, figure), "train_s": float(np.mean(outcome.train_s)),
@@ -223,7 +217,7 @@ class Study:
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
         times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
-        rows[["query_ms", "query_p95_ms"]] = [median_and_p95(times[file]) for file in rows.model]
+        rows[["query_ms", "query_p95_ms"]] = [p50_p95(times[file]) for file in rows.model]
         return rows[list(ROW)]
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
+from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     DECIDING,

@@ -25,7 +25,7 @@ from gsparc.evaluation.table import Column
 from gsparc.models.method import Method, Prediction
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
-from gsparc.prediction.pareto import Point, Settings, worded
+from gsparc.prediction.pareto import Point, Settings, describe_point
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import Call, ClockSettings, time_interleaved
 
@@ -69,7 +69,7 @@ def measure_candidates(
             log.info("%d of %d faster variants scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
     for index, (_, method) in enumerate(candidates):
-        ask = Predictor(method, data.site).cycling(places)
+        ask = Predictor(method, data.site).cycle_places(places)
         calls |= {(index, count): ask for count in threads}
     # A copy of memory, the unit of the others' times, is made by one thread.
     times = time_interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
@@ -79,7 +79,7 @@ def measure_candidates(
             continue
         index, count = key
         (settings, method), (figures, close) = candidates[index], scored[index]
-        label = f"{worded(settings)}, {count} thread{'s' if count > 1 else ''}"
+        label = f"{describe_point(settings)}, {count} thread{'s' if count > 1 else ''}"
         points.append(Point(label, settings, count, figures, close, ms, method.size()))
     return points, {name: times[name] for name in others}
 
@@ -109,7 +109,7 @@ def closeness_db(answers: Tensor, whole: Tensor) -> float:
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
 
-def beaten_by(point: Point, others: Mapping[str, Point], figure_name: str) -> str | None:
+def find_better(point: Point, others: Mapping[str, Point], figure_name: str) -> str | None:
     """Return the most accurate other that is neither slower nor worse than a point; None without one."""
     own = score_of(figure_name, point.value(figure_name))
     better = {n: score_of(figure_name, r.value(figure_name)) for n, r in others.items() if r.p50 <= point.p50}
@@ -153,7 +153,7 @@ def draw_front(
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
-    winner = {i: beaten_by(points[i], others, figure_name) for i in on_front}
+    winner = {i: find_better(points[i], others, figure_name) for i in on_front}
     rows = [
         f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
         + (f" ({winner[i]} is better)" if winner[i] else "")
@@ -202,7 +202,7 @@ def facts_of(
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
         "tradeoff/figure": figure,
-        "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
+        "tradeoff/front_beaten_by_others": sum(find_better(p, others, figure) is not None for p in best),
         "time/copy_ms": copy_ms,
         "time/render_ms_p50": full.p50,
         "time/render_ms_p95": full.p95,

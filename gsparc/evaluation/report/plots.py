@@ -19,7 +19,7 @@ from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, error_sizes
 from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
-from gsparc.prediction.pareto import front
+from gsparc.prediction.pareto import pareto_front
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
@@ -67,7 +67,7 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
         if name in columns:
             x, y = (columns[key][columns["front"] == 1] for key in ("render_ms_p50", name))
             axes.plot(x, y, ".-", lw=0.8, c="k", label="swept front")
-    best = front([x for x, _ in points], [score_of(name, y) for _, y in points])
+    best = pareto_front([x for x, _ in points], [score_of(name, y) for _, y in points])
     x, y = [points[i][0] for i in best], [points[i][1] for i in best]
     axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
     set_log_axis(axes)

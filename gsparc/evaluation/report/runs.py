@@ -19,7 +19,7 @@ from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import result_rows
 from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.fitting import dotted_settings
-from gsparc.prediction.timing import BLOCKS, Call, median_and_p95, time_interleaved
+from gsparc.prediction.timing import BLOCKS, Call, p50_p95, time_interleaved
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
@@ -51,7 +51,7 @@ class Run:
         """Its own row of the results, with `setting`, and times measured alone, where they were."""
         own = {**self.rows[0], "setting": self.setting, "run": self}
         if len(self.render_ms):
-            own["query_ms"], own["query_p95_ms"] = median_and_p95(self.render_ms)
+            own["query_ms"], own["query_p95_ms"] = p50_p95(self.render_ms)
         return own
 
     @property
@@ -221,7 +221,7 @@ def time_again(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0)
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
-        calls[number] = opened.predictor.cycling(opened.data.moving[opened.split.folds[0].test])
+        calls[number] = opened.predictor.cycle_places(opened.data.moving[opened.split.folds[0].test])
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }

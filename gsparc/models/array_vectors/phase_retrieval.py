@@ -210,7 +210,7 @@ def _search(
         normal = slope.transpose(1, 2) @ slope
         lift = damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-12
         normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
-        step = Factor.of(normal, "ignore").solved(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
+        step = Factor.of(normal, "ignore").solve(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
         tried = state - step
         new_error, new_slope = problem.residual(tried, rows[owner])
         new_cost = new_error.square().sum(1)

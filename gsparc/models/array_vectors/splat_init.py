@@ -63,7 +63,7 @@ class VectorProcess:
     training: Spent
 
 
-def start_from_array_vectors(task: InitTask) -> Start:
+def start_from_vectors(task: InitTask) -> Start:
     """Return Gaussians whose emissions through the array are the posterior of its vectors.
 
     Raises:

@@ -24,7 +24,7 @@ from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
 from gsparc.models.target_rows import entry_variance
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
-from gsparc.processes.places import of_both_ends
+from gsparc.processes.places import has_both_ends
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import TINY_M, Law
 from gsparc.processes.worker import stop_when_late
@@ -178,7 +178,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
 
 def fit_site_law(rows: PowerRows, site: Site) -> tuple[Law, tuple[str, ...]]:
     """Return the law of powers at a site, and notes: a place that nobody gave is estimated."""
-    if of_both_ends(rows.places):
+    if has_both_ends(rows.places):
         return fit_law(rows, None), ()
     if site.static_position is not None and np.isfinite(site.static_position).all():
         return fit_law(rows, site.static_position), ()

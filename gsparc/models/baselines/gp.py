@@ -24,12 +24,7 @@ from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import entry_variance, power_rows, to_real
 from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import Kernel, distances
-from gsparc.processes.nearest import (
-    NeighbourSample,
-    PlaceValues,
-    condition_on_nearest,
-    most_likely_given_nearest,
-)
+from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, fit_kernel_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows, rows_with_nearest
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, draw_rows
@@ -87,7 +82,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
-def choose_kernel_by_left_out(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
+def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
     """Return the length and noise of largest leave-one-out likelihood, from three starting lengths.
 
     Args:
@@ -145,7 +140,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         if len(targets) > CHOSEN_ON:
             thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
             looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
-        kernel = choose_kernel_by_left_out(positions[looked_at], parts.scores[looked_at], len(parts.mean))
+        kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
@@ -159,9 +154,9 @@ class GaussianProcess(Differentiable, ClosedForm):
         # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
         rows = covering_rows(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.kind, self.limit)
-        start = choose_kernel_by_left_out(positions[rows], parts.scores, len(parts.mean))
+        start = choose_left_out_kernel(positions[rows], parts.scores, len(parts.mean))
         scores, self.lost = project_targets(targets, self.kind, parts.mean, parts.axes)
-        kernel, fit_note = choose_kernel_by_neighbours(positions, scores, len(parts.mean), start, 0)
+        kernel, fit_note = choose_nearest_kernel(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
         values = PlaceValues(positions, torch.from_numpy(scores), once)
         self.scores = condition_on_nearest(Prior(kernel), values, 0)
@@ -261,7 +256,7 @@ def project_targets(
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))
 
 
-def choose_kernel_by_neighbours(
+def choose_nearest_kernel(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
     """Return length and noise likeliest given the nearest rows, by the strongest components, and a note.
@@ -278,7 +273,7 @@ def choose_kernel_by_neighbours(
     values = torch.from_numpy(scores[rows][..., strong]).double()
     once = torch.ones(rows.shape, dtype=torch.float64)
     sample = NeighbourSample.of(torch.from_numpy(places[rows]), values, once)
-    result = most_likely_given_nearest([start], sample, pdist(places[row]))
+    result = fit_kernel_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
     return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note

@@ -56,7 +56,7 @@ class Slot:
             len(rows), len(antennas), len(tones)
         ).to(whole.dtype)
 
-    def places(self, moving: Tensor, rotation: Tensor) -> Tensor:
+    def antenna_places(self, moving: Tensor, rotation: Tensor) -> Tensor:
         """Return the antenna's places (B, 3) float64 [m]; of the moving end's (B, 3) and turns (B, 3, 3)."""
         if not self.element.any():
             return moving
@@ -110,7 +110,7 @@ class Group(SlotPlaces):
         """Return the rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
-    def drawn(self, rows: float) -> Group:
+    def thin(self, rows: float) -> Group:
         """Return at most so many rows, drawn evenly."""
         if len(self) <= rows:
             return self
@@ -123,7 +123,7 @@ class Group(SlotPlaces):
 
     def state(self, factors: Tensor) -> dict[str, Any]:
         """Return what `read` reads; targets as measured, of runs of these factors."""
-        # Groups hold aligned targets, and `align_runs` divides by the factors again when they are read.
+        # Groups hold aligned targets, and `fit_factors` divides by the factors again when read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
 
@@ -170,7 +170,7 @@ def group_channels(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[G
                 continue
             here = torch.from_numpy(measured)
             chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
-            places = slot.places(moving[here], turned[here])
+            places = slot.antenna_places(moving[here], turned[here])
             when = torch.from_numpy(run[measured]), torch.from_numpy(order[rows[measured]])
             groups.append(Group(slot, places, here, chosen, *when))
     return tuple(groups)
@@ -264,7 +264,7 @@ def count_static_ends(groups: tuple[Group, ...]) -> int:
     return len({group.slot.station for group in groups})
 
 
-def align_runs(
+def fit_factors(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
@@ -284,12 +284,12 @@ def align_runs(
     known = []
     for group, factor in zip(groups, solved, strict=True):
         target = group.target / factors[group.run][:, None]
-        known.append((replace(group, target=target), Conditioned(factor, target, factor.solved(target))))
+        known.append((replace(group, target=target), Conditioned(factor, target, factor.solve(target))))
     return factors, known
 
 
 def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Return the negative log likelihood [nats] of what `align_runs` says, scales profiled out."""
+    """Return the negative log likelihood [nats] of what `fit_factors` says, scales profiled out."""
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
@@ -320,4 +320,4 @@ def thin_groups(groups: tuple[Group, ...], columns: int, rows: float = math.inf)
     Groups of as many rows keep the same ones.
     """
     chosen = np.unique(np.linspace(0, len(groups) - 1, min(columns, len(groups))).round().astype(int))
-    return tuple(groups[number].drawn(rows) for number in chosen)
+    return tuple(groups[number].thin(rows) for number in chosen)

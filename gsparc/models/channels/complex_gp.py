@@ -22,7 +22,7 @@ from gsparc.data.blocks import take
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import Group, Slot, align_runs, negative_log_likelihood
+from gsparc.models.channels.columns import Group, Slot, fit_factors, negative_log_likelihood
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
@@ -114,7 +114,7 @@ class ComplexGP(ClosedForm):
             np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
         )
         rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
-        few = rows.drawn(CHOSEN_ON)
+        few = rows.thin(CHOSEN_ON)
         if len(few) < len(rows):
             notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
         kernels = self._kernels(few.places, few.target)
@@ -200,10 +200,10 @@ def _power(channels: np.ndarray) -> np.ndarray:
 
 
 def _aligned(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """See `columns.align_runs`; of a kernel of unit power."""
+    """See `columns.fit_factors`; of a kernel of unit power."""
     gram = kernel.between(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
-    return align_runs((rows,), [gram], runs)
+    return fit_factors((rows,), [gram], runs)
 
 
 def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:

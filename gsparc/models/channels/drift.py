@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group, thin_groups
-from gsparc.models.channels.evidence import GroupInBasis, fit_terms, solve_group
+from gsparc.models.channels.evidence import BasisGroup, fit_terms, solve_group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Drift, Noise
 from gsparc.models.channels.terms.compressed import Dense
@@ -20,7 +20,7 @@ STEPS = 15
 SHARES = (0.3, 1.0, 0.3)  # of the white noise, where fast and slow drift and noise start
 
 
-def contiguous_stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
+def sample_stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     """Return at most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
     stretches = []
     for group in thin_groups(groups, COLUMNS):
@@ -36,7 +36,7 @@ def fit_drift(
     """Return the terms with correlated noise, and what evidence gains on `groups` [nats].
 
     Args:
-        groups: see `contiguous_stretches`.
+        groups: see `sample_stretches`.
         signals: covariances (n, n) of theirs.
         prior: without correlated noise.
     """
@@ -47,10 +47,8 @@ def fit_drift(
         eye = torch.eye(len(group), dtype=torch.float64)
         held = Dense(signal[None]), Dense(drift.correlations(group, group).to(torch.complex128))
         # No parameter of these terms changes the signal.
-        parts.append(
-            GroupInBasis.of(group, eye, held, torch.eye(1 + len(SHARES), dtype=torch.float64)[:, 1:])
-        )
+        parts.append(BasisGroup.of(group, eye, held, torch.eye(1 + len(SHARES), dtype=torch.float64)[:, 1:]))
     white = torch.tensor([1.0, 0.0, 0.0, level], dtype=torch.float64)
     before = sum(solve_group(part, white).nll for part in parts)
     fitted, least = fit_terms(parts, (drift, noise), 0.0, STEPS)
-    return prior.changed(*fitted), before - least
+    return prior.with_terms(*fitted), before - least

@@ -33,7 +33,7 @@ Grouping = list[Tensor] | None  # rows that are left out together; None: one by 
 
 
 @dataclass(frozen=True)
-class GroupInBasis:
+class BasisGroup:
     """A group's signal in a basis.
 
     Attributes:
@@ -53,11 +53,11 @@ class GroupInBasis:
     rest: float
 
     @staticmethod
-    def of(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> GroupInBasis:
+    def of(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> BasisGroup:
         """Return it with the group's targets in the basis."""
         target = basis.T.to(torch.complex128) @ group.target
         rest = max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
-        return GroupInBasis(group, basis, pieces, design, target, rest)
+        return BasisGroup(group, basis, pieces, design, target, rest)
 
     @property
     def is_whole(self) -> bool:
@@ -103,7 +103,7 @@ def normalise_power(group: Group) -> Group:
 
 def compress_groups(
     groups: tuple[Group, ...], prior: ChannelPrior, cache: Cache | None = None
-) -> tuple[GroupInBasis, ...]:
+) -> tuple[BasisGroup, ...]:
     """Return signals of all groups; of one set of displacements and wavelength they share the basis.
 
     `cache` keeps matrices of places that further candidates and groups need again.
@@ -117,26 +117,26 @@ def compress_groups(
         basis = get_or_make(cache, key, partial(Basis.of, key, group.places, alike, noise, cache))
         pieces = tuple(piece for term in prior.signals for piece in term.pieces(group, basis))
         design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
-        parts.append(GroupInBasis.of(group, basis.columns, pieces, design))
+        parts.append(BasisGroup.of(group, basis.columns, pieces, design))
     return tuple(parts)
 
 
-def without_rows(part: GroupInBasis, left: Tensor) -> GroupInBasis:
-    """Return the rows but those of `left` (n,) bool, from the same matrices."""
-    rest = torch.nonzero(~left).flatten()
+def without_rows(part: BasisGroup, left_out: Tensor) -> BasisGroup:
+    """Return the rows but those of `left_out` (n,) bool, from the same matrices."""
+    rest = torch.nonzero(~left_out).flatten()
     # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
-    pieces = tuple(piece.within(mixed) for piece in part.pieces)
-    return GroupInBasis.of(part.group.take(rest), basis, pieces, part.design)
+    pieces = tuple(piece.change_basis(mixed) for piece in part.pieces)
+    return BasisGroup.of(part.group.take(rest), basis, pieces, part.design)
 
 
-def solve_group(part: GroupInBasis, power: Tensor) -> SolvedGroup:
+def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
     powers = power[:-1].split([piece.count for piece in part.pieces])
     for piece, level in zip(part.pieces, powers, strict=True):
-        covariance = piece.added(covariance, level)
+        covariance = piece.add_to(covariance, level)
     covariance.diagonal().add_(noise)
     given = Conditioned.of(covariance, part.target)
     count, outputs = part.group.target.shape
@@ -147,7 +147,7 @@ def solve_group(part: GroupInBasis, power: Tensor) -> SolvedGroup:
     return SolvedGroup(outputs * (count * math.log(scale) + determinant), given, scale)
 
 
-def power_gradient(part: GroupInBasis, power: Tensor, at: SolvedGroup) -> Tensor:
+def power_gradient(part: BasisGroup, power: Tensor, at: SolvedGroup) -> Tensor:
     """Return the gradient (P,) of the negative log likelihood by logarithms of own powers."""
     count, outputs = part.group.target.shape
     weights = at.given.weights
@@ -158,21 +158,21 @@ def power_gradient(part: GroupInBasis, power: Tensor, at: SolvedGroup) -> Tensor
     return torch.cat([*(piece.traces(weight) for piece in part.pieces), noise[None]]) * power
 
 
-def negative_log_evidence(parts: tuple[GroupInBasis, ...], prior: ChannelPrior) -> float:
+def negative_log_evidence(parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> float:
     """Return the negative log marginal likelihood of all groups [nats]."""
     return sum(solve_group(part, part.own(prior)).nll for part in parts)
 
 
 def fit_powers(
-    parts: tuple[GroupInBasis, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
+    parts: tuple[BasisGroup, ...], prior: ChannelPrior, shrinkage: float, steps: int = STEPS
 ) -> tuple[ChannelPrior, float]:
     """Fit parameters of largest evidence of all `learned_terms` terms; see `fit_terms`."""
     fitted, nll = fit_terms(parts, learned_terms(prior), shrinkage, steps)
-    return prior.changed(*fitted), nll
+    return prior.with_terms(*fitted), nll
 
 
 def fit_terms(
-    parts: Sequence[GroupInBasis], terms: tuple[ChannelTerm, ...], shrinkage: float, steps: int
+    parts: Sequence[BasisGroup], terms: tuple[ChannelTerm, ...], shrinkage: float, steps: int
 ) -> tuple[tuple[ChannelTerm, ...], float]:
     """Fit parameters of largest evidence; return its negative logarithm without the priors too.
 
@@ -213,7 +213,7 @@ def fit_terms(
     return fitted, sum(solve_group(part, (part.design @ found).exp()).nll for part in parts)
 
 
-def left_out_errors(part: GroupInBasis, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
+def left_out_errors(part: BasisGroup, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
     """Return errors (n, D) of rows left out in groups, of each grouping (Rasmussen and Williams, 5.12).
 
     Powers (P,) are its own.

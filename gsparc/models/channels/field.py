@@ -19,7 +19,7 @@ from gsparc.models.channels.columns import (
     Group,
     Slot,
     SlotPlaces,
-    align_runs,
+    fit_factors,
     group_channels,
     query_ends,
     static_place,
@@ -154,7 +154,7 @@ class ChannelField(ClosedForm):
         prior = self.prior
         both = zip(prior.of_groups(groups), groups, strict=True)
         covariances = [signal + prior.disturbance(group) for signal, group in both]
-        factors, told = align_runs(groups, covariances, len(runs), factors)
+        factors, told = fit_factors(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
         self.weights = tuple(Weights(group, given, max(given.scale, TINY), *rest) for group, given in told)
@@ -214,7 +214,7 @@ class ChannelField(ClosedForm):
                 if images is not None:
                     at.slot.put(share, here, known.given.mean(images.covariance(at, known.group)))
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
-                removed = known.given.known(cross) if exact else known.learned(cross)
+                removed = known.given.explained_variance(cross) if exact else known.learned(cross)
                 whole = prior.variance(at) + prior.disturbed
                 left = known.scale * (whole - removed).clamp_min(0)
                 tell(at.slot, here, known.given.mean(cross), left, known.scale * whole)
@@ -227,7 +227,7 @@ class ChannelField(ClosedForm):
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
                 slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
-                at = SlotPlaces(slot, slot.places(moving[here], turned[here]))
+                at = SlotPlaces(slot, slot.antenna_places(moving[here], turned[here]))
                 common, left, whole = self.common.at(prior, at)
                 tell(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
@@ -241,7 +241,7 @@ class ChannelField(ClosedForm):
             here = torch.nonzero(station == number).flatten()
             for known in self.stations.get(number, ()):
                 slot, learned = known.group.slot, known.group
-                places = slot.places(moving[here], turned[here])
+                places = slot.antenna_places(moving[here], turned[here])
                 here_and_there = (to_numpy(one).tobytes() for one in (places, learned.places[:1]))
                 key = slot.wavenumber, learned.displacements, *here_and_there
                 alike.setdefault(key, []).append((known, here, places))

@@ -20,15 +20,15 @@ from gsparc.data.schema import Measurements
 from gsparc.models.channels import drift
 from gsparc.models.channels.columns import (
     Group,
-    align_runs,
     count_static_ends,
+    fit_factors,
     group_channels,
     negative_log_likelihood,
     thin_groups,
 )
 from gsparc.models.channels.complex_gp import LENGTHS, NOISES
 from gsparc.models.channels.evidence import (
-    GroupInBasis,
+    BasisGroup,
     Grouping,
     compress_groups,
     fit_powers,
@@ -47,8 +47,8 @@ from gsparc.models.channels.terms.term import Frame
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.left_out import rows_of_groups
-from gsparc.processes.places import ORIGIN, of_both_ends
-from gsparc.processes.worker import Cancelled, cancelled_by
+from gsparc.processes.places import ORIGIN, has_both_ends
+from gsparc.processes.worker import Cancelled, cancel_when
 from gsparc.training.time_budget import Effort, TimeBudget
 
 BEYOND = 10.0  # extents of the places after which nothing is known any more
@@ -145,7 +145,7 @@ def find_terms(
     search = _Search(replace(settings, rows=most), groups, every, wavelength, cache)
     steps = [search._measured(start, search._compressed(start))]
     try:
-        with cancelled_by(budget.over):  # what the seconds end is as if it had not been tried
+        with cancel_when(budget.is_spent):  # what the seconds end is as if it had not been tried
             search.grow(steps, notes)
     except Cancelled:
         notes.append("waves: the time limit ended the search for terms")
@@ -160,7 +160,7 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudge
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
     both = zip(prior.of_groups(groups), groups, strict=True)
     runs = np.unique(np.asarray(data.run)[rows])
-    factors, _ = align_runs(groups, [signal + prior.disturbance(group) for signal, group in both], len(runs))
+    factors, _ = fit_factors(groups, [signal + prior.disturbance(group) for signal, group in both], len(runs))
     return RunFactors(runs, factors)
 
 
@@ -175,10 +175,10 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
         isotropic = partial(isotropic_correlation, length=length * wavelength)
         bounded = [isotropic(g.places, g.places, g.slot.wavenumber) for g in looked]
         for noise in NOISES:
-            if tried and budget.over():
+            if tried and budget.is_spent():
                 break
             eye = [noise * torch.eye(len(each), dtype=each.dtype) for each in bounded]
-            factors, told = align_runs(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
+            factors, told = fit_factors(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
             tried.append((negative_log_likelihood(factors, told), factors, length * wavelength, noise))
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
@@ -196,7 +196,7 @@ def _strongest(prior: ChannelPrior) -> ChannelPrior:
     beyond = directions.power - directions.power.min()
     everywhere = isotropic.power + directions.power.sum()
     strong = beyond > WEAKEST * everywhere
-    return prior.changed(
+    return prior.with_terms(
         replace(isotropic, power=everywhere - beyond[strong].sum()),
         replace(directions, angles=directions.angles[strong], power=beyond[strong]),
     )
@@ -208,7 +208,7 @@ def _groupings(places: Tensor) -> list[Grouping]:
     return [None, *(groups if len(groups) < len(places) else None for groups in deep)]
 
 
-def _left_out(part: GroupInBasis, prior: ChannelPrior) -> np.ndarray:
+def _left_out(part: BasisGroup, prior: ChannelPrior) -> np.ndarray:
     """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
     errors = left_out_errors(part, part.own(prior), _groupings(part.group.places))
     return np.stack([error.abs().square().mean(1).numpy() for error in errors])
@@ -258,10 +258,10 @@ class _Search:
         )
         return after if keep else before
 
-    def _compressed(self, prior: ChannelPrior) -> tuple[GroupInBasis, ...]:
+    def _compressed(self, prior: ChannelPrior) -> tuple[BasisGroup, ...]:
         return compress_groups(self.groups, prior, self.cache)
 
-    def _measured(self, prior: ChannelPrior, parts: tuple[GroupInBasis, ...]) -> Candidate:
+    def _measured(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
         """With what left-out rows say."""
         errors = np.mean([_left_out(part, prior).mean(1) for part in parts], axis=0)
         return Candidate(prior, negative_log_evidence(parts, prior) + self._worth(prior), errors)
@@ -279,20 +279,20 @@ class _Search:
     @property
     def one_end(self) -> bool:
         """Whether one end stands."""
-        return not of_both_ends(self.every[0].places)
+        return not has_both_ends(self.every[0].places)
 
     def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; lengths by a short fit each, then powers."""
         prior, frame = before.prior, before.prior.frame
         level = NEW * prior[Isotropic].power
         if self.settings.constant and self.one_end:
-            prior = prior.changed(Leakage(frame, level))
+            prior = prior.with_terms(Leakage(frame, level))
         if direct:
-            prior = prior.changed(Direct(frame, level.repeat(2)))
+            prior = prior.with_terms(Direct(frame, level.repeat(2)))
         tried: list[tuple[ChannelPrior, float]] = []
         for bound in sorted({frame.envelope, LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if direct else GAINS[:1]:
-                trial = prior.framed(envelope=bound, gain=gain * self.wavelength)
+                trial = prior.with_frame(envelope=bound, gain=gain * self.wavelength)
                 tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
         return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
 
@@ -304,7 +304,7 @@ class _Search:
         offset = find_static_offset(self._compressed(prior), prior, self.wavelength)
         if offset is None:
             return candidate
-        moved = self._fitted(prior.framed(offset=offset))
+        moved = self._fitted(prior.with_frame(offset=offset))
         return moved if moved.nll < candidate.nll else candidate
 
     def _with_mirrors(self, before: Candidate) -> Candidate | None:
@@ -317,12 +317,12 @@ class _Search:
         if not len(planes):
             return None
         images = Images.of(prior.frame, planes, NEW * float(prior[Isotropic].power))
-        mirrored = self._fitted(prior.changed(images))
+        mirrored = self._fitted(prior.with_terms(images))
         images, power = mirrored.prior[Images], mirrored.prior.power
         heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return mirrored
-        return self._fitted(mirrored.prior.changed(images.only(heard)))
+        return self._fitted(mirrored.prior.with_terms(images.select(heard)))
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
@@ -353,9 +353,9 @@ class _Search:
         power = ((1 - SHARED) * level / len(angles)).repeat(len(angles))
         towards = torch.zeros(knots, dtype=torch.float64)
         fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
-        return prior.changed(replace(isotropic, power=SHARED * level), fresh)
+        return prior.with_terms(replace(isotropic, power=SHARED * level), fresh)
 
-    def _crossed(self, parts: tuple[GroupInBasis, ...], prior: ChannelPrior) -> np.ndarray:
+    def _crossed(self, parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
         number = [bisected_cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
         errors = np.zeros(1 + len(DEPTHS))
@@ -370,7 +370,7 @@ class _Search:
         return errors
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
-        groups = drift.contiguous_stretches(self.every)
+        groups = drift.sample_stretches(self.every)
         known = before.prior.of_groups(groups)
         prior, gain = drift.fit_drift(groups, known, before.prior)
         errors = np.zeros((2, 1 + len(DEPTHS)))

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.evidence import GroupInBasis
+from gsparc.models.channels.evidence import BasisGroup
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Images
@@ -50,7 +50,7 @@ class _Searcher:
         self.planes, self.risen = torch.zeros(0, 4, dtype=torch.float64), 0.0
 
     def gains(
-        self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.known
+        self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.explained
     ) -> Tensor:
         """Rise of the log likelihood (W, levels) of each plane alone."""
 
@@ -64,7 +64,7 @@ class _Searcher:
         self.planes, self.risen = torch.cat([self.planes, plane[None]]), self.risen + gain
         image = Images.of(self.frame, plane[None])
         self.rough, self.probes = (
-            tuple(probe.added(image.waves(probe.group)[0], level) for probe in each)
+            tuple(probe.with_wave(image.waves(probe.group)[0], level) for probe in each)
             for each in (self.rough, self.probes)
         )
 
@@ -73,7 +73,7 @@ class _Searcher:
         chosen: list[Tensor] = []
         for number in scores.argsort(descending=True).tolist():
             tried = Images.of(self.frame, torch.stack([*chosen, grid[number]]))
-            placed = tried.placed(self.ends)
+            placed = tried.mirror(self.ends)
             away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
             if not bool((away < APART * self.wavelength).any()):
                 chosen.append(grid[number])
@@ -105,7 +105,7 @@ class _Searcher:
 
 
 def find_mirrors(
-    coarse: tuple[GroupInBasis, ...], parts: tuple[GroupInBasis, ...], prior: ChannelPrior,
+    coarse: tuple[BasisGroup, ...], parts: tuple[BasisGroup, ...], prior: ChannelPrior,
     wavelength: float, most: int,
 ) -> Tensor:  # fmt: skip
     """Return planes (W, 4) float64, local; none where all together are not worth it.
@@ -158,8 +158,8 @@ def candidate_planes(probes: Probes, frame: Frame, wavelength: float) -> tuple[T
 
 
 def _about(probe: Probe, waves: Tensor) -> Tensor:
-    """`Probe.known` by that of a few: an isotropic field knows waves from everywhere alike."""
+    """`Probe.explained` by that of a few: an isotropic field knows waves from everywhere alike."""
     size = waves.abs().square().sum(1)
     few = torch.linspace(0, len(waves) - 1, min(LOOKED_AT, len(waves))).long()
-    share = probe.known(waves[few]).sum() / size[few].sum().clamp_min(TINY)
+    share = probe.explained(waves[few]).sum() / size[few].sum().clamp_min(TINY)
     return size * share

@@ -33,14 +33,14 @@ class ChannelPrior(Stored):
             raise KeyError(kind.__name__)
         return found
 
-    def changed(self, *terms: ChannelTerm) -> ChannelPrior:
+    def with_terms(self, *terms: ChannelTerm) -> ChannelPrior:
         """Return the prior with these in place of their kinds; those without powers are left out."""
         kinds = {type(term): term for term in (*self.terms, *terms)}
         # In the order of `KINDS`: parameters of terms stand one after the other in vectors.
         ordered = (kinds[kind] for kind in dict.fromkeys([*KINDS, *kinds]) if kind in kinds)
         return ChannelPrior(tuple(term for term in ordered if len(term.power)))
 
-    def framed(self, **numbers: Any) -> ChannelPrior:
+    def with_frame(self, **numbers: Any) -> ChannelPrior:
         """Return the prior with some numbers of `frame` changed."""
         frame = replace(self.frame, **numbers)
         return ChannelPrior(tuple(replace(term, frame=frame) for term in self.terms))

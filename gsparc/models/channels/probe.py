@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Group
-from gsparc.models.channels.evidence import GroupInBasis, solve_group
+from gsparc.models.channels.evidence import BasisGroup, solve_group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
 from gsparc.processes.density import TINY
@@ -45,7 +45,7 @@ class Probe:
     scale: float
 
     @staticmethod
-    def of(part: GroupInBasis, prior: ChannelPrior) -> Probe:
+    def of(part: BasisGroup, prior: ChannelPrior) -> Probe:
         """Factor a group's covariance with its own powers."""
         at, basis, noise = solve_group(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
@@ -53,7 +53,7 @@ class Probe:
         root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
         return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
-    def known(self, waves: Tensor) -> Tensor:
+    def explained(self, waves: Tensor) -> Tensor:
         """Return f^H C^-1 f (m,) float64 of waves (m, n)."""
         inside, basis, downdate = (
             (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
@@ -67,10 +67,10 @@ class Probe:
         `known` (m,) stands in for `known(waves)`.
         """
         inner = (waves.conj() @ self.alpha).abs().square().sum(1)
-        size = 1 + level * (self.known(waves) if known is None else known)
+        size = 1 + level * (self.explained(waves) if known is None else known)
         return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
 
-    def added(self, wave: Tensor, level: float) -> Probe:
+    def with_wave(self, wave: Tensor, level: float) -> Probe:
         """Return the probe with a wave (n,) of some power among the terms."""
         own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
         own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
@@ -81,7 +81,7 @@ class Probe:
 
 def likelihood_gains(
     probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
-    known: Callable[[Probe, Tensor], Tensor] = Probe.known,
+    known: Callable[[Probe, Tensor], Tensor] = Probe.explained,
 ) -> Tensor:  # fmt: skip
     """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
@@ -94,14 +94,14 @@ def likelihood_gains(
 
 
 def find_static_offset(
-    parts: tuple[GroupInBasis, ...], prior: ChannelPrior, wavelength: float
+    parts: tuple[BasisGroup, ...], prior: ChannelPrior, wavelength: float
 ) -> Tensor | None:
     """Return the likeliest offset (3,) float64 [m] on a grid that is refined, or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """
     direct = prior[Direct]
-    none = prior.changed(replace(direct, power=torch.full_like(direct.power, TINY)))
+    none = prior.with_terms(replace(direct, power=torch.full_like(direct.power, TINY)))
     probes, level = [Probe.of(part, none) for part in parts], float(direct.power.sum())
 
     def gain(offsets: Tensor) -> Tensor:

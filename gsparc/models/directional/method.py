@@ -22,7 +22,7 @@ from gsparc.models.directional.position_refine import PositionRefinement, Uncert
 from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
-from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_phase_and_static_end
+from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_static_phase
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import wave, wave_over_band
@@ -60,7 +60,7 @@ class DirectionalGP(SourcesInFrame):
             ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
         """
         started = TimeBudget()
-        require_phase_and_static_end(data.site, self.name)
+        require_static_phase(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
         known = np.concatenate([fold.train, fold.val])
@@ -93,7 +93,7 @@ class DirectionalGP(SourcesInFrame):
         self._refine_positions()
         self._refit()
         changed = self._update_visibility()
-        self.posterior.prepared()
+        self.posterior.precompute()
         note = (
             f"directional_gp: {self.size()} triangulated sources, direction error "
             f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
@@ -116,7 +116,7 @@ class DirectionalGP(SourcesInFrame):
 
     def _refit(self) -> None:
         """Powers and kernel."""
-        few = self._few(SearchSettings.search_rows).learned()
+        few = self._few(SearchSettings.search_rows).fit()
         self.posterior = replace(self.posterior, power=few.power, kernel=few.kernel)
 
     def _update_visibility(self) -> int:
@@ -149,7 +149,7 @@ class DirectionalGP(SourcesInFrame):
             self._refit()
         return changed
 
-    def found(self) -> Found:
+    def sources(self) -> Found:
         """Return places [m], local, and amplitudes of the sources, to start a search from."""
         return self.posterior.positions.points + self._fitted().middle, self.posterior.power.sqrt()
 
@@ -180,7 +180,7 @@ class DirectionalGP(SourcesInFrame):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.frame = site, Frame(site, **state["frame"])
-        self.posterior = from_containers(SightedSources, state["posterior"]).prepared()
+        self.posterior = from_containers(SightedSources, state["posterior"]).precompute()
 
     @property
     def terms(self) -> tuple[str, ...]:

@@ -136,14 +136,14 @@ class SightedSources:
     @cached_property
     def exact(self) -> SightedSources:
         """The same in float64, of what was computed in float32."""
-        return to_double(self.prepared())
+        return to_double(self.precompute())
 
-    def prepared(self) -> SightedSources:
+    def precompute(self) -> SightedSources:
         """Return itself, with what all queries need; what the first makes might be for inference only."""
         assert len(self.dual_weights) == len(self.rows)
         return self
 
-    def learned(self) -> SightedSources:
+    def fit(self) -> SightedSources:
         """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
@@ -193,7 +193,7 @@ class SightedSources:
         arriving = wave(at.away, carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
         cross = self._cross(arriving * probability, at.retained, self.power) * at.correlation
-        gains = (powers * probability.square()).sum(1) - self.conditioned.known(cross)
+        gains = (powers * probability.square()).sum(1) - self.conditioned.explained_variance(cross)
         # Variance p (1 - p) of a source that is seen or not, times its power.
         of_visibility = (powers * probability * (1 - probability)).sum(1)
         return gains.clamp_min(0) + of_visibility + noise, (powers * probability).sum(1) + noise

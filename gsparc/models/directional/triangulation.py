@@ -98,7 +98,7 @@ class RayClusters:
 def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
     """Return all points where rays intersect, by falling evidence."""
     rng = np.random.default_rng(seed)
-    empty = expectation_maximisation(rays, rays.places[:0], MAX_ERROR)
+    empty = fit_by_em(rays, rays.places[:0], MAX_ERROR)
     error = _initial_error(rays, rng)
     if error is None:
         return empty
@@ -109,13 +109,13 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
         if not new:
             break
         points += new
-        clusters = expectation_maximisation(rays, np.stack(points), error)
+        clusters = fit_by_em(rays, np.stack(points), error)
         points, error = list(clusters.points), clusters.error
         free = clusters.responsibility.sum(0) < 0.5
     return clusters if points else empty
 
 
-def expectation_maximisation(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
+def fit_by_em(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
     """Run expectation maximisation over points and rays, without duplicates and points of weak evidence."""
     while True:
         responsibility = np.zeros((0, len(rays)))

@@ -30,7 +30,7 @@ def direct_path_scene(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
     return replace(scene, log_amplitude=power.sqrt().log().reshape(1), noise_floor=noise_floor)
 
 
-def estimate_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
+def find_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     """Return factors (E,) complex64 for channels of each antenna, the first 1; None: nothing gained.
 
     Args:

@@ -19,7 +19,7 @@ from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
-from gsparc.processes.worker import Cancelled, after_steps, cancelled_by, ending_when
+from gsparc.processes.worker import Cancelled, cancel_when, end_when, step_limit
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -74,8 +74,8 @@ def run_searches(
 
     def ends(share: float) -> Callable[[], bool]:
         """Whether so much of a search's effort, from now, or all of the seconds are spent."""
-        counted = after_steps(round(share * budget.effort.evaluations))
-        return lambda: counted() or budget.over()
+        counted = step_limit(round(share * budget.effort.evaluations))
+        return lambda: counted() or budget.is_spent()
 
     def unwanted(number: int) -> bool:
         """Whether those before it are all that is wanted."""
@@ -98,16 +98,16 @@ def run_searches(
             look(rows, scene)
         error = left_out_nmse(rows, scene)
         hidden = scene.quadrature == 1 or reached_noise_floor([error], noise_floor, 1)
-        if settings.clutter and not hidden and is_compact_array(rows):
+        if settings.clutter and not hidden and shares_occlusion(rows):
             scene = find_clutter(rows, scene, torch.Generator().manual_seed(settings.seed + number))
             error = left_out_nmse(rows, scene)
         return Member(scene, error, number)
 
     def search(number: int) -> Member | None:
-        if unwanted(number) or (number > 0 and budget.over()):
+        if unwanted(number) or (number > 0 and budget.is_spent()):
             return None
         try:
-            with cancelled_by(partial(unwanted, number)), ending_when(ends(1.0)):
+            with cancel_when(partial(unwanted, number)), end_when(ends(1.0)):
                 member = solve(number)
         except Cancelled:
             return None
@@ -146,7 +146,7 @@ def left_out_nmse(rows: Rows, scene: Scene) -> float:
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 
-def is_compact_array(rows: Rows) -> bool:
+def shares_occlusion(rows: Rows) -> bool:
     """Whether the static end's antennas are near enough to be occluded alike."""
     return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
 

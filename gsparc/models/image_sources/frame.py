@@ -168,7 +168,7 @@ def merge_equal_paths(
     return summed, delay[..., kept], unit[:, kept]
 
 
-def require_phase_and_static_end(site: Site, name: str) -> None:
+def require_static_phase(site: Site, name: str) -> None:
     """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")

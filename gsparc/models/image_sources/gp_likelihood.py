@@ -48,7 +48,7 @@ class CircularGains:
         """(n, n) complex64."""
         return torch.complex(self._real, self._imag)
 
-    def add(self, scaled: Tensor, correlation: Tensor) -> None:
+    def add_source(self, scaled: Tensor, correlation: Tensor) -> None:
         """Add one source, `(s a)(s a)^H * C`."""
         # With a = p + j q: a a^H = (p p^T + q q^T) + j (q p^T - p q^T).
         pair = torch.stack([scaled.real, scaled.imag], 1)
@@ -62,7 +62,7 @@ class CircularGains:
         self._real.diagonal().add_(noise)
         return Conditioned.of(self.matrix, self.target)
 
-    def slope_by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+    def grad_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """Return slopes (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
         slopes = torch.empty_like(scaled)
@@ -72,11 +72,11 @@ class CircularGains:
             slopes[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
         return 2 * slopes
 
-    def slope_by_noise(self, slope: Tensor) -> Tensor:
+    def grad_noise(self, slope: Tensor) -> Tensor:
         """Return the derivative () by the variance of the noise."""
         return slope.diagonal().real.sum()
 
-    def slope_by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+    def grad_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
         """Return derivatives (n, n) by the correlation of one source."""
         return (slope.conj() * scaled[:, None] * scaled.conj()).real
 
@@ -86,7 +86,7 @@ def stack_real_imag(waves: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
 
 
-def variance_along_and_across(quadrature: Tensor | float) -> Tensor:
+def quadrature_variances(quadrature: Tensor | float) -> Tensor:
     """Return the variance along and across a gain's phase, (2,)."""
     return torch.tensor([1 - quadrature / 2, quadrature / 2])
 
@@ -103,10 +103,10 @@ class PhasedGains(CircularGains):
         """(2 n, 2 n) float32."""
         return self._sum.view(2 * len(self.target), -1)
 
-    def add(self, scaled: Tensor, correlation: Tensor) -> None:
+    def add_source(self, scaled: Tensor, correlation: Tensor) -> None:
         """Add one source, with waves s_k w_k."""
         pair = torch.stack(stack_real_imag(scaled), 1)
-        product = (pair * variance_along_and_across(self.quadrature)) @ pair.T
+        product = (pair * quadrature_variances(self.quadrature)) @ pair.T
         self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
 
     def condition(self, noise: Tensor | float) -> Conditioned:
@@ -114,23 +114,23 @@ class PhasedGains(CircularGains):
         self.matrix.diagonal().add_(noise / 2)
         return Conditioned.of(self.matrix, stack_real_imag(self.target)[0])
 
-    def slope_by_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
+    def grad_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """See `CircularGains`."""
         n, slopes = len(scaled), torch.empty_like(scaled)
         blocks = slope.view(2, n, 2, n)
         for k, one in enumerate(correlation):
-            pair = torch.stack(stack_real_imag(scaled[:, k]), 1) * variance_along_and_across(self.quadrature)
+            pair = torch.stack(stack_real_imag(scaled[:, k]), 1) * quadrature_variances(self.quadrature)
             by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
             # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
             slopes[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
         return slopes
 
-    def slope_by_noise(self, slope: Tensor) -> Tensor:
+    def grad_noise(self, slope: Tensor) -> Tensor:
         """See `CircularGains`."""
         # Half of the noise is in either part, and of real values d nll is half of trace(G dK).
         return slope.diagonal().sum() / 4
 
-    def slope_by_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
+    def grad_correlation(self, slope: Tensor, scaled: Tensor) -> Tensor:
         """See `CircularGains`; differentiable in `quadrature`."""
         n, share = len(scaled), torch.as_tensor(self.quadrature) / 2
         along, across = (
@@ -162,7 +162,7 @@ class Posterior:
         """Covariance of all sources, without noise until `conditioned` adds it."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
-            gains.add(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
+            gains.add_source(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
         return gains
 
     @cached_property
@@ -186,14 +186,14 @@ class Posterior:
         """Return `nll` of the scene without source k, of circular gains."""
         one, source = CircularGains(self.rows), self.scene.sources[k]
         correlation = self.scene.visibility.correlation(self.rows.places, source)
-        one.add(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
+        one.add_source(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
         return Conditioned.of(self.covariance - one.matrix, self.rows.target).nll
 
     # ---- of gains of fixed phases ----
     @property
     def dual_weights(self) -> Tensor:
         """Dual weights of u_k + j v_k (K, n, R) complex64, before the correlation over places."""
-        n, (along, across) = len(self.rows), variance_along_and_across(self.scene.quadrature)
+        n, (along, across) = len(self.rows), quadrature_variances(self.scene.quadrature)
         alpha = torch.complex(*self.conditioned.weights.split(n))
         power = self.scene.log_amplitude.mul(2).exp()
         circular = (self.waves.conj() * power).T[:, :, None] * alpha

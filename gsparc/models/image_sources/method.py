@@ -19,13 +19,13 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import Snapshot
 from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
 from gsparc.models.image_sources import ensemble
-from gsparc.models.image_sources.element_factors import direct_path_scene, estimate_element_factors
+from gsparc.models.image_sources.element_factors import direct_path_scene, find_element_factors
 from gsparc.models.image_sources.ensemble import Look, Member
 from gsparc.models.image_sources.frame import (
     Frame,
     SourcesInFrame,
     require_fixed_rotation,
-    require_phase_and_static_end,
+    require_static_phase,
 )
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
@@ -36,7 +36,7 @@ from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import image_rotations, normal_form
-from gsparc.physics.row_factors import Freedom, alignment_factors
+from gsparc.physics.row_factors import Freedom, align_factors
 from gsparc.physics.waves import wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import Race
@@ -87,7 +87,7 @@ class ImageSourceGP(SourcesInFrame):
         Raises:
             ValueError: the data are not channels, or their phase means nothing.
         """
-        require_phase_and_static_end(data.site, self.name)
+        require_static_phase(data.site, self.name)
         require_fixed_rotation(data)
         known = np.concatenate([fold.train, fold.val])
         self._groups = context.leave_out
@@ -165,7 +165,7 @@ class ImageSourceGP(SourcesInFrame):
 
     def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
-        factors = estimate_element_factors(rows, scene)
+        factors = find_element_factors(rows, scene)
         if factors is None:
             return data
         self.factors = self.factors * factors
@@ -187,7 +187,7 @@ class ImageSourceGP(SourcesInFrame):
         mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(race.looked(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
+        errors.append(race.log_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
 
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
@@ -256,7 +256,7 @@ class ImageSourceGP(SourcesInFrame):
         measured = data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
         free: Freedom = "phase" if self.settings.offsets == "phase" else "phase+delay"
         target = data.target.copy()
-        target[known] *= alignment_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
+        target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)
 
     def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:

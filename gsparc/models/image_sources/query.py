@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior, variance_along_and_across
+from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances
 from gsparc.models.image_sources.rows import moving_end, ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
 from gsparc.models.method import to_double
@@ -153,7 +153,7 @@ class RowVariance:
         there = torch.stack([member.waves.real.T, member.waves.imag.T], 1)[:, None]  # (K, 1, 2, n)
         there = there * self.power[:, None, None, None]
         self.level, self.there = there * float(kernel.constant), there * (1 - float(kernel.constant))
-        self.along, across = variance_along_and_across(scene.quadrature).tolist()
+        self.along, across = quadrature_variances(scene.quadrature).tolist()
         self.across = across * torch.tensor([[1.0, -1.0], [-1.0, 1.0]])[..., None]
 
     def __call__(self, arriving: Tensor, varying: Tensor) -> tuple[Tensor, Tensor]:

@@ -82,13 +82,13 @@ def _objective(
     amplitude, noise = moved.log_amplitude.detach().exp(), math.exp(moved.log_noise)
     scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).gains()
     for k, one in enumerate(correlation):
-        gains.add(scaled[:, k], one)
+        gains.add_source(scaled[:, k], one)
     conditioned = gains.condition(noise + scene.noise_floor)
-    by_waves = gains.slope_by_waves(conditioned.slope, scaled, correlation)
+    by_waves = gains.grad_waves(conditioned.slope, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     slopes = torch.autograd.grad(waves, leaves, by_waves * amplitude, materialize_grads=True)
     by_place, by_normal, by_offset, _, _, *by_phase = slopes
-    by_noise = noise * gains.slope_by_noise(conditioned.slope)
+    by_noise = noise * gains.grad_noise(conditioned.slope)
     gradient = [by_place, by_normal, by_offset, by_amplitude, by_noise, *by_phase]
     if cost is None:
         return conditioned.nll, gradient
@@ -133,7 +133,7 @@ def learn_visibility(
         loss = ((value - about) / width).square().sum()
         for k, source in enumerate(scene.sources):
             correlation = KernelVisibility.of(value).correlation(rows.places, source)
-            loss = loss + (gains.slope_by_correlation(slope, scaled[:, k]) * correlation).sum()
+            loss = loss + (gains.grad_correlation(slope, scaled[:, k]) * correlation).sum()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

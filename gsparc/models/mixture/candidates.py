@@ -32,7 +32,7 @@ def sources(init: InitSettings, clutter: bool, context: FitContext) -> ClosedFor
     """
     method = ImageSourceGP(**_searched(init, clutter, context))
     if "rays" in context.beside:
-        method.start = context.beside["rays"].found()
+        method.start = context.beside["rays"].sources()
     return method
 
 

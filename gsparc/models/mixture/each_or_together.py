@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.inner_folds import cut_inner_folds
+from gsparc.data.inner_folds import cut_folds
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.field.initial import InitSettings
@@ -72,10 +72,10 @@ def choose_stations(
     budget = context.time_budget()
     errors, folds, most = [], budget.effort.station_folds, budget.effort.station_rows
     # Two folds at least are cut, though one may be looked at: a single one would test all rows.
-    for inner in cut_inner_folds(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
+    for inner in cut_folds(data, fold, context.split, max(folds, 2), context.seed).folds[:folds]:
         learned = heard_rows(data, np.union1d(inner.train, inner.val))
         # Rows below or above a level have no value to be wrong by.
-        queries = inner.test[data.side(inner.test) == 0]
+        queries = inner.test[data.censored_side(inner.test) == 0]
         if len(learned) > most:
             # Drawn from all stations at once: each keeps its share of the rows.
             learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:most])
@@ -90,7 +90,7 @@ def choose_stations(
         separate = torch.cat([powers for _, powers in parts])
         target = decibels(data.batch(rows).target.flatten().double())
         errors.append([(_levels(joint, data, rows) - target).square(), (separate - target).square()])
-        if budget.over():
+        if budget.is_spent():
             break
     if not errors:
         return "together", "too few rows of each station to leave any out"

@@ -24,7 +24,7 @@ from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import LEAST_HELD, HeldOutPair, in_error_unit
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
-from gsparc.processes.worker import ending_when
+from gsparc.processes.worker import end_when
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import FellBehind, Race, mean_square
 from gsparc.training.time_budget import TimeBudget
@@ -68,10 +68,10 @@ def fit_candidates(
     race: Race | None = None
 
     def note(what: str, error: float) -> None:
-        context.curve(budget.counted.wall, what, error)
+        context.log_curve(budget.counted.wall, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES and (why := _needless(race, bool(fields) and budget.over())):
+        if name in SEARCHES and (why := _needless(race, bool(fields) and budget.is_spent())):
             log.info("init=%s is left out: %s", name, why)
             continue
         within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
@@ -80,7 +80,7 @@ def fit_candidates(
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
             within = replace(within, leave_out=leave_out, race=race, beside=fields)
-            with heeded.apart() as read[name], ending_when(budget.over):
+            with heeded.set_apart() as read[name], end_when(budget.is_spent):
                 clutter = name not in CLUTTERED or effects.visibility is not False
                 field = parts[name](settings, clutter, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
@@ -183,7 +183,7 @@ def _held(
 
 
 def weigh_process(
-    field: Method, data: Measurements, fold: Fold, left: LeftOut | None, distance: float | None
+    field: Method, data: Measurements, fold: Fold, left_out: LeftOut | None, distance: float | None
 ) -> tuple[tuple[GaussianProcess, float] | None, float | None]:
     """Return what a plain process on whole targets is worth beside a field, by rows neither learned from.
 
@@ -194,7 +194,7 @@ def weigh_process(
         field: fitted on the same rows, without a process.
         data: measurements.
         fold: training and validation rows.
-        left: training rows of spectra as the field's start predicts them, before any step.
+        left_out: training rows of spectra as the field's start predicts them, before any step.
         distance: of validation rows from the nearest training row [m].
 
     Returns:
@@ -202,10 +202,10 @@ def weigh_process(
         of validation rows that the field explains, where that was found.
     """
     spectra = data.site.kind == "spectrum"
-    left = left if spectra else None
+    left_out = left_out if spectra else None
     process = GaussianProcess()
     process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
-    if not field.size() or (left is None and len(fold.val) < LEAST_HELD):
+    if not field.size() or (left_out is None and len(fold.val) < LEAST_HELD):
         few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
         log.info("%s: a Gaussian process alone", few if field.size() else "no Gaussians")
         return (process, 1.0), None
@@ -222,8 +222,8 @@ def weigh_process(
             )
         else:
             weight = solution_weights.stacking_weights([own, plain], target, np.arange(len(val)))[1]
-    if left is not None:
-        rows.append(_left_out(left, distance))
+    if left_out is not None:
+        rows.append(_left_out(left_out, distance))
         if explained is None:
             own, target = (torch.from_numpy(part) for part in (rows[-1].own, rows[-1].target))
             explained = solution_weights.explained_variance(own, target, True)
@@ -231,7 +231,7 @@ def weigh_process(
         weight = solution_weights.share_of_second(rows)
     log.info(
         "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
-        len(val), 0 if left is None else len(left.centres), weight,
+        len(val), 0 if left_out is None else len(left_out.centres), weight,
     )  # fmt: skip
     return ((process, weight) if weight > 0 else None), explained
 

@@ -72,7 +72,7 @@ class Powers(Mixture):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
-        heeded.count(*["model.terms"] * bool(self.own_terms))  # a tuple is not noted when it is read
+        heeded.count_reads(*["model.terms"] * bool(self.own_terms))  # a tuple is not noted when it is read
         return super().fit(data, fold, replace(context, terms=self.own_terms))
 
     def tries(self, data: Measurements) -> Mapping[str, Candidate]:

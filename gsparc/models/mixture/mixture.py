@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.inner_folds import cut_inner_folds
+from gsparc.data.inner_folds import cut_folds
 from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -95,7 +95,7 @@ class Mixture(LearnsTogether, ClosedForm):
             ValueError: these measurements are of another kind, or the only initialiser cannot solve this.
         """
         self.site, self.runs = data.site, RunFactors.none()
-        with heeded.apart():
+        with heeded.set_apart():
             if (why := self.obstacle(data)) is not None:
                 raise ValueError(f"{self.name}: {why}")
             parts = self.tries(data)
@@ -103,7 +103,7 @@ class Mixture(LearnsTogether, ClosedForm):
             # An initialiser of another kind of site means nothing here: what this kind has is tried.
             name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
             init = replace(self.init, name=name)
-        heeded.count(*["init.name"] * named, *["model.effects.residual"] * (data.site.kind != "rssi"))
+        heeded.count_reads(*["init.name"] * named, *["model.effects.residual"] * (data.site.kind != "rssi"))
         if "scene" in parts:
             read_walls(self.init.file)  # its errors come before anything is computed
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
@@ -124,7 +124,7 @@ class Mixture(LearnsTogether, ClosedForm):
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
         rows, by, note = refine_places(self, self.runs.aligned(data), std)
-        if by.any() and budget.over():
+        if by.any() and budget.is_spent():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
         if not by.any() or budget.limited:
@@ -156,16 +156,12 @@ class Mixture(LearnsTogether, ClosedForm):
         self.runs = _runs(data, known, context)
         data = self.runs.aligned(data)
         stages = {"factors of runs": budget.counted.wall} if len(self.runs) > 1 else {}
-        cut = (
-            cut_inner_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed)
-            if several
-            else None
-        )
+        cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
         found, reports, read = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, budget, cut
         )
         chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
-        heeded.count(*(path for name in chosen for path in read[name]))
+        heeded.count_reads(*(path for name in chosen for path in read[name]))
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
         self.site, self.init_s = data.site, budget.counted.wall
@@ -178,7 +174,7 @@ class Mixture(LearnsTogether, ClosedForm):
             self.condition(data, known)
         seconds = budget.counted.wall
         if several:
-            context.curve(seconds, "final")
+            context.log_curve(seconds, "final")
         stages |= {name: report.seconds for name, report in reports.items()}
         # Not below 0: searches of a resumed run count what they took before.
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
@@ -189,7 +185,7 @@ class Mixture(LearnsTogether, ClosedForm):
         return FitReport(seconds, tuple(notes), limited).with_cost(Cost(stages, unused))
 
     def _explained(self, data: Measurements, fold: Fold, apart: bool) -> float | None:
-        """What Gaussians explain of validation rows; conditions on training rows, unless `apart` already."""
+        """What Gaussians explain of validation rows; conditions on training rows, unless apart already."""
         if not (len(fold.val) and self.count):
             return None
         if not apart:

@@ -99,11 +99,11 @@ def in_error_unit(values: Tensor, site: Site) -> Tensor:
     return decibels(values) if site.kind == "rssi" else values
 
 
-def mix_means(own: Tensor, other: Tensor, weight: float, site: Site) -> Tensor:
+def mix_means(own: Tensor, second: Tensor, weight: float, site: Site) -> Tensor:
     """Return the mean (n, ...) of two predictions in the unit of errors, the other's of this weight."""
     if site.kind != "rssi":
-        return own.lerp(other, weight)
-    return own.clamp_min(TINY_POWER) ** (1 - weight) * other.clamp_min(TINY_POWER) ** weight
+        return own.lerp(second, weight)
+    return own.clamp_min(TINY_POWER) ** (1 - weight) * second.clamp_min(TINY_POWER) ** weight
 
 
 def to_real_entries(values: Tensor) -> Tensor:

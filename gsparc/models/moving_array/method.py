@@ -175,7 +175,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         first = None if static is None else torch.from_numpy(np.asarray(static)).float()
         return find_sources(
             some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
-            self.seed, self._budget.over,
+            self.seed, self._budget.is_spent,
         )  # fmt: skip
 
     def _powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:

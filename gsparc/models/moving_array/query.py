@@ -17,7 +17,7 @@ from gsparc.data.query import Query
 from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
-from gsparc.models.moving_array.triangulate import bearings, mix_lags
+from gsparc.models.moving_array.triangulate import bearings, sum_lags
 from gsparc.models.reduced import Interpolated, Settings, View
 from gsparc.ops.transforms import is_differentiated
 from gsparc.physics.lags import SpectrumLags
@@ -48,7 +48,7 @@ class ReceivingArray:
 
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
         """Return images (n, H, W) of sources of powers (n, K)."""
-        images = self.space.spectrum(mix_lags(power, self.atoms(sources, receivers)), self._pixels)
+        images = self.space.spectrum(sum_lags(power, self.atoms(sources, receivers)), self._pixels)
         if self.exponent == 1 or not is_differentiated(images):
             return images if self.exponent == 1 else images.sqrt()
         bright = images > 0  # at 0 a root has no slope

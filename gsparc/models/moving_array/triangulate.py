@@ -80,7 +80,7 @@ def nonnegative_powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     return power
 
 
-def mix_lags(power: Tensor, atoms: Tensor) -> Tensor:
+def sum_lags(power: Tensor, atoms: Tensor) -> Tensor:
     """Return lags (n, Q) of sources of the given power (n, K)."""
     return (power[:, None] @ atoms)[:, 0]
 
@@ -111,7 +111,7 @@ def find_sources(
     def residual_of(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
         atoms = space.atoms(bearings(sources, receivers, rotation))
-        return lags - mix_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
+        return lags - sum_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 
     positions, residual = known, residual_of(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())

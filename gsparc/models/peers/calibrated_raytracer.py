@@ -28,7 +28,7 @@ from gsparc.simulate.calibration import (
     calibrate,
     used_materials,
 )
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import from_config, known_scene, load_tracer
@@ -169,9 +169,9 @@ class CalibratedRayTracer(Method):
         assert self.site is not None
         return self._ready().trace(places + self.site.origin, self._traced_effects())
 
-    def _traced_effects(self) -> PropagationEffects:
+    def _traced_effects(self) -> Effects:
         # Diffuse scattering has parameters of its own, which nothing here learns.
-        return PropagationEffects(
+        return Effects(
             diffraction=self.diffraction, edge_diffraction=False, diffuse=False, polarisation=False,
             depth=self.depth,
         )  # fmt: skip

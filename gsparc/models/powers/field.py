@@ -197,7 +197,7 @@ class PowerField(ClosedForm):
             posterior = process.posterior
             loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
             places = process.places[loud]
-            decibels, factor = self.fringes.blended_unseen(
+            decibels, factor = self.fringes.add_left_out_fringes(
                 decibels, torch.from_numpy(places), torch.from_numpy(nearest_distances(places)), self.known
             )
             spread = spread * factor
@@ -228,7 +228,7 @@ class PowerField(ClosedForm):
         mean, spread, share = process.answer(places)
         if self.fringes is None:
             return mean, spread, share, mean
-        mean, factor = self.fringes.blended(mean, places, self._distance(places))
+        mean, factor = self.fringes.add_fringes(mean, places, self._distance(places))
         return mean, spread * factor, share, self.fringes.solutions(places).mean(1)
 
     def _distance(self, places: Tensor) -> Tensor:

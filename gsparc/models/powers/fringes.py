@@ -18,17 +18,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, ErrorGain, compare_errors, number_squares, split_groups
-from gsparc.models.powers.waves import (
-    FLOOR,
-    PlaneWaveBasis,
-    field_decibels,
-    fit_wave_weights,
-    plane_wave_basis,
-)
+from gsparc.models.powers.waves import FLOOR, PlaneWaveBasis, field_db, fit_wave_weights, make_basis
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
 from gsparc.processes.nearest import condition_on_nearest
-from gsparc.processes.places import of_both_ends
+from gsparc.processes.places import has_both_ends
 from gsparc.processes.powers import MOST_ROWS as FACTORED
 from gsparc.processes.powers import PowerRows, condition_on_powers
 from gsparc.processes.prior import Posterior, Prior
@@ -105,7 +99,7 @@ class Fringes(Stored):
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
         return self.level + to_decibels(field.real.square() + field.imag.square() + FLOOR)
 
-    def blended(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+    def add_fringes(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
 
         Args:
@@ -115,7 +109,7 @@ class Fringes(Stored):
         """
         return self._shared(decibels, self.solutions(places).mean(1), distance)
 
-    def blended_unseen(
+    def add_left_out_fringes(
         self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
     ) -> tuple[Tensor, Tensor]:
         """Return the same at rows (n,) by those solutions that never saw them or their surroundings."""
@@ -131,7 +125,7 @@ class Fringes(Stored):
 
 def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
     """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
-    if wavelength is None or of_both_ends(places):
+    if wavelength is None or has_both_ends(places):
         return False
     unique = np.unique(places, axis=0)
     return len(unique) > 1 and float(np.median(nearest_distances(unique))) < wavelength / 2
@@ -167,7 +161,7 @@ def fit_fringes(
     chosen = np.sort(order[: probes + count])
     every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
     level = float(to_decibels(from_decibels(rows.decibels).mean()))
-    basis = plane_wave_basis(rows.places[fold >= 0], wavelength)
+    basis = make_basis(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
@@ -175,13 +169,13 @@ def fit_fringes(
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: ErrorGain | None = None
-    while len(weights) < budget.effort.fringes and not budget.over():
+    while len(weights) < budget.effort.fringes and not budget.is_spent():
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)
             weights.append(fit_wave_weights(columns[seen], rows.decibels[seen] - level, rng))
         blind = np.arange(len(weights)) % FOLDS
-        powers = level + field_decibels(columns @ np.stack(weights, 1))
+        powers = level + field_db(columns @ np.stack(weights, 1))
         blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
         if len(weights) >= TRIED and not gain.exceeds(0.0):
@@ -223,7 +217,7 @@ def _apart(
     error, distance = np.zeros((2, len(rows.places)))
     if many := len(rows.places) > MOST_ROWS:
         dense = condition_on_nearest(prior, rows.means_at_places(), seed)
-        at = dense.near.every.query(rows.places)[1]
+        at = dense.near.tree.query(rows.places)[1]
     for part in parts:
         rest = np.setdiff1d(at, at[part]) if many else np.setdiff1d(np.arange(len(rows.places)), part)
         known: Posterior = (

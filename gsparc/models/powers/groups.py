@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.processes.places import moving_end, on_floor
+from gsparc.processes.places import horizontal, moving_end
 from gsparc.processes.trend import TINY_M
 
 SIDES = 10  # squares along the longer side of the places' box
@@ -38,7 +38,7 @@ def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
     Along the longer side of the places' box there are `sides` squares.
     """
-    floor = on_floor(moving_end(places))
+    floor = horizontal(moving_end(places))
     side = max(float(np.ptp(floor, axis=0).max()), TINY_M) / sides
     cell = np.floor((floor - floor.min(0)) / side).clip(max=sides - 1).astype(np.int64)
     return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)

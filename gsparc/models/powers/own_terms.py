@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.processes.places import of_both_ends
+from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import MAIN
@@ -79,7 +79,7 @@ class UserTerm(Columns):
         return mean * self._asked(places).sum(1) if mean else super().mean(places)
 
     def _asked(self, places: Tensor) -> Tensor:
-        both = places if of_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
+        both = places if has_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
         result = self.term.columns(both + torch.cat([self.origin, self.origin]))
         if not isinstance(result, Tensor):
             gave = f"{type(self.term).__name__}.columns gave {type(result).__name__}"
@@ -103,7 +103,7 @@ class UserTerm(Columns):
         if result.ndim != 2 or len(result) != len(places):
             raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed")
         if wrong := int((~result.isfinite()).any(1).sum()):
-            unknown = not of_both_ends(places) and not self.still.isfinite().all()
+            unknown = not has_both_ends(places) and not self.still.isfinite().all()
             why = ", but the place of the end that stands is not given" if unknown else ""
             raise ValueError(f"{gave}, NaN or infinite in {wrong} rows; finite numbers are needed{why}")
         if (most := float(result.abs().max())) * (1.0 if prior is None else prior[1]) > LARGEST:
@@ -157,7 +157,7 @@ def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[Learne
     columns = posterior.prior.columns(at)
     weights, scale = (columns.T @ posterior.weights)[:, 0], posterior.prior.kernel.amplitude
     # Of weights of unit variance, times the amplitude: 1 - C^T K^-1 C.
-    left = (scale * (1 - posterior.factor.whitened(columns).square().sum(0)).clamp_min(0)).sqrt()
+    left = (scale * (1 - posterior.factor.whiten(columns).square().sum(0)).clamp_min(0)).sqrt()
     numbers = torch.stack([weights, left, torch.zeros_like(left), torch.full_like(left, scale**0.5)]).numpy()
     sizes = [one.columns(at[:1]).shape[1] for one in own]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)

@@ -115,7 +115,7 @@ def candidate_priors(
     found = sorted(
         (choose_candidate(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score
     )
-    return found if rows.silent.any() else [*found, _kriged(rows.drawn(chosen_on, seed), trends[0][0])]
+    return found if rows.silent.any() else [*found, _kriged(rows.draw(chosen_on, seed), trends[0][0])]
 
 
 def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
@@ -136,10 +136,10 @@ def mix_candidates(
     """
     if len(found) == 1:
         return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
-    part = rows.drawn(chosen_on, seed)
+    part = rows.draw(chosen_on, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in found]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    gram = _relative([_among_rows(rows.loud, one.prior, seed) for one in found])
+    gram = _relative([_among_rows(rows.measured, one.prior, seed) for one in found])
     for sides in SPANS:
         gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
@@ -186,9 +186,9 @@ def _settings(
     rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows.heard.drawn(chosen_on, seed)
-    few = loud.drawn(COMPARED_ON, seed)
-    weighed = rows.drawn(min(WEIGHED_ON, chosen_on), seed)
+    loud = rows.heard.draw(chosen_on, seed)
+    few = loud.draw(COMPARED_ON, seed)
+    weighed = rows.draw(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     scores = [one.score for one in candidates]
@@ -258,7 +258,7 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
     silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
     known = ConditionalGaussian.of(gram, values[:, 0], silent)
-    doubt = torch.from_numpy(rows.side)[silent] * known.doubt(values[silent, 0])
+    doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
     used = ~rows.silent
     used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
     return rows.at(np.flatnonzero(used))

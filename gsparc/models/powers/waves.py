@@ -16,7 +16,7 @@ from scipy.linalg import blas, eigh
 
 from gsparc.models.channels.kernels import fibonacci_sphere
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
-from gsparc.processes.factor import Factor, NotPositiveDefiniteError
+from gsparc.processes.factor import Factor, NotDefiniteError
 from gsparc.processes.stored import Stored
 
 WAVES = 800  # on the sphere: twelve wavelengths of places are resolved
@@ -53,7 +53,7 @@ class PlaneWaveBasis(Stored):
         return self.plane(places) @ self.mixture
 
 
-def plane_wave_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
+def make_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
     """Return combinations of plane waves, from everywhere alike, that places (n, 3) tell apart.
 
     A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
@@ -66,7 +66,7 @@ def plane_wave_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
     return PlaneWaveBasis(waves, vectors[:, large] / math.sqrt(values[large].sum()))
 
 
-def field_decibels(field: np.ndarray) -> np.ndarray:
+def field_db(field: np.ndarray) -> np.ndarray:
     """Return powers [dB] of complex fields of any shape, with the floor."""
     return to_decibels(np.abs(field) ** 2 + FLOOR)
 
@@ -145,10 +145,10 @@ def _step(
         damped[diagonal] += damping * middle
         try:
             factor = Factor.of(torch.from_numpy(damped), "raise")
-        except NotPositiveDefiniteError:  # rounding: more damping mends it
+        except NotDefiniteError:  # rounding: more damping mends it
             damping *= DAMPED
             continue
-        by = -factor.solved(torch.from_numpy(right)[:, None])[:, 0].numpy()
+        by = -factor.solve(torch.from_numpy(right)[:, None])[:, 0].numpy()
         better = _Misfit.of(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
         if better.value < now.value:
             return better, max(damping / 3, 1e-5)

@@ -21,8 +21,8 @@ from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Prior
 from gsparc.field.initial import InitTask, Start, keep_weights
 from gsparc.field.model import GaussianModel
-from gsparc.models.array_vectors.splat_init import start_from_array_vectors
-from gsparc.models.baselines.gp import choose_kernel_by_left_out, principal_components
+from gsparc.models.array_vectors.splat_init import start_from_vectors
+from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
 from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat.left_out_images import LeftOut, predict_left_out
 from gsparc.models.target_rows import to_real, training_targets
@@ -76,7 +76,7 @@ def _kernel(data: Measurements, rows: np.ndarray, most: int, seed: int) -> tuple
     chosen = rows if len(rows) <= most else np.sort(draw.choice(rows, most, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
     parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
-    return chosen, choose_kernel_by_left_out(data.moving[looked_at], parts.scores, len(parts.mean))
+    return chosen, choose_left_out_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
     batch = data.batch(rows)
     images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
-    emission = Factor.of(gram + ridge).solved(weights.mT @ images.mT).mT
+    emission = Factor.of(gram + ridge).solve(weights.mT @ images.mT).mT
     distance = model.distances(batch.tx)
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
@@ -202,7 +202,7 @@ def initialise(task: InitTask) -> Start:
         ValueError: a start is asked for that the data do not allow.
     """
     if task.settings.response.array and task.closed_form:
-        return start_from_array_vectors(task)
+        return start_from_vectors(task)
     if task.closed_form:
         assert task.receiver is not None  # else `auto_settings` refuses
         process = learn_process(task.data, task.rows, task.anchors, task.seed)

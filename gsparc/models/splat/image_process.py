@@ -61,7 +61,7 @@ class ImageProcess(LearnedField):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
         self._average, self._average_mean = None, None
-        with heeded.apart():
+        with heeded.set_apart():
             why = (
                 array_obstacle(data.site, "rx", "the receiver moves")
                 if self.settings.response.array
@@ -79,10 +79,10 @@ class ImageProcess(LearnedField):
                 ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
             )  # fmt: skip
         # Settings of the field count as heeded only where the field has a part in the answer.
-        with heeded.apart() as read:
+        with heeded.set_apart() as read:
             report = super().fit(data, fold, context)
         if not self._alone:
-            heeded.count(*read)
+            heeded.count_reads(*read)
         spent = dict(self.spent)
         if self._average is not None:
             method = self._average[0]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.models.baselines.gp import choose_kernel_by_left_out
+from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import left_out_around
 from gsparc.processes.stored import Stored
@@ -44,7 +44,7 @@ class LeftOut(Stored):
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
         # Left singular vectors times singular values are scores in an orthonormal basis.
-        kernel = choose_kernel_by_left_out(self.positions, vectors * lengths, len(mean))
+        kernel = choose_left_out_kernel(self.positions, vectors * lengths, len(mean))
         inverse = Factor.of(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
         return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]

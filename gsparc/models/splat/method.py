@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.inner_folds import cut_inner_folds
+from gsparc.data.inner_folds import cut_folds
 from gsparc.data.limits import check_arguments, or_word, switch, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -168,7 +168,7 @@ class LearnedField(Method):
             if module is None:
                 continue
             files = GsparcCheckpointIO(self, context.config_yaml, self._marks(stage, budget, origin))
-            heeded.count("dataset.batch_size")
+            heeded.count_reads("dataset.batch_size")
             began = budget.counted
             trainer, batches = gradient_stage.make_trainer(
                 module, data, stage.fold, stage.context, files, budget, self._watch(stage)
@@ -178,7 +178,7 @@ class LearnedField(Method):
             self._end(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
         self.frozen = self._doubled = None
         what = f"final, {self.steps} of {self.steps_taken} steps kept"
-        context.curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
+        context.log_curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
         return FitReport(budget.counted.wall, limited_by=self._limited_by)
 
     def _begin(self, data: Measurements, fold: Fold, marks: Mapping[str, Any]) -> None:
@@ -240,9 +240,9 @@ class LearnedField(Method):
                 yield Stage("train", watched, context, 0)
             self._calibrate(data, watched)
             self._weigh_process(data, watched)
-        if self.refit and len(watched.val) and not self._alone and not budget.over():
+        if self.refit and len(watched.val) and not self._alone and not budget.is_spent():
             kept, resume = (self.model, self.steps, self._prior), context.resume if refits else None
-            yield Stage("refit", _all_rows(watched), context.within("refit", resume=resume), steps)
+            yield Stage("refit", _all_rows(watched), context.for_part("refit", resume=resume), steps)
             if budget.limited and not refits:  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
 
@@ -284,7 +284,7 @@ class LearnedField(Method):
         self.spent["initialiser" + stage.again] = prepared
         if not stage.steps:
             return None
-        if budget.over():
+        if budget.is_spent():
             log.warning("budget_s=%.3g: none is left for gradient steps", context.budget_s)
             blind = stage.name == "train" and self.choices.closed_form  # nothing shows that steps would gain
             self._paying = 0 if blind else self._paying
@@ -529,7 +529,7 @@ def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     known = np.sort(np.concatenate([fold.train, fold.val]))
     if len(known) < THIRDS * LEAST_HELD:
         return fold
-    cut = cut_inner_folds(data, fold, context.split, THIRDS, context.seed).folds[0]
+    cut = cut_folds(data, fold, context.split, THIRDS, context.seed).folds[0]
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
 
 

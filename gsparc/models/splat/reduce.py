@@ -19,13 +19,13 @@ from gsparc.field.response import ArrayResponse
 from gsparc.models.method import Method
 from gsparc.models.reduced import Interpolated, Settings, coarsen_grid
 from gsparc.ops import Pose, SphereGrid
-from gsparc.processes.features import correlation, features_at_places, pivoted_rows
+from gsparc.processes.features import correlation, pivoted_rows, place_features
 
 if TYPE_CHECKING:
     from gsparc.models.splat.method import LearnedField
 
 
-def through_array(model: GaussianModel) -> bool:
+def is_imaged_by_array(model: GaussianModel) -> bool:
     """Return whether Gaussians emit fields that an array images, on pixels of its own."""
     return model.settings.response.array
 
@@ -36,7 +36,7 @@ def reduction_settings(model: GaussianModel) -> tuple[str, ...]:
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
     places that the features are told by, which `keep` is a share of, and pixels.
     """
-    if not through_array(model):
+    if not is_imaged_by_array(model):
         return ("confidence", "stride")
     return ("keep", "stride", "confidence") if model.tells_unknown else ("confidence",)
 
@@ -64,7 +64,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     raster = model.settings.raster
     raster = replace(raster, low_pass=raster.low_pass / stride**2)  # as wide as before on the sky
     model.settings = replace(model.settings, raster=raster)
-    by_places = through_array(model) and model.tells_unknown
+    by_places = is_imaged_by_array(model) and model.tells_unknown
     if "keep" in settings:
         distil_features(model, float(settings["keep"]))
     if not settings.get("confidence", True):
@@ -94,7 +94,7 @@ def _frozen_again(
     view = method.frozen_at(Pose(receiver[0], receiver[1:]))
     response, grid = model.response, model.site.grid
     assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
-    renderer = response.every(stride, coarsen_grid(grid, stride)) if stride > 1 else None
+    renderer = response.coarsen(stride, coarsen_grid(grid, stride)) if stride > 1 else None
     return freeze_array(model, view.view, renderer), grid
 
 
@@ -116,7 +116,7 @@ def distil_features(model: GaussianModel, share: float) -> None:
     count, width, channels = emission.weight2.shape
     weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
     chosen = pivoted_rows(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
-    features = features_at_places(places[chosen], places, length, noise, old.kernel)
+    features = place_features(places[chosen], places, length, noise, old.kernel)
     result = features.weigh @ (own @ (old.whitening.double() @ weights))
     prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())
     few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)

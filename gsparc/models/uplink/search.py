@@ -177,7 +177,7 @@ class SourceSearch:
         n = fit.gain.shape[1]
         reach = self._reach(n)
         factor = Factor.of(self._scaled(fit, noise), "ignore")
-        step = factor.solved((fit.slope * reach)[..., None])[..., 0] * reach
+        step = factor.solve((fit.slope * reach)[..., None])[..., 0] * reach
         step = step.clamp(-LARGEST * reach, LARGEST * reach)
         return step[:, : 2 * n].view(-1, 2, n).transpose(1, 2), step[:, 2 * n :]
 

@@ -158,7 +158,7 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
         ValueError: no scene is known, or not one that a ray tracer loads.
     """
     if stated is None:
-        if not names_scene(provenance):
+        if not has_known_scene(provenance):
             raise ValueError(
                 "the data name no scene of triangles; say model.scene=NAME, TOWN.osm or SCENE.xml"
             )
@@ -176,7 +176,7 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
     return replace(scene, carrier_hz=carrier_hz)
 
 
-def names_scene(provenance: Mapping[str, str]) -> bool:
+def has_known_scene(provenance: Mapping[str, str]) -> bool:
     """Tell whether measurements come out of a scene that a ray tracer loads."""
     try:
         return json.loads(provenance["scene"])["room"] is None

@@ -122,7 +122,7 @@ def test_more_members_than_the_library_holds_were_packed():
     process = of_powers(60).method.powers
     for count, packs in ((7, True), (8, False)):
         many = replace(process, others=((0.1, replace(process, others=())),) * count)
-        assert (make.powers_form(many, 1.0) is not None) == packs
+        assert (make.compile_powers(many, 1.0) is not None) == packs
 
 
 def test_channels_without_sources_and_stations_are_refused_in_one_line():

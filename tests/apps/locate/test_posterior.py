@@ -23,9 +23,9 @@ def test_cells_cover_the_plane_that_was_walked():
 
 def test_halves_fill_the_whole():
     cells = cover_box(PLACES, 50, False)
-    finer = cells.halved()
+    finer = cells.halve()
     assert len(finer) == 4 * len(cells) and finer.size.sum() == pytest.approx(cells.size.sum())
-    one = cells.at(np.array([3])).halved()
+    one = cells.at(np.array([3])).halve()
     assert np.abs(one.centre - cells.centre[3]).max(0) == pytest.approx(cells.edge[3] / 4)
 
 
@@ -59,15 +59,15 @@ def test_errors_of_recorded_places_widen_an_area():
     cells = cover_box(PLACES, 8_000, False)
     sharp = gaussians(cells, [[2.0, 1.0]])
     wide = Posterior(cells, sharp.sharp, 0.3)
-    area = cells.size[wide.within(0.9)].sum()
+    area = cells.size[wide.densest_cells(0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
     place = np.array([2.3, 1.1, 1.5])
-    assert wide.at(place) == pytest.approx(wide.log_density[cells.index_of(place)], abs=0.05)
+    assert wide.log_density_at(place) == pytest.approx(wide.log_density[cells.index_of(place)], abs=0.05)
 
 
 def test_area_of_a_known_density_holds_its_share():
     found = gaussians(cover_box(PLACES, 20_000, False), [[2.0, 1.0]])
-    area = found.cells.size[found.within(0.9)].sum()
+    area = found.cells.size[found.densest_cells(0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * 0.2**2 * np.log(0.1), rel=0.02)
     assert found.level(np.array([2.0, 1.0, 1.5])) < 0.01 and found.level(np.array([3.9, 1.9, 1.5])) > 0.99
 

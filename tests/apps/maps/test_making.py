@@ -11,13 +11,7 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
-from gsparc.apps.maps.field_map import (
-    REFUSED,
-    best_server,
-    read_loads,
-    server_chance,
-    sinr,
-)
+from gsparc.apps.maps.field_map import REFUSED, best_server, read_loads, server_chance, sinr
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import _usual_levels, choose_stations, predict_map
 from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
@@ -63,7 +57,7 @@ def test_a_unit_of_maps_changed_their_names_alone():
     for name in ("expected_error_db", "outage", "sinr_db", "server_chance", "best_server"):
         np.testing.assert_allclose(getattr(other, name), getattr(own, name), atol=1e-6)
     assert "[dBm]" in next(iter(list_layers(other))).legend.label
-    assert other.figures()["map/unit"] == "dBm"
+    assert other.summarise()["map/unit"] == "dBm"
     with pytest.raises(ValueError, match=r"unit=W: of powers in dBW expected dBm, dBW$"):
         predict_map(predictor, unit="W")
 
@@ -155,7 +149,7 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     assert told[0] == pytest.approx(0.5, abs=1e-4) and told[3] == pytest.approx(0.0756, abs=2e-3)
     quiet = predict_map(predictor, step_m=10.0)
     loud = predict_map(predictor, step_m=10.0, noise_db=0.0)
-    assert not quiet.unsure.any() and loud.unsure.all() and loud.figures()["map/server_unsure"] == 1
+    assert not quiet.unsure.any() and loud.unsure.all() and loud.summarise()["map/server_unsure"] == 1
     unsure = {layer.name: layer.unsure for layer in list_layers(loud)}
     assert unsure["best_server"] is not None and unsure["power"] is None
 

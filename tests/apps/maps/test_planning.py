@@ -26,7 +26,7 @@ def test_gains_are_what_conditioning_takes_away():
     root = rng.normal(size=(6, 6))
     one = ErrorCovariance(root @ root.T, 0.3, np.ones(6))
     every = np.ones(6, bool)
-    gains, before = one.gains(every), one.variances().sum()
+    gains, before = one.variance_reductions(every), one.variances().sum()
     for place in range(6):
         twin = ErrorCovariance(one.covariance.copy(), 0.3, np.ones(6))
         twin.condition_on(place)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsparc.apps.view.answer import Answer, Rays, merge_paths, predict_answer
-from gsparc.apps.view.building import BOX, MIRROR, ray_parts
+from gsparc.apps.view.building import BOX, MIRROR, draw_rays
 from gsparc.apps.view.reasons import explain_level, legend_html
 from gsparc.apps.view.scene import Faces
 
@@ -45,7 +45,7 @@ def test_a_path_that_two_searches_found_is_one_path():
 def test_rays_are_as_long_as_their_delays():
     towards = np.array([[1.0, 0, 0], [0, 1, 0]])
     rays = Rays(np.array([-40.0, -50]), np.array([10.0, 20]), towards)
-    lines, ends = ray_parts(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
+    lines, ends = draw_rays(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
     length = np.linalg.norm(ends.places - 1, axis=1)
     np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
     assert lines.segments.shape == (2, 2, 3)

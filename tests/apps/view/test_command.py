@@ -56,7 +56,7 @@ def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, 
 def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
     viewed = open_model(town_model(), {"file": str(tmp_path / "gone.npz")})
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
-    scene = build_scene(viewed, None, "west", viewed.measured("west"))
+    scene = build_scene(viewed, None, "west", viewed.measured_at("west"))
     assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
 
 
@@ -76,7 +76,7 @@ def test_a_unit_of_pictures_changed_their_names_alone(monkeypatch):
     assert (dbm.site.level_unit, dbw.site.level_unit) == ("dBm", "dBW")
     level, lower = (predict_levels(one.predictor_of("west"), places)[0] for one in (dbm, dbw))
     np.testing.assert_allclose(lower, level - 30, atol=1e-4)
-    np.testing.assert_allclose(dbw.measured("west").values, dbm.measured("west").values - 30, atol=1e-4)
+    np.testing.assert_allclose(dbw.measured_at("west").values, dbm.measured_at("west").values - 30, atol=1e-4)
     with pytest.raises(ValueError, match=r"unit=mW: of powers in dBm expected dBm, dBW$"):
         open_model(town_model(), unit="mW")
 

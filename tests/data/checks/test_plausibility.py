@@ -38,7 +38,7 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
 
 def warnings_of(levels: LinkLevels | None):
     assert levels is not None
-    return plausibility.plausibility_warnings(levels, plausibility.find_level_steps(levels))
+    return plausibility.sanity_warnings(levels, plausibility.find_level_steps(levels))
 
 
 def room(seed=0, count=100):
@@ -182,7 +182,7 @@ def campus(stations=slice(None)) -> LinkLevels:
 def test_a_real_station_that_lost_its_gain():
     """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1162 on, where it was off."""
     some = campus(slice(5, 9))
-    found = plausibility.level_step_warnings(some, plausibility.find_level_steps(some))
+    found = plausibility.step_warnings(some, plausibility.find_level_steps(some))
     assert len(found) == 2 and all("ebc-nuc1" in line for line in found)
     assert "rises by 17 dB between row 349 and row 350" in found[0]
     assert "falls by 19 dB between row 1161 and row 1461" in found[1]

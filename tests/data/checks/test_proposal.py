@@ -2,12 +2,7 @@
 
 import numpy as np
 
-from gsparc.data.checks.describe import (
-    describe_spacing,
-    propose_block_side,
-    propose_split,
-    rows_in_test_blocks,
-)
+from gsparc.data.checks.describe import propose_side, propose_split, spacing_words, test_block_rows
 from gsparc.data.own import load_own, write_own
 
 
@@ -22,24 +17,24 @@ def powers(file, places):
 def test_squares_are_a_tenth_of_the_site_or_several_neighbours_wide(tmp_path):
     rng = np.random.default_rng(0)
     data = powers(tmp_path / "a.npz", rng.uniform([0, 0, 1], [270, 200, 1], (400, 3)))
-    assert propose_block_side(data) == 30.0
-    assert 0.15 < len(rows_in_test_blocks(data, 30.0)) / 400 < 0.5
+    assert propose_side(data) == 30.0
+    assert 0.15 < len(test_block_rows(data, 30.0)) / 400 < 0.5
     assert "split=blocks split.side_m=30 " in propose_split(data)
     sparse = powers(
         tmp_path / "b.npz", np.array([[x, y, 1.0] for x in range(0, 60, 10) for y in range(0, 60, 10)])
     )
-    assert propose_block_side(sparse) is None and "too few places" in propose_split(sparse)
+    assert propose_side(sparse) is None and "too few places" in propose_split(sparse)
 
 
 def test_copies_of_places_were_neighbours_at_no_distance(tmp_path):
     """Seen from above as well: squares of floor of places at two heights had no least side."""
     places = np.array([[x, y, z] for x in range(0, 60, 10) for y in range(0, 60, 10) for z in (1.0, 2.0)])
-    assert describe_spacing(np.repeat(places[::2], 3, axis=0), None).startswith(
+    assert spacing_words(np.repeat(places[::2], 3, axis=0), None).startswith(
         "the nearest other place is 10 m"
     )
-    assert propose_block_side(powers(tmp_path / "a.npz", places)) is None
+    assert propose_side(powers(tmp_path / "a.npz", places)) is None
 
 
 def test_one_place_alone_has_no_squares(tmp_path):
     data = powers(tmp_path / "a.npz", np.tile([1.0, 2.0, 3.0], (5, 1)) + [[0, 0, 0.1 * i] for i in range(5)])
-    assert propose_block_side(data) is None
+    assert propose_side(data) is None

@@ -8,7 +8,7 @@ from hydra import initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from releases import real
 
-from gsparc.commands.shared.settings import plain
+from gsparc.commands.shared.settings import to_dict
 from gsparc.evaluation.experiment.problem import load_every_problem
 
 ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
@@ -16,7 +16,7 @@ ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
 
 def test_a_fetched_set_needs_no_path(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    settings = plain(compose("experiment=results/newrf", config="compare"))
+    settings = to_dict(compose("experiment=results/newrf", config="compare"))
     with pytest.raises(ValueError, match="no dataset has a path"):
         load_every_problem(settings)
     (tmp_path / "gsparc/data/newrf").mkdir(parents=True)

@@ -6,9 +6,9 @@ import pytest
 from hydra import initialize_config_module
 
 from gsparc.evaluation.experiment.cells import Cell, Contender
-from gsparc.evaluation.experiment.fitting import CellResult, prepare_cell, run_cells
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.problem import Problem, _may_match
+from gsparc.evaluation.experiment.run_cells import CellResult, prepare_cell, run_cells
 from gsparc.models.checkpoint import CheckpointError
 
 

@@ -8,8 +8,8 @@ from clocks import WoundClock
 
 from gsparc.evaluation.experiment import latency
 from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.problem import Problem
+from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.models.method import Prediction
 from gsparc.prediction import timing
 

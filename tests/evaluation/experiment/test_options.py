@@ -16,7 +16,7 @@ from worlds import World, arrays
 from gsparc.data import executor, heeded
 from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
-from gsparc.evaluation.console import plain
+from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.folds import fit_context, fit_folds
 from gsparc.models.registry import build, fill_defaults
@@ -49,9 +49,9 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
         patch.setattr(HydraConfig.instance(), "cfg", whole)
         method = build(fill_defaults(config.model))
         reads = options.options_to_note(config, method)
-        with heeded.recording(reads):
+        with heeded.record_reads(reads):
             data = datamodule(config.dataset).measurements
-            split = split_for(plain(config.split), data)
+            split = split_for(to_dict(config.split), data)
             folder = Path(mkdtemp())
             fits = fit_folds(
                 method, data, split,

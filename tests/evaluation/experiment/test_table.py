@@ -5,9 +5,9 @@ import pytest
 
 from gsparc.evaluation.experiment import pictures
 from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.fitting import CellResult
 from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.experiment.pictures import draw_budgets
+from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.experiment.table import (
     average_cells,
     markdown,

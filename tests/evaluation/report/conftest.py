@@ -82,15 +82,7 @@ def invent_three(folder: Path) -> list[Path]:
     return [
         invent(folder / "a0", seed=0, psnr=28.0, overrides=(*said, "seed=0")),
         invent(folder / "a1", seed=1, psnr=28.4, overrides=(*said, "seed=1")),
-        invent(
-            folder / "b0",
-            psnr=29.5,
-            seconds=130,
-            ms=0.2,
-            effects="array",
-            overrides=other,
-            train=50,
-        ),
+        invent(folder / "b0", psnr=29.5, seconds=130, ms=0.2, effects="array", overrides=other, train=50),
     ]
 
 

@@ -12,7 +12,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from gsparc.data.load import load, split_for
 from gsparc.data.query import Query
 from gsparc.evaluation.scores import score_methods
-from gsparc.models.baselines.gp import GaussianProcess, choose_kernel_by_left_out, principal_components
+from gsparc.models.baselines.gp import GaussianProcess, choose_left_out_kernel, principal_components
 from gsparc.ops import Pose
 from gsparc.processes.density import LeftOutDensity
 from gsparc.processes.kernel import Kernel
@@ -22,10 +22,7 @@ from gsparc.training.context import FitContext
 def test_chosen_kernel_is_a_minimum(campaign):
     data = campaign("spectrum", 40)
     scores = torch.from_numpy(principal_components(data.target, "spectrum", 512).scores)
-    kernel, places = (
-        choose_kernel_by_left_out(data.moving, scores.numpy(), 288),
-        torch.from_numpy(data.moving),
-    )
+    kernel, places = (choose_left_out_kernel(data.moving, scores.numpy(), 288), torch.from_numpy(data.moving))
     at = {
         step: LeftOutDensity.apply(
             Kernel.of_one(kernel.length * step, kernel.noise).gram(places), scores, 288, False

@@ -80,7 +80,7 @@ def test_a_probe_gains_what_the_likelihood_rises():
             rise = (fits[0] - fits[1]) / probe.scale + sizes[0] - sizes[1]
             torch.testing.assert_close(gain, rise, rtol=1e-4, atol=1e-3)
         covariance = covariance + level * waves[0][:, None] * waves[0].conj()[None]
-        probe = probe.added(waves[0], level)
+        probe = probe.with_wave(waves[0], level)
 
 
 def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():

@@ -60,7 +60,7 @@ def _prior(data, *, correlated=False, mirrors=1, angles=4, envelope=0.4):
     sizes = [1, angles, 1, 2, 2 * mirrors, 1, 2 * correlated]
     power = torch.rand(sum(sizes), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
     isotropic, unequal, leakage, direct, images, noise, drift = power.split(sizes)
-    return ChannelPrior(()).changed(
+    return ChannelPrior(()).with_terms(
         Isotropic(frame, isotropic),
         Directions(frame, unequal, angles=fibonacci_sphere(angles), concentration=5.0),
         Leakage(frame, leakage),

@@ -56,7 +56,7 @@ def _tied(data, rows):
     frame = Frame(torch.from_numpy(data.moving).mean(0), 20.0, 0.6, 0.4, offset)
     power = torch.rand(13, dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
     towards = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
-    prior = ChannelPrior(()).changed(
+    prior = ChannelPrior(()).with_terms(
         Isotropic(frame, power[:1]),
         Directions(frame, power[1:9], angles=fibonacci_sphere(16)[:8], concentration=5.0, towards=towards),
         Leakage(frame, power[9:10]),

@@ -57,7 +57,7 @@ def test_a_search_starts_from_sources_where_rays_meet():
     rows = np.arange(60)
     fold, still = Fold(rows, rows[:0], rows[:0]), torch.from_numpy(data.site.static_position).double()
     method = fitted(data, fold)[0]
-    found = method.found()
+    found = method.sources()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
         settings = SearchSettings(order=order)
         start = Search(draw_rows(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources

@@ -12,7 +12,7 @@ from rooms import PILLAR, WAVELENGTH, shoebox
 
 from gsparc.models.image_sources.clutter import finite_mirrors, search
 from gsparc.models.image_sources.clutter.blocking import Clutter, plane_tangents, visible_share
-from gsparc.models.image_sources.clutter.boxes import find_box
+from gsparc.models.image_sources.clutter.boxes import find_occluding_box
 from gsparc.models.image_sources.clutter.finite_mirrors import find_patch, find_small_mirrors
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.clutter.search import find_clutter
@@ -23,7 +23,7 @@ from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import all_sequences
-from gsparc.processes.worker import Cancelled, cancelled_by, ending_when
+from gsparc.processes.worker import Cancelled, cancel_when, end_when
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -141,7 +141,7 @@ def test_score_is_what_the_best_multiple_gains():
     left = _unexplained(rows, _bare())
     scene, scorer = left.scene, left.scorer
     change = torch.randn(20, 8, dtype=torch.complex64)
-    score, multiple = scorer.gain_of_positive_multiples(change)
+    score, multiple = scorer.gain_of_multiples(change)
     best = int(score.argmax())
     moved = replace(rows, target=rows.target - (multiple[best] * change[:, best])[:, None])
     gain = Posterior(rows, scene).nll - Posterior(moved, scene).nll
@@ -158,7 +158,7 @@ def _truth(scene: Scene, rows: Rows, noise: float = 0.02) -> Rows:
 
 def test_the_pillar_is_found_by_its_shadow():
     rows = _truth(_scene(_boxed(_box())), _rows(150))
-    box, score = find_box(_unexplained(rows, _bare()), draws=500)
+    box, score = find_occluding_box(_unexplained(rows, _bare()), draws=500)
     assert score > 20
     middle = (box[:2] + box[3:5]) / 2
     torch.testing.assert_close(middle, torch.tensor([1.8, 1.4]), atol=0.25, rtol=0)
@@ -229,7 +229,7 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         spent.append(time.thread_time())
         return spent[-1] > spent[0] + 0.5
 
-    with cancelled_by(unwanted), pytest.raises(Cancelled):
+    with cancel_when(unwanted), pytest.raises(Cancelled):
         find_small_mirrors(replace(left, room=4 * _room()), 3)
     assert max(np.diff([*spent, time.thread_time()])) < 0.5
     room, cells = 20 * _room(), []
@@ -253,10 +253,10 @@ def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
     rows = _beside_a_table(60)[0].rows
     start, looks = _bare(), []
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
-    with ending_when(late):
+    with end_when(late):
         found = find_clutter(rows, start, torch.Generator().manual_seed(0))
     assert isinstance(found, Scene) and len(looks) < 60
-    with cancelled_by(lambda: True), pytest.raises(Cancelled):
+    with cancel_when(lambda: True), pytest.raises(Cancelled):
         find_clutter(rows, start, torch.Generator().manual_seed(0))
 
 

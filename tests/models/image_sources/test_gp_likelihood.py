@@ -10,11 +10,7 @@ from gsparc.models.image_sources import refine
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import (
-    KernelVisibility,
-    Scene,
-    spherical_waves,
-)
+from gsparc.models.image_sources.scene import KernelVisibility, Scene, spherical_waves
 from gsparc.processes.kernel import matern32_of_squares
 
 COUNT = 24

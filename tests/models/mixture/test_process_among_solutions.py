@@ -5,7 +5,7 @@ import torch
 from boxes import room_of_spectra
 from closed import fitted_to
 
-from gsparc.data.inner_folds import cut_inner_folds
+from gsparc.data.inner_folds import cut_folds
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
@@ -21,7 +21,7 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     spoilt, _ = fitted_to(GaussianProcess(), data, few)
     spoilt.mean = spoilt.mean + 0.3
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
-    cut = cut_inner_folds(data, fold, None, 3, 0)
+    cut = cut_folds(data, fold, None, 3, 0)
     assert [*weigh_candidates({"bearings": spoilt, "process": good}, data, fold, cut)] == ["process"]
 
 

@@ -20,16 +20,14 @@ from gsparc.simulate.calibration import (
     student_loss,
     used_materials,
 )
-from gsparc.simulate.effects import PropagationEffects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.build import SceneSettings, known_scene, names_scene
+from gsparc.simulate.scenes.build import SceneSettings, has_known_scene, known_scene
 from gsparc.training.context import FitContext
 
 STATION = np.array([-2.5, 0.0, 3.0])
 CARRIER_HZ = 3.5e9
-PLAIN = PropagationEffects(
-    diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2
-)
+PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
 TRUE = Material(4.0, 0.2)
 GAIN_DB = 17.0
 ALL = np.arange(60)
@@ -79,9 +77,13 @@ def test_where_no_scene_is_known_it_says_so_in_one_line(scene, words):
 
 def test_a_room_without_triangles_names_no_scene():
     boxy = SceneSettings("box", 30, CARRIER_HZ, 0.0, 1, room={"size_m": [6, 5, 3]})
-    assert not names_scene(said(boxy)) and not names_scene({}) and not names_scene({"scene": "a street"})
+    assert (
+        not has_known_scene(said(boxy))
+        and not has_known_scene({})
+        and not has_known_scene({"scene": "a street"})
+    )
     street = SceneSettings("canyon", 30, CARRIER_HZ, 0.0, 1, builtin="simple_street_canyon")
-    assert names_scene(said(street)) and known_scene(None, said(street), 2e9).carrier_hz == 2e9
+    assert has_known_scene(said(street)) and known_scene(None, said(street), 2e9).carrier_hz == 2e9
 
 
 def test_without_the_ray_tracer_it_says_what_to_install(monkeypatch):

@@ -13,7 +13,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.fringes import Blend, nearest_distances, resolves_wavelength
-from gsparc.models.powers.waves import field_decibels, fit_wave_weights, plane_wave_basis
+from gsparc.models.powers.waves import field_db, fit_wave_weights, make_basis
 from gsparc.ops import Pose
 
 LIGHT, WAVELENGTH = 299_792_458.0, 0.3
@@ -47,7 +47,7 @@ def interfering():
 
 def test_a_basis_is_of_unit_power_where_it_was_made():
     places = np.random.default_rng(0).uniform(0, 0.6, (300, 3)) * [1, 1, 0]
-    columns = plane_wave_basis(places, WAVELENGTH).columns(places)
+    columns = make_basis(places, WAVELENGTH).columns(places)
     assert (np.abs(columns) ** 2).sum(1).mean() == pytest.approx(1.0)
     assert 20 < columns.shape[1] < 60
 
@@ -55,11 +55,11 @@ def test_a_basis_is_of_unit_power_where_it_was_made():
 def test_powers_are_fitted_by_waves():
     rng = np.random.default_rng(0)
     places = rng.uniform(0, 0.5, (400, 3)) * [1, 1, 0]
-    columns = plane_wave_basis(places, WAVELENGTH).columns(places)
+    columns = make_basis(places, WAVELENGTH).columns(places)
     count = columns.shape[1]
     true = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / 2**0.5
-    decibels = field_decibels(columns @ true)
-    found = [field_decibels(columns @ fit_wave_weights(columns, decibels, rng)) for _ in range(4)]
+    decibels = field_db(columns @ true)
+    found = [field_db(columns @ fit_wave_weights(columns, decibels, rng)) for _ in range(4)]
     assert min(np.median(np.abs(one - decibels)) for one in found) < 0.5
 
 

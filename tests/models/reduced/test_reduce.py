@@ -156,14 +156,14 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(process, caplog):
     """The command's own default strides ended it on grids of 7 x 13."""
     columns = process.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
-    assert list(reduced.setting_combinations(process.method, {"stride": [1, 2, 3]})) == [{}, {"stride": 2}]
+    assert list(reduced.list_settings(process.method, {"stride": [1, 2, 3]})) == [{}, {"stride": 2}]
     assert f"stride=3: does not divide the {columns} columns" in caplog.text
 
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.fold, FitContext(Path()))
-    assert list(reduced.setting_combinations(method, {"keep": [1.0, 0.5]})) == [{}]
+    assert list(reduced.list_settings(method, {"keep": [1.0, 0.5]})) == [{}]
     assert reduced.reduce_method(method, {"keep": 0.5}, {}) is method
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.models.baselines.gp import choose_kernel_by_left_out
+from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.models.splat.left_out_images import LeftOut
 
 COUNT, PIXELS = 30, 12
@@ -24,7 +24,7 @@ def test_the_process_has_not_seen_what_lies_within_the_gap(left):
     found = left.predict_by_process()
     mean, at = left.images.mean(0), torch.from_numpy(left.positions)
     vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
-    kernel = choose_kernel_by_left_out(left.positions, vectors * lengths, PIXELS)
+    kernel = choose_left_out_kernel(left.positions, vectors * lengths, PIXELS)
     for g, c in [(0, 0), (1, 1), (1, 2)]:
         i = left.centres[c]
         far = np.linalg.norm(left.positions - left.positions[i], axis=1) > left.gaps[g]

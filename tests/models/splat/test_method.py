@@ -73,7 +73,7 @@ def test_every_kind_of_file_trains_predicts_and_reads_back(tmp_path, name):
     asked = load(tmp_path / "model.ckpt")
     where = {data.site.moving_end: data.moving[fold.test[0]] + data.site.origin}
     rssi = data.site.kind == "rssi"  # answered in the unit of the file
-    answer = asked.linear(**where).mean.numpy() if rssi else getattr(asked, data.site.kind)(**where)
+    answer = asked.predict_linear(**where).mean.numpy() if rssi else getattr(asked, data.site.kind)(**where)
     scale = data.site.target_scale
     assert np.allclose(answer / scale, said.mean[0], atol=1e-3 * float(said.mean.abs().max()))
 

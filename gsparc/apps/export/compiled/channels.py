@@ -18,7 +18,7 @@ LANES = 16
 BEYOND = 1e6  # [m], a place that is near none
 
 
-def sources_form(method: ImageSourceGP, site: Site, query: EnsembleMeans) -> Form:
+def compile_sources(method: ImageSourceGP, site: Site, query: EnsembleMeans) -> Form:
     """Return the form of an ensemble's sources without clutter, whose gains `query` has."""
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     count, rows = len(query.sources), len(query.places)

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from gsparc.apps.export.compiled.blob import Form
-from gsparc.apps.export.compiled.channels import sources_form
-from gsparc.apps.export.compiled.powers import powers_form
-from gsparc.apps.export.compiled.spectra import array_form, view_form
+from gsparc.apps.export.compiled.channels import compile_sources
+from gsparc.apps.export.compiled.powers import compile_powers
+from gsparc.apps.export.compiled.spectra import compile_array, compile_view
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import FrozenArray, FrozenView
@@ -70,7 +70,7 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     if site.static_end is None and site.kind != "rssi":
         raise ValueError(f"{method.name} of two moving ends has no compiled form; only powers have")
     # An exact form is not measured: its error is that of rounding to float32.
-    exact = exact_form(method, site)
+    exact = compile_exactly(method, site)
     if exact is not None:
         return CompiledForm(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
     form = distil_form(predictor, seed)
@@ -102,23 +102,23 @@ _ARRAY, _IMAGE, _SUM = "an array's spectrum", "a frozen image", "a sum of source
 _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of processes of powers"}
 
 
-def exact_form(method: Method, site: Site) -> Form | None:
+def compile_exactly(method: Method, site: Site) -> Form | None:
     """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
-        return None if method.only is None else exact_form(method.only, site)
+        return None if method.only is None else compile_exactly(method.only, site)
     if isinstance(method, PowerField):
         if method.powers is None or method.fringes is not None:
             return None
-        return powers_form(method.powers, site.target_scale)
+        return compile_powers(method.powers, site.target_scale)
     if isinstance(method, ImageProcess) and method._average is not None:
-        return exact_form(method._average[0], site) if not method.size() else None
+        return compile_exactly(method._average[0], site) if not method.size() else None
     if isinstance(method, LearnedField):
         return _rendered(method, site)
     if isinstance(method, GaussianProcess):
-        return None if method.powers is None else powers_form(method.powers, site.target_scale)
+        return None if method.powers is None else compile_powers(method.powers, site.target_scale)
     if isinstance(method, ImageSourceGP):
         cluttered = any(len(member.scene.clutter) for member in method.members)
-        return None if cluttered else sources_form(method, site, method.query)
+        return None if cluttered else compile_sources(method, site, method.query)
     return None
 
 
@@ -129,8 +129,8 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
     place = torch.from_numpy(np.asarray(site.static_position, np.float32))
     frozen = method.frozen_at(Pose(place, torch.from_numpy(np.asarray(rotation, np.float32))))
     if isinstance(frozen, FrozenArray):
-        return array_form(method.fitted(), frozen)
-    return view_form(frozen) if isinstance(frozen, FrozenView) else None
+        return compile_array(method.fitted(), frozen)
+    return compile_view(frozen) if isinstance(frozen, FrozenView) else None
 
 
 def distil_form(predictor: Predictor, seed: int) -> Form:
@@ -158,7 +158,7 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     # All rows are learned from: a model's answers have no noise that validation would guard against.
     process = GaussianProcess()
     process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
-    form = exact_form(process, site)
+    form = compile_exactly(process, site)
     assert form is not None
     return replace(form, predictor=Predictor(process, site))
 
@@ -184,7 +184,7 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))
     alone._conditioned(rows, [scene])
-    form = sources_form(alone, data.site, alone.query)
+    form = compile_sources(alone, data.site, alone.query)
     return replace(form, predictor=Predictor(alone, data.site))
 
 
@@ -217,7 +217,7 @@ def ask_model(predictor: Predictor, places: np.ndarray) -> np.ndarray:
     site = predictor.site
     parts = (split_ends(site, places[i : i + 64]) for i in range(0, len(places), 64))
     asked = [{end: at + site.origin for end, at in part.items()} for part in parts]
-    return np.concatenate([predictor.linear(**ends).mean.numpy() for ends in asked])
+    return np.concatenate([predictor.predict_linear(**ends).mean.numpy() for ends in asked])
 
 
 def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:

@@ -20,7 +20,7 @@ BEYOND = 1e9  # [m], a place that is near none
 LANES = 8
 
 
-def powers_form(process: PowerProcess, scale: float) -> Form | None:
+def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     """Return the form of a process; None where its terms are others than compiled.
 
     Args:
@@ -29,7 +29,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
     """
     if process.others:
         weights, alone = zip(*process.members, strict=True)
-        files = [pack_form(form, np.zeros(3)) for one in alone if (form := powers_form(one, scale))]
+        files = [pack_form(form, np.zeros(3)) for one in alone if (form := compile_powers(one, scale))]
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
         # As many as `kMost` of ops/csrc/field/mixture.h.
         fits = len(files) == len(weights) <= LANES
@@ -81,7 +81,7 @@ def powers_form(process: PowerProcess, scale: float) -> Form | None:
 def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Order of the rows (n,), rows, neighbours and depth of each set (S, 3), and boxes of all nodes."""
     order, sets, boxes = [], [], []
-    for rows, neighbours in near.shares(most):
+    for rows, neighbours in near.split_by_density(most):
         # Depth such that leaves have about LEAF rows.
         depth = max(0, math.ceil(math.log2(len(rows) / LEAF)))
         own, tree = _tree(near.places[rows], depth)

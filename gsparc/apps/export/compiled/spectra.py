@@ -13,7 +13,7 @@ ROWS, COLUMNS = 4, 4  # pixels of a block
 ACTIVATIONS = {"linear": 0, "sigmoid": 1, "softplus": 2}
 
 
-def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
+def compile_array(model: GaussianModel, frozen: FrozenArray) -> Form | None:
     """Return the form of an array's field; None where its emissions are no process of places."""
     encoding = model.emission.encoding
     if frozen.weights is None or frozen.offset is None or not model.tells_unknown:
@@ -32,7 +32,7 @@ def array_form(model: GaussianModel, frozen: FrozenArray) -> Form | None:
     return Form(1, numbers, {name: value.detach().float().numpy() for name, value in arrays.items()})
 
 
-def view_form(frozen: FrozenView) -> Form | None:
+def compile_view(frozen: FrozenView) -> Form | None:
     """Return the form of Gaussians before a static receiver; None of networks of other than similarities."""
     model = frozen.visible
     emission, encoding, attenuation = model.emission, model.emission.encoding, model.settings.attenuation

@@ -13,10 +13,10 @@ import viser
 
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import predict_answer
-from gsparc.apps.view.building import PATHS, SPHERE, ray_parts
+from gsparc.apps.view.building import PATHS, SPHERE, draw_rays
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import plane_sheet
-from gsparc.apps.view.reasons import ENDS, headline, legend_html
+from gsparc.apps.view.reasons import ENDS, legend_html, summarise_answer
 from gsparc.apps.view.scene import EXTENT, Part, Points, Scene, Sheet
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView, walk_places
@@ -69,8 +69,8 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
         for place in walk_places(view, name, steps // len(names)):
             answer = predict_answer(viewed.predictor_of(name), {**view.starts(name), moving: place})
             dot.position = scene.frame.to_drawn(place)
-            label.text = (f"{name}: " if len(names) > 1 else "") + headline(answer, view.unit)
-            parts: list[Part] = list(ray_parts(answer, extent) or ())
+            label.text = (f"{name}: " if len(names) > 1 else "") + summarise_answer(answer, view.unit)
+            parts: list[Part] = list(draw_rays(answer, extent) or ())
             legends += [PATHS] if parts else []
             if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
                 around = answer.ends["rx"] + sphere.offsets

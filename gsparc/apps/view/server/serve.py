@@ -57,7 +57,7 @@ class Server:
             if not gone:
                 self.sessions[client.client_id] = session
         if gone:
-            self.work.forget(client.client_id)
+            self.work.drop_client(client.client_id)
             return
         log.info("client %d connected, %d in all", client.client_id, len(self.sessions))
 
@@ -65,7 +65,7 @@ class Server:
         with self._lock:
             if self.sessions.pop(client.client_id, None) is None:
                 self._gone.add(client.client_id)
-        self.work.forget(client.client_id)
+        self.work.drop_client(client.client_id)
         log.info("client %d left, %d in all", client.client_id, len(self.sessions))
 
     def run(self) -> None:

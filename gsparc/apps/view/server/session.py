@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import Answer, predict_answer
-from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, ray_parts
+from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, draw_rays
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import Plane, plane_sheet, refine_plane, weakest_place
@@ -175,22 +175,22 @@ class Session:
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
         self.chosen_station = value
-        if not self.view.has(value):
+        if not self.view.has_station(value):
             self.title.content = f"**{value} is being prepared ...**"
         self.view.station(value)
         # Meanwhile another may have been chosen: only the last is shown.
         if self.chosen_station == value:
-            self.work.ask((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
+            self.work.put((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
 
     # -- what the worker does ----------------------------------------------------------------------
 
     def want_answer(self) -> None:
         """Have the present places answered."""
-        self.work.ask((self.client.client_id, "answer"), self._answered, urgent=True)
+        self.work.put((self.client.client_id, "answer"), self._answered, urgent=True)
 
     def want_plane(self) -> None:
         """Have the present plane drawn."""
-        self.work.ask((self.client.client_id, PLANE), self._planes)
+        self.work.put((self.client.client_id, PLANE), self._planes)
 
     def _show_station(self, name: str) -> Iterator[None]:
         self.station, self.one = name, self.view.station(name)
@@ -215,12 +215,12 @@ class Session:
         self._show(answer)
         self.answers += 1
         # The picture has a key of its own: a later answer replaces it before it is drawn.
-        self.work.ask((self.client.client_id, "panel"), partial(self._panel_of, answer))
+        self.work.put((self.client.client_id, "panel"), partial(self._panel_of, answer))
         yield
 
     def _show(self, answer: Answer) -> None:
         why = explain_level(answer, self.view.viewed.moving[-1], self.one.tree)
-        rays, first = ray_parts(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
+        rays, first = draw_rays(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
         with self.client.atomic():
             self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:

@@ -46,7 +46,7 @@ class Dense:
         """m."""
         return len(self.matrices)
 
-    def added(self, covariance: Tensor, power: Tensor) -> Tensor:
+    def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
         """Return a covariance (r, r), which may be overwritten, with these of powers (m,)."""
         flat = self.matrices.view(len(power), -1)
         return covariance.add_((power.to(flat.dtype) @ flat).view(covariance.shape))
@@ -55,7 +55,7 @@ class Dense:
         """Return traces (m,) of products with a Hermitian matrix (r, r)."""
         return (self.matrices.reshape(len(self.matrices), -1) @ weight.T.reshape(-1)).real
 
-    def within(self, mixed: Tensor) -> Dense:
+    def change_basis(self, mixed: Tensor) -> Dense:
         """Return them in another basis, of which the old one is (s, r) float64 coordinates."""
         real, imag = self.matrices.real, self.matrices.imag
         return Dense(torch.complex(mixed @ real @ mixed.T, mixed @ imag @ mixed.T))
@@ -68,7 +68,7 @@ class Factored:
     factor: Tensor
     count: ClassVar[int] = 1
 
-    def added(self, covariance: Tensor, power: Tensor) -> Tensor:
+    def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
         """See `Dense`."""
         return covariance.addmm_(self.factor * power, self.factor.mH)
 
@@ -76,7 +76,7 @@ class Factored:
         """See `Dense`."""
         return (self.factor.conj() * (weight @ self.factor)).real.sum()[None]
 
-    def within(self, mixed: Tensor) -> Factored:
+    def change_basis(self, mixed: Tensor) -> Factored:
         """See `Dense`."""
         return Factored(mixed.to(torch.complex128) @ self.factor)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import spherical_wave
 from gsparc.models.channels.terms.spherical import Spherical
-from gsparc.processes.places import moving_end, of_both_ends, other_end
+from gsparc.processes.places import has_both_ends, moving_end, other_end
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Direct(Spherical):
 
     def waves(self, at: SlotPlaces) -> Tensor:
         """Return the wave (1, n), see `Spherical`; of places (n, 6), from one end to the other."""
-        if not of_both_ends(at.places):
+        if not has_both_ends(at.places):
             return super().waves(at)
         middle, wavenumber = moving_end(self.frame.middle) - other_end(self.frame.middle), at.slot.wavenumber
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / wavenumber)

@@ -45,7 +45,7 @@ def maximise_by_evolution(
     return parents[first], float(best[first])
 
 
-def find_box(unexplained: UnexplainedRows, draws: int = 1000) -> tuple[Tensor, float]:
+def find_occluding_box(unexplained: UnexplainedRows, draws: int = 1000) -> tuple[Tensor, float]:
     """Return the box (6,) whose shadow explains most, and its gain [nats].
 
     Args:

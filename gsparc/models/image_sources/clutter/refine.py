@@ -23,12 +23,7 @@ STEPS = (SOFT, SOFT, 0.003, 0.03, STEP)
 STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
 
-def refine_with_clutter(
-    residual: ClutterLikelihood,
-    scene: Scene,
-    paths: Paths,
-    steps: int,
-) -> Scene:
+def refine_with_clutter(residual: ClutterLikelihood, scene: Scene, paths: Paths, steps: int) -> Scene:
     """Return the most likely scene of `steps` steps; paths are those of the start."""
     assert scene.phase is not None
     rows, old = residual.rows, scene.clutter

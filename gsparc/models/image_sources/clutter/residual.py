@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.gp_likelihood import Posterior, stack_real_imag, variance_along_and_across
+from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances, stack_real_imag
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
 from gsparc.processes.factor import Factor
@@ -59,7 +59,7 @@ class ClutterLikelihood:
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
         varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
         across = stack_real_imag(scaled)[1]
-        return varying.summed.matrix, variance_along_and_across(scene.quadrature)[1] * (across @ across.T)
+        return varying.summed.matrix, quadrature_variances(scene.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""
@@ -70,8 +70,8 @@ class ClutterLikelihood:
 
         def cost(constant: float, noise: float) -> float:
             self._factor(constant, noise, scene.quadrature)
-            whitened = self._own.whitened(columns * self._constant(constant, scene.quadrature))
-            white = self._own.whitened(self.target[:, None])[:, 0]
+            whitened = self._own.whiten(columns * self._constant(constant, scene.quadrature))
+            white = self._own.whiten(self.target[:, None])[:, 0]
             return _cost(whitened, white, self._determinant).item()
 
         best = cost(constant, noise)
@@ -116,7 +116,7 @@ class ClutterLikelihood:
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _inner(columns, self.white)
         own = Factor.of(inner)
-        mean, projection = own.solved(seen[:, None])[:, 0].float(), own.whitened(columns.T.double()).float()
+        mean, projection = own.solve(seen[:, None])[:, 0].float(), own.whiten(columns.T.double()).float()
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
@@ -156,10 +156,10 @@ class CandidateScorer:
             raise_if_cancelled()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
-            scores.append(self.gain_of_positive_multiples(torch.complex(*change))[0])
+            scores.append(self.gain_of_multiples(torch.complex(*change))[0])
         return torch.cat(scores)
 
-    def gain_of_positive_multiples(self, change: Tensor) -> tuple[Tensor, Tensor]:
+    def gain_of_multiples(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return nats (M,) float32 that positive multiples (M,) of complex changes (n, M) gain, and these."""
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
@@ -220,5 +220,5 @@ def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
 def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
     inner, seen = _inner(columns, white)
     own = Factor.of(inner)
-    explained = white.double().square().sum() - own.whitened(seen[:, None]).square().sum()
+    explained = white.double().square().sum() - own.whiten(seen[:, None]).square().sum()
     return determinant + 0.5 * (own.log_determinant + explained)

@@ -12,7 +12,7 @@ import torch
 
 from gsparc.models.image_sources.backprojection import select_separated
 from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, Clutter, visible_share
-from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_box
+from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_occluding_box
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_patch, find_small_mirrors
 from gsparc.models.image_sources.clutter.refine import refine_with_clutter
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
@@ -23,7 +23,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import Cancelled, cancelled_by, out_of_time, raise_if_cancelled
+from gsparc.processes.worker import Cancelled, cancel_when, out_of_time, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +120,7 @@ class _ClutterSearcher:
         start = self.nll
         best = self.whole = start, self.scene
         try:
-            with cancelled_by(out_of_time):  # within a step, too
+            with cancel_when(out_of_time):  # within a step, too
                 for epoch in range(EPOCHS):
                     before = self.nll
                     self._improve()
@@ -206,7 +206,7 @@ class _ClutterSearcher:
 
     def _boxes(self) -> None:
         for _ in range(BOXES):
-            box, score = find_box(self._left())
+            box, score = find_occluding_box(self._left())
             if score < MIN_GAIN:
                 break
             if not self._try(replace(self.scene, clutter=self.scene.clutter.with_box(box)), BOX):

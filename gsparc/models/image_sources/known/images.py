@@ -238,7 +238,7 @@ def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor)
     return [sequences[i] for i in sorted(distinct)]
 
 
-def initial_log_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
+def log_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
     """Log amplitudes (K,) float32 to start from, given the direct wave's amplitude."""
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
     return math.log(direct) + order * math.log(REFLECTED)

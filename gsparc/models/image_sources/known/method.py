@@ -13,14 +13,9 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.search import INITIAL_KERNEL
-from gsparc.models.image_sources.ensemble import Look, Member, is_compact_array, left_out_nmse
+from gsparc.models.image_sources.ensemble import Look, Member, left_out_nmse, shares_occlusion
 from gsparc.models.image_sources.gp_likelihood import estimate_phases
-from gsparc.models.image_sources.known.images import (
-    MOST_PATCHES,
-    Mirrors,
-    initial_log_amplitudes,
-    most_mirrors,
-)
+from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, log_amplitudes, most_mirrors
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
@@ -28,7 +23,7 @@ from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_am
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections, normal_form
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import ending_when
+from gsparc.processes.worker import end_when
 from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
@@ -75,7 +70,7 @@ class KnownWallsGP(ImageSourceGP):
             near = walls_prior_cost(given.planes, given.sequences, moved.planes, moved.log_amplitude)
             return near + prior.cost(moved.phase, given.sequences)
 
-        with ending_when(budget.over):
+        with end_when(budget.is_spent):
             scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, self.kernel)
             prior = ReflectionPhasePrior.of(scene)
@@ -101,13 +96,13 @@ class KnownWallsGP(ImageSourceGP):
         if order > 1 and most_mirrors(len(indices), order) < len(indices):
             few = most_mirrors(len(indices), order)
             log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
-        hidden = settings.clutter and is_compact_array(rows)
+        hidden = settings.clutter and shares_occlusion(rows)
         ends = transmitter, rows.position
         sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
         obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.none()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
-            transmitter, mirrors.planes, sequences, initial_log_amplitudes(sequences, direct),
+            transmitter, mirrors.planes, sequences, log_amplitudes(sequences, direct),
             math.log(NOISE), self.kernel, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide

@@ -114,7 +114,7 @@ class JointPowerField(ClosedForm):
         most, largest = rows_per_station(len(every.stations)), int(np.bincount(every.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-        self.heard = self.unheard = SharedTerms.over(every, self.own.never.known_trend, 1.0, 0, self.seed)
+        self.heard = self.unheard = SharedTerms.prior(every, self.own.never.known_trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
         terms, self.inflation, gain = learn_shared_terms(every, self.own, self.seed, budget)
@@ -149,13 +149,13 @@ class JointPowerField(ClosedForm):
         every = rows_of_stations(data, rows, self.places)
         every = every if self.network is None else relabel_by_site(every, self.network)
         used = every.thinned(rows_per_station(len(every.stations)), self.seed)
-        self.posterior, self._reach = self.own.given(used, self.heard, self.seed), None
+        self.posterior, self._reach = self.own.condition(used, self.heard, self.seed), None
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
-            elsewhere = self.own.given(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
+            elsewhere = self.own.condition(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = self._elsewhere((elsewhere.factor, elsewhere.mean))
         self.whole = max(float(used.heard.decibels.var()), self.own.variance)
-        self.rows = {number: torch.from_numpy(used.of(number).loud.index) for number in used.stations}
+        self.rows = {number: torch.from_numpy(used.of(number).measured.index) for number in used.stations}
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; (B, 1) linear powers.
@@ -181,7 +181,7 @@ class JointPowerField(ClosedForm):
         return Prediction(power, entry_variance(spread, power, "rssi"), share)
 
     @torch.no_grad()
-    def joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def predict_joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return levels (G, k) of measurements [dB], covariances (G, k, k) and noise (k,) [dB^2], float64.
 
         Args:
@@ -199,7 +199,7 @@ class JointPowerField(ClosedForm):
         for one in number.unique().tolist():
             at = (number == one).nonzero()[:, 0]
             of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
-            mean[:, at], left = of.together(places[:, at], one)
+            mean[:, at], left = of.predict_joint(places[:, at], one)
             covariance[:, at[:, None], at] = inflation * left
             kernel = self.own.prior(one).kernel
             noise[at] = inflation * kernel.amplitude * kernel.noise
@@ -255,7 +255,7 @@ class JointPowerField(ClosedForm):
     def _elsewhere(self, weights: tuple[Factor, Tensor]) -> SharedTermsPosterior:
         """What is said of stations that have no rows; of a network's, of a sector without pattern, too."""
         never, network = self.own.never, self.network
-        never = never if network is None else replace(never, trend=network.joined_by(ROUND))
+        never = never if network is None else replace(never, trend=network.add_sectors(ROUND))
         return SharedTermsPosterior({}, never, self.unheard.columns, weights)
 
     def with_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
@@ -275,7 +275,7 @@ class JointPowerField(ClosedForm):
         if network is None and (sectors[:, 0] != NO_AZIMUTH).any():
             raise DataError("azimuths of a new station: this model was learned without azimuths")
         if network is not None:
-            never = replace(self.own.never, trend=network.joined_by(sectors))
+            never = replace(self.own.never, trend=network.add_sectors(sectors))
             result.own = replace(self.own, never=never)
         result.elsewhere = result._elsewhere((elsewhere.factor, elsewhere.mean))
         return result

@@ -20,13 +20,13 @@ from gsparc.models.powers.groups import ErrorGain, compare_errors
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import Kernel, distances
-from gsparc.processes.places import beyond_ends, moving_end
+from gsparc.processes.places import extra_columns, moving_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import ending_when
+from gsparc.processes.worker import end_when
 from gsparc.training.time_budget import TimeBudget
 
 START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
@@ -61,7 +61,7 @@ class StationPriors:
         """Return that of a station."""
         return self.heard.get(number, self.never)
 
-    def given(self, rows: StationRows, terms: SharedTerms, seed: int) -> SharedTermsPosterior:
+    def condition(self, rows: StationRows, terms: SharedTerms, seed: int) -> SharedTermsPosterior:
         """Return what rows say; pseudo-values of silent ones follow from their own station's."""
         result = {}
         for number in rows.stations:
@@ -72,7 +72,7 @@ class StationPriors:
                 shared = replace(terms, unit=process_deviation(prior))
                 wide = replace(prior.known_trend, more=(*prior.known_trend.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
-                least = LEAST_SILENT * len(np.unique(beyond_ends(part.places), axis=0))
+                least = LEAST_SILENT * len(np.unique(extra_columns(part.places), axis=0))
                 known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
@@ -97,9 +97,9 @@ def learn_station_priors(
     trend, notes = _site_law(rows, seed)
     heard = rows.heard
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
-    with nullcontext() if budget is None else ending_when(budget.over):
+    with nullcontext() if budget is None else end_when(budget.is_spent):
         kernel, priors = _common_settings(heard, trend, seed)
-        if budget is not None and budget.over():
+        if budget is not None and budget.is_spent():
             numbers = []
         for number in numbers:
             some = heard.of(number).thinned(ENDS_ON, seed)
@@ -169,13 +169,13 @@ def learn_shared_terms(
     heard = rows.heard
     few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = SharedTerms.over(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
+    bare = SharedTerms.prior(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
-    processes = own.given(few, bare, seed).processes
+    processes = own.condition(few, bare, seed).processes
     best = plain = bare, *_left_out(processes, bare)
     for length in LENGTHS:
-        if length != LENGTHS[0] and budget is not None and budget.over():
+        if length != LENGTHS[0] and budget is not None and budget.is_spent():
             break
         for share in PLACE:
             terms = replace(bare, length=length * short, place_db=math.sqrt(share * own.variance))

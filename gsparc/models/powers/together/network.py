@@ -26,7 +26,7 @@ from gsparc.processes.censored import PseudoValues
 from gsparc.processes.density import Evidence, minimise
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
-from gsparc.processes.places import moving_end, on_floor, other_end
+from gsparc.processes.places import horizontal, moving_end, other_end
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import (
     NO_AZIMUTH,
@@ -39,7 +39,7 @@ from gsparc.processes.sectors import (
     sector_of,
 )
 from gsparc.processes.trend import LEAST_SPREAD
-from gsparc.processes.worker import ending_when
+from gsparc.processes.worker import end_when
 from gsparc.training.time_budget import TimeBudget
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
@@ -98,7 +98,7 @@ def number_sites(stations: Stations, places: np.ndarray) -> np.ndarray:
     >>> number_sites(Stations(at, ("A-1", "A-2", "B-1")), at)
     array([0, 0, 1])
     """
-    apart = np.linalg.norm(on_floor(places[:, None] - places), axis=-1)
+    apart = np.linalg.norm(horizontal(places[:, None] - places), axis=-1)
     stem = np.array([re.sub(r"(.)[-_ /.:][^-_ /.:]*$", r"\1", name) for name in stations.name])
     near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
     if stations.sector is not None:
@@ -134,7 +134,7 @@ def learn_network(
         network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
         levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
     )  # fmt: skip
-    with nullcontext() if budget is None else ending_when(budget.over):
+    with nullcontext() if budget is None else end_when(budget.is_spent):
         rough, gains, scale = _rough(few, start)
         turned, notes = _turned(few, rough, gains, scale, names)
         if notes:
@@ -258,7 +258,7 @@ def _by_evidence(
         gram, quiet = own[i] + kernel.gram(at_), side[i] != 0
         if quiet.any():
             gram.diagonal()[quiet] += last[i][0].variance
-        columns = Factor.of(gram, "raise").whitened(learned.shared_columns(at_))
+        columns = Factor.of(gram, "raise").whiten(learned.shared_columns(at_))
         precision += columns.T @ columns
     doubt, kernel = Factor.of(precision, "raise").root.T, _relative(kernel)
     return replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude)), kernel

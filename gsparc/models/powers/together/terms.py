@@ -117,7 +117,7 @@ class SharedTerms(Columns):
     unit: float = 1.0
 
     @classmethod
-    def over(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
+    def prior(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
         """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _decades(trend, torch.from_numpy(rows.places))
         bare = cls(trend, float(decades.min()), float(decades.max()), NO_PLACES, length)
@@ -141,7 +141,7 @@ class SharedTerms(Columns):
         if not self.place_db:
             return law / self.unit
         near = matern32(distances(self.inducing, moving_end(places)), self.length)
-        return torch.cat([law, self.place_db * self._factor.whitened(near).T], 1) / self.unit
+        return torch.cat([law, self.place_db * self._factor.whiten(near).T], 1) / self.unit
 
     @cached_property
     def _factor(self) -> Factor:

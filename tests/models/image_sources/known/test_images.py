@@ -11,10 +11,7 @@ from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.image_sources.clutter.blocking import visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.known import images as known
-from gsparc.models.image_sources.known.images import (
-    Mirrors,
-    walls_of_file,
-)
+from gsparc.models.image_sources.known.images import Mirrors, walls_of_file
 from gsparc.physics.mirror_planes import images
 
 ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILLAR)

@@ -63,7 +63,7 @@ def prior_of(data: Measurements) -> tuple[StationPriors, SharedTerms]:
     trend = Trend(0.0, Law(36.0, 2.5, 2.0, 6.0, None), 1.5, 0.8)
     never = Prior(Kernel.matern((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
     own = StationPriors(never, {1: Prior(Kernel.matern((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
-    terms = SharedTerms.over(rows_of(data), trend, 8.0, 30, 0)
+    terms = SharedTerms.prior(rows_of(data), trend, 8.0, 30, 0)
     return own, replace(terms, place_db=2.7)
 
 
@@ -97,7 +97,7 @@ def test_it_is_the_dense_process():
     (own, terms), every = prior_of(data), rows_of(data)
     known, asked = every.at(np.arange(0, 200)), every.at(np.arange(200, 240))
     known = known.at(np.flatnonzero(known.station != 4))  # never heard
-    posterior, count = own.given(known, terms, 0), len(known.index)
+    posterior, count = own.condition(known, terms, 0), len(known.index)
     gram, values = dense(joined(known, asked), own, terms)
     inner = np.linalg.solve(gram[:count, :count], np.c_[values[:count], gram[:count, count:]])
     mean = gram[count:, :count] @ inner[:, 0]
@@ -111,7 +111,7 @@ def test_it_is_the_dense_process():
     known = gram[count:, count:] - gram[count:, :count] @ inner[:, 1:]
     for number in asked.stations:
         at = np.flatnonzero(asked.station == number)[:2]
-        together = posterior.together(places[at][None], number)[1][0]
+        together = posterior.predict_joint(places[at][None], number)[1][0]
         assert np.allclose(together.numpy(), known[np.ix_(at, at)], atol=1e-8)
 
 
@@ -121,7 +121,7 @@ def test_all_stations_at_once_are_answered_as_one_by_one():
     own = replace(own, heard={})
     rng = np.random.default_rng(0)
     known = every.at(np.flatnonzero(rng.random(240) < np.linspace(0.3, 0.9, 6)[every.station]))
-    posterior = own.given(known, terms, 0)
+    posterior = own.condition(known, terms, 0)
     places, number = torch.from_numpy(every.places[:15]), torch.from_numpy(every.station[:15])
     mean, left = posterior.answer(places, number)
     for one in number.unique().tolist():
@@ -142,7 +142,7 @@ def test_rows_and_stations_left_out():
     gram, values = dense(every, own, terms)
     inverse = np.linalg.inv(gram)
     error, variance = inverse @ values / inverse.diagonal(), 1 / inverse.diagonal()
-    posterior = own.given(every, terms, 0)
+    posterior = own.condition(every, terms, 0)
     whole = left_out_processes([posterior.block(number) for number in every.stations])
     for number, of_station in zip(every.stations, whole, strict=True):
         at = np.flatnonzero(every.station == number)
@@ -169,7 +169,7 @@ def test_settings_become_likelier():
         replace(learned.never, kernel=Kernel.matern((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {}
     )
     for own in (begin, learned):
-        posterior = own.given(rows, prior_of(town())[1], 0)
+        posterior = own.condition(rows, prior_of(town())[1], 0)
         found = [posterior.left_out(number) for number in rows.stations]
         densities.append(sum(float((e.square() / v + v.log()).sum()) for e, v in found) / len(rows.index))
     assert densities[1] < densities[0] - 0.01

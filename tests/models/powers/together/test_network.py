@@ -46,7 +46,7 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
     rx, result = Pose(places, torch.eye(3).expand(len(places), 3, 3)), []
     for number, still in enumerate(one.place):
         tx = torch.from_numpy(still - site.origin).float().expand(len(places), 3)
-        said = method.of(number).predict(Query(tx, rx))
+        said = method.copy_for(number).predict(Query(tx, rx))
         assert said.variance is not None
         result.append(power_in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
     mean, spread = (np.stack(part, 1) for part in zip(*result, strict=True))
@@ -59,18 +59,20 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
     assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
     assert all(0.8 < found[name] < 0.97 for name in ("hold", "hold_listed", "hold_unlisted"))
-    every = method.every()
-    assert every is not None and every.joint() is not None
+    every = method.all_stations()
+    assert every is not None and every.joint_method() is not None
     moving = torch.from_numpy(one.asked - method.site.origin)[:, None].expand(-1, 30, 3)
-    level, covariance, noise = every.joint().joint(moving, torch.arange(30))
+    level, covariance, noise = every.joint_method().predict_joint(moving, torch.arange(30))
     mean, spread = levels(method, one)
     assert np.allclose(level + 10 * np.log10(method.site.target_scale), mean, atol=1e-3)
     assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
     assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
-    more = every.joint().with_station(np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]]))
+    more = every.joint_method().with_station(
+        np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]])
+    )
     around = torch.tensor([[500.0, 0, 1.5], [-500, 0, 1.5]])[:, None].expand(-1, 2, 3)
-    east, west = more.joint(around, torch.tensor([30, 31]))[0]
+    east, west = more.predict_joint(around, torch.tensor([30, 31]))[0]
     assert east[0] > west[0] + 10 and east[1] == pytest.approx(float(west[1]))  # no pattern
     assert draw_sector_levels(method, one.data(6), np.arange(500), tmp_path / "sectors.png")
     wrong = one.azimuth != network(1, moments=220, asked=120).azimuth
@@ -171,7 +173,7 @@ def given_settings() -> JointPowerField:
     known = find_sectors(data)
     trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
     own = StationPriors(Prior(shadowing(), trend), {})
-    terms = SharedTerms.over(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    terms = SharedTerms.prior(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
     field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
     return field
