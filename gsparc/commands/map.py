@@ -79,7 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     field = predict_map(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
     lines = map_notes(field, coverage)
-    size = f"height {field.grid.height:g} m, cells of {field.grid.step:.3g} m"
+    size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
     for layer in list_layers(field):
@@ -101,7 +101,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         # NaN alone differs from itself: figures that these rows do not tell are left out.
         facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
-    before = f"{facts['map/cells']} cells, {facts['map/stations']} station(s)"
+    before = f"{facts['map/cells']} squares, {facts['map/stations']} station(s)"
     if field.calibrated:
         before += f", expected error {facts['map/expected_error_db']:.2f} dB of the strongest"
     before += "; map "

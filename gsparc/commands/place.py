@@ -36,7 +36,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.left_out:
         error = placing.new_station_error(reopen_training(path, settings["dataset"]), int(config.left_out))
     found = placing.place_station(predictor, count=config.count, promise=promise, error=error, **query)
-    columns = coordinates(found.places, predictor)
+    columns = {**found.given, **coordinates(found.places, predictor)}
     columns |= {"coverage": found.coverage, "low": found.low, "high": found.high}
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
@@ -50,12 +50,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts = {
         "place/x": x, "place/y": y, "place/z": z, "place/before": found.before,
         "place/after": found.coverage[0], "place/low": found.low[0], "place/high": found.high[0],
-        "place/candidates": len(found.places), "place/threshold_db": level,
+        "place/refused": found.refused, "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
     lines = [
         placing.assumption(predictor.site, z, query["antenna"]),
-        f"now {found.before:.1%} of the area with {level:g} {unit} or more",
+        f"now {found.before:.1%} of the area with {level:g} {unit} or more"
+        + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
         f"with a station at {where}: {found.coverage[0]:.1%} "
         f"(90 % interval {found.low[0]:.1%} to {found.high[0]:.1%})",
     ]

@@ -9,7 +9,7 @@ import numpy as np
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.links.stations import find_station
+from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import ENDS, End, Site
 from gsparc.prediction.query import usual_heights
@@ -124,24 +124,24 @@ def match_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tupl
         if wanted is not None:
             raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
         return rows, np.full(len(rows), -1)
-    names = list(stations.name)
-    only = None if wanted is None else find_station(wanted, names, len(names))
+    called = all_names(stations)
+    only = None if wanted is None else find_station(wanted, stations)
     if wanted is not None and only is None:
-        raise DataError(f"station={wanted}: no such station{suggest_or_list(wanted, names)}")
+        raise DataError(f"station={wanted}: no such station{suggest_or_list(wanted, called)}")
     if queries.station is None:
         # Each row about every station, those of one row side by side.
-        every = np.arange(len(names)) if only is None else np.array([only])
+        every = np.arange(len(stations)) if only is None else np.array([only])
         return np.repeat(rows, len(every)), np.tile(every, len(rows))
-    numbers = {
-        name: number for number, name in enumerate(names)
-    }  # by name alone: a number is a name, or wrong
+    # By name alone: a number is a name, or wrong.
+    numbers = {name: find_station(name, stations) for name in called}
     plain = queries.station if queries.plain is None else queries.plain
     words = zip(queries.station.tolist(), plain.tolist(), strict=True)
-    number = np.array([numbers.get(word, numbers.get(short, -1)) for word, short in words], np.int64)
+    found = (numbers.get(word, numbers.get(short)) for word, short in words)
+    number = np.array([-1 if one is None else one for one in found], np.int64)
     if (number < 0).any():
         row = int(np.argmax(number < 0))
         word = str(queries.station[row])
-        fault = f"{word!r} is no station of the model{suggest_or_list(word, names)}"
+        fault = f"{word!r} is no station of the model{suggest_or_list(word, called)}"
         raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
     rows = rows if only is None else np.flatnonzero(number == only)
     if not len(rows):

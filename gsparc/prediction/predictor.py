@@ -107,7 +107,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         stations = self.site.stations
         if stations is None:
             raise ValueError(f"at: {self.site.name} has one static end, and no stations")
-        number = find_station(station, stations.name, len(stations))
+        number = find_station(station, stations)
         if number is None:
             raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.

@@ -107,6 +107,16 @@ def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
     assert np.mean(np.abs(level - drive.level_db) < 2 * spread) > 0.8
 
 
+def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path, monkeypatch):
+    place = [[5, 5, 1.5]]
+    (own,) = answered(town, tmp_path, ["x", "y", "z"], place, station="mast")
+    monkeypatch.setitem(vars(town.site.stations), "label", ("A-1", "A-2", "B-1"))
+    assert answered(town, tmp_path, ["x", "y", "z"], place, station="B-1") == [own]
+    listed = answered(town, tmp_path, ["x", "y", "z", "station"], [[*place[0], "B-1"]])
+    assert [row["rssi_db"] for row in listed] == [own["rssi_db"]]
+    assert town.at("B-1").site.static_position is not None
+
+
 def test_every_station_of_every_place(town, tmp_path):
     place = walk()[:7] + np.array([0.5, 0, 0])
     facts = predict_file(town, write_table(tmp_path / "a.csv", "xyz", place.tolist()))

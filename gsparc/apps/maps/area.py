@@ -89,7 +89,7 @@ def lay_grid(
     needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
     if needed > SHARE_OF_MEMORY * machine_memory():
         raise DataError(
-            f"step_m={step:g}: {count.prod():.3g} cells of {stations} station(s) need {needed / 2**30:.3g} "
+            f"step_m={step:g}: {count.prod():.3g} squares of {stations} station(s) need {needed / 2**30:.3g} "
             f"GiB, more than half of this machine's memory; take a larger step or a smaller area"
         )
     nx, ny = (max(int(n), 1) for n in count)

@@ -226,17 +226,20 @@ def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
     return np.where(number == REFUSED, np.nan, near.sum(0)).astype(np.float32)
 
 
-def read_loads(load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
-    """Loads (T,) in [0, 1] of one number, one per station, or by name (the others 1).
+def read_loads(
+    load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str], labels: Sequence[str] = ()
+) -> np.ndarray:
+    """Loads (T,) in [0, 1] of one number, one per station, or by name or label (the others 1).
 
     Raises:
         DataError: another number of them, an unknown name, or no share.
     """
     if isinstance(load, Mapping):
-        wrong = next((name for name in load if name not in stations), None)
+        wrong = next((name for name in load if name not in {*stations, *labels}), None)
         if wrong is not None:
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
-        load = [load.get(name, 1.0) for name in stations]
+        pairs = zip(stations, labels or stations, strict=True)
+        load = [load.get(name, load.get(label, 1.0)) for name, label in pairs]
     values = finite_array(load)
     if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():
         fault = f"shares from 0 to 1 are needed: one number, or {len(stations)}, one per station"

@@ -23,7 +23,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import finite_array
-from gsparc.data.links.stations import find_station
+from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.schema import End, Site
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
@@ -75,7 +75,9 @@ def predict_map(
     promise = read_promise(predictor.extra) if promise == "stored" else promise
     names, notes = choose_stations(predictor, stations, promise)
     grid = lay_grid(site, area, height_m, step_m, plan, len(names))
-    load_of = field_map.read_loads(load, names)
+    numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
+    about = station_facts(site, numbers)
+    load_of = field_map.read_loads(load, names, about["stations"])
     level = PowerUnit.of(unit, site.level_unit, levels=True)
     # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
@@ -87,7 +89,6 @@ def predict_map(
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.shape)
     stride = _stride(grid, promise, tolerance_db)
-    numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     every, computed = np.flatnonzero(grid.inside), 0
     joint = joint_levels(predictor, grid.places(every[:1]), numbers) is not None
     alike = np.zeros_like(values["power_db"])
@@ -103,7 +104,6 @@ def predict_map(
     if computed < len(names) * len(every):
         most = f"{computed} of {len(names) * len(every)} levels were predicted"
         notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
-    about = station_facts(site, numbers)
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
     usual, floor = _usual_levels(promise, numbers, noise_db)
@@ -135,7 +135,7 @@ def predict_map(
             flat[name][..., cells] = layer
         overlap[cells] = field_map.count_overlap(power, carrier)
     if promise is not None and not np.isfinite(values["power_db"]).any():
-        fault = f"every cell lies more than {calibration.reach:.3g} m from what was measured"
+        fault = f"every square lies more than {calibration.reach:.3g} m from what was measured"
         raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
     extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.shape)}
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
@@ -170,12 +170,11 @@ def choose_stations(
             raise DataError(f"{key}={list(wanted)}: {predictor.site.name} has one station; leave it out")
         return [""], []
     names: list[str] = []
-    called = [*stations.name, *(getattr(stations, "label", None) or ())]
     for one in wanted if wanted is not None else stations.name:
-        number = find_station(one, called, len(stations))
+        number = find_station(one, stations)
         if number is None:
-            raise DataError(f"{key}: no station {one!r}{suggest_or_list(str(one), called)}")
-        names.append(stations.name[number % len(stations)])
+            raise DataError(f"{key}: no station {one!r}{suggest_or_list(str(one), all_names(stations))}")
+        names.append(stations.name[number])
     if not names:
         raise DataError("stations=[]: name one at least, or all")
     notes = []

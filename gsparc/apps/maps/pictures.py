@@ -67,7 +67,7 @@ class Layer:
         name: of its file and its button.
         values: (ny, nx) float, NaN where nothing is said.
         legend: what its colours mean, with the unit.
-        words: names of whole numbers, for a layer of classes; "" of those that are nowhere on the map.
+        words: names of whole numbers, for a layer of classes.
         group: (n,) of each class, those of one have shades of one colour; None: each is one.
         unsure: (ny, nx) bool, cells that are hatched, and why; None: none.
     """
@@ -96,7 +96,7 @@ class Layer:
     def class_table(self) -> dict[str, list[Any]]:
         """Return columns of its classes, largest first: number, name, share of the map and colour."""
         count = np.bincount(self.values[np.isfinite(self.values)].astype(int), minlength=len(self.words))
-        order = [int(k) for k in np.argsort(-count, kind="stable") if count[k]]
+        order = np.argsort(-count, kind="stable").tolist()
         share, colour = count / max(count.sum(), 1), self.table()
         return {
             "number": order, "station": [self.words[k] for k in order],
@@ -175,10 +175,8 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
 
 
 def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], site: np.ndarray, doubt: Any) -> Layer:
-    there = np.unique(number[np.isfinite(number)]).astype(int)
-    words = tuple(one if k in there else "" for k, one in enumerate(stations))
-    legend = Legend("strongest station", -0.5, len(words) - 0.5)
-    return Layer(name, number, legend, words, doubt, site if len(site) else None)
+    legend = Legend("strongest station", -0.5, len(stations) - 0.5)
+    return Layer(name, number, legend, stations, doubt, site if len(site) else None)
 
 
 def file_name(layer: Layer, suffix: str = ".png") -> str:
@@ -223,7 +221,8 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
         axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
                   path_effects=from_above.OUTLINE)  # fmt: skip
     listed = layer.class_table()
-    for colour, word in [*zip(listed["colour"], listed["station"], strict=True)][:MOST_COLOURS]:
+    shown = [row for row in zip(listed["colour"], listed["station"], listed["share"], strict=True) if row[2]]
+    for colour, word, _ in shown[:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
     if len(listed["number"]) > MOST_COLOURS:
         axis.plot([], [], " ", label=f"all {len(listed['number'])}: {file_name(layer, '.csv')}")
@@ -312,7 +311,8 @@ def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: st
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     dots = axis.scatter(*placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis")
-    label = f"share of the area with {threshold_db:g} {unit} or more, with a station here"
+    of = f"the {1 - placing.refused:.0%} of the area that was tested" if placing.refused else "the area"
+    label = f"share of {of} with {threshold_db:g} {unit} or more, with a station here"
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     from_above.draw_stations(axis, placing.stations)
     from_above.draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -91,12 +91,15 @@ class Placement:
 
     Attributes:
         places: (n, 3) world [m].
-        coverage: (n,) expected share of the area with the threshold or more, with a station there.
+        coverage: (n,) expected share of the area that is not refused with the threshold or more, with a
+            station there.
         low, high: (n,) the ends of its 90 % interval.
         before: the share as it is.
+        refused: share of the area where the promise says nothing.
         grid: the area.
         stations: (T, 2) that stand already [m].
         error: of stations left out.
+        given: other columns (n,) of a table of candidates, by head.
     """
 
     places: np.ndarray
@@ -104,9 +107,11 @@ class Placement:
     low: np.ndarray
     high: np.ndarray
     before: float
+    refused: float
     grid: Grid
     stations: np.ndarray
     error: NewStationError
+    given: Mapping[str, np.ndarray]
 
 
 def place_station(
@@ -127,7 +132,7 @@ def place_station(
         antenna: of the new station.
         promise: see `predict_map`, of the stations that stand.
         error: see `new_station_error`; None: the model's own deviations.
-        dry: predict one cell of each station that stands alone: whether everything asked for is possible.
+        dry: predict one square of each station that stands alone: whether everything asked for is possible.
 
     Raises:
         DataError: the model cannot predict a station that was never there, or anything else that is wrong.
@@ -140,7 +145,7 @@ def place_station(
     antenna = antenna or Antenna()
     still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]
     height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
-    candidates = _candidates(grid, sites, predictor, height, count)
+    candidates, given = _candidates(grid, sites, predictor, height, count)
     cells = grid.places()
     try:
         _new(predictor, candidates[0], cells[:1], antenna)
@@ -153,8 +158,16 @@ def place_station(
         predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
         threshold_db=threshold_db, promise=promise, dry=dry,
     )  # fmt: skip
-    old_outage = np.nan_to_num(now.outage[grid.inside], nan=1.0)
     error = error or NewStationError()
+    # Refused squares are left out: as unserved they would count against the stations that stand,
+    # and draw a new one to where nothing was tested.
+    known = np.isfinite(now.outage[grid.inside])
+    rest: Any = (1 - float(known.mean()), grid, still[:, :2], error)
+    if dry:
+        return Placement(candidates, *np.full((3, len(candidates)), np.nan), np.nan, *rest, given)
+    if not known.any():
+        raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
+    old_outage, cells = now.outage[grid.inside][known], cells[known]
     # A 90 % interval of Student's t, as few stations tell the deviation: the normal's 1.645 held too little.
     reach = float(t.ppf(0.95, max(error.stations, 1))) * error.offset_db
 
@@ -174,7 +187,8 @@ def place_station(
     before = float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
     value, low, high = scores[order].T
-    return Placement(candidates[order], value, low, high, before, grid, still[:, :2], error)
+    given = {head: words[order] for head, words in given.items()}
+    return Placement(candidates[order], value, low, high, before, *rest, given)
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
@@ -203,19 +217,23 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     return NewStationError(float(np.sqrt(np.mean(means**2))), within, len(means))
 
 
-def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> np.ndarray:
+def _candidates(
+    grid: Grid, sites: Any, predictor: Predictor, height: float, count: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and is_table(sites):
         site, end = predictor.site, predictor.site.static_end or "tx"
         asked = read_query_places(sites, (end,))
         where = asked.ends[end]
         above = np.full(len(asked), height) if where.height is None else where.height
-        return to_world(replace(asked, ends={end: replace(where, height=above)}), site)[end]
+        given = {head: words for head, role, words in asked.table if role in (None, "row_name")}
+        return to_world(replace(asked, ends={end: replace(where, height=above)}), site)[end], given
     if sites is not None:
         every, _ = walkable_places(sites, grid, predictor.site.georeference, "sites")
     else:
         every = grid.places()
     few = every[evenly_spaced(len(every), count)]
-    return np.column_stack([few[:, :2], np.full(len(few), height)])
+    return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
 
 def _new(

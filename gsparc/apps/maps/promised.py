@@ -70,20 +70,20 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     figures = field.summarise()
     share = figures["map/server_unsure"]
     if share and len(field.stations) > 1:
-        notes.append(f"best_server: in {share:.1%} of the cells (hatched) it is more likely another, or none")
+        notes.append(f"best_server: in {share:.1%} of squares (hatched) it is more likely another, or none")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
         own = "they are the model's own deviations, and no place is refused as too far from data"
         return [*notes, f"intervals are not tested: {own}"]
-    silent = f"of those not heard, as the model estimates, {coverage.silent_share:.1%}"
-    apart = f" (of heard rows {coverage.heard_share:.1%}, {silent})"
+    silent = f"unlisted rows have no level: the model itself expects {coverage.silent_share:.1%}, not a test"
+    apart = f" (of heard rows {coverage.heard_share:.1%}; {silent})"
     apart = "" if np.isnan(coverage.silent_share) else apart
     ours = f"{coverage.share:.1%} of them held{apart}, {coverage.width_db:.1f} dB wide in the mean"
     own = f"uncalibrated {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB"
     tested = f"tested on {coverage.rows} rows of {coverage.blocks} held-out blocks"
     notes.append(f"{field.share:.0%} intervals, {tested}: {ours}; {own}")
     if figures["map/refused"]:
-        cells = f"{figures['map/refused']} of {int(field.grid.inside.sum())} cells"
-        notes.append(f"{cells} are refused: too far from what was measured")
+        squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"
+        notes.append(f"{squares} are refused: too far from what was measured")
     return notes

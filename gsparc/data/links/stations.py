@@ -18,21 +18,22 @@ FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
-def find_station(wanted: str | int, names: Sequence[str], count: int) -> int | None:
-    """Return which of `count` stations a name, or, if none is called by a number, a number from 0 means.
-
-    Args:
-        wanted: name or number.
-        names: (count,) of the stations; empty where they have none.
-        count: number of stations.
+def find_station(wanted: str | int, stations: Stations) -> int | None:
+    """Return which station is meant by its name, that of the list of cells, or, if no name is one, a number.
 
     Returns:
-        None where there is none: 7 is not the eighth of the cells 33, 212, ...
+        None where there is none (7 is not the eighth of the cells 33, 212, ...), or several are called so.
     """
-    if str(wanted) in list(names):
-        return list(names).index(str(wanted))
-    numbers = [] if any(name.isdigit() for name in names) else [str(number) for number in range(count)]
-    return numbers.index(str(wanted)) if str(wanted) in numbers else None
+    counted = not any(name.isdigit() for name in stations.name)
+    numbers = [str(number) for number in range(len(stations) if counted else 0)]
+    named = (names.index(str(wanted)) for names in (list(stations.name), list(stations.label or ()), numbers)
+             if names.count(str(wanted)) == 1)  # fmt: skip
+    return next(named, None)
+
+
+def all_names(stations: Stations) -> list[str]:
+    """List all that `find_station` finds stations by, but numbers."""
+    return list(dict.fromkeys([*stations.name, *(stations.label or ())]))
 
 
 def number_places(places: np.ndarray) -> np.ndarray:

@@ -89,6 +89,7 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
     assert best_server(power).tolist() == [0, 1, REFUSED]
     assert read_loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
+    assert read_loads({"Roof": 0.2}, ["a", "b"], ["Tower", "Roof"]).tolist() == [1.0, 0.2]
 
 
 def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
@@ -137,6 +138,12 @@ def test_twenty_one_stations_had_twenty_colours():
     named = list(label_places(classes, words))
     assert [word for _, _, word in named] == list(words)
     assert all(classes[row, column] == words.index(word) for row, column, word in named)
+
+
+def test_a_sector_that_serves_nowhere_was_missing_in_the_table():
+    layer = Layer("best_server", np.zeros((4, 4)), Legend("", -0.5, 1.5), ("west", "east"))
+    listed = layer.class_table()
+    assert listed["station"] == ["west", "east"] and listed["share"] == [1, 0]
 
 
 def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(predictor):

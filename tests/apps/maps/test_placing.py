@@ -8,7 +8,9 @@ import pytest
 from towns import MASTS, town_file, town_model
 
 import gsparc
+from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import Antenna, NewStationError, assumption, new_station_error, place_station
+from gsparc.apps.maps.promise import Promise, held_out_evidence
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
@@ -48,11 +50,28 @@ def test_intervals_took_four_stations_for_very_many(together):
     assert (few.high - few.low > many.high - many.low).all() and (few.coverage == many.coverage).all()
 
 
+def test_refused_squares_counted_as_not_served(together):
+    method, data, path = together
+    rows, west = np.arange(len(data)), data.station == 0
+    out = data.place % 2 == 1
+    evidence = held_out_evidence(method, data, Fold(rows[~out], rows[:0], rows[out]), rows[out])
+    promise = Promise(evidence, data.moving[west], data.station[west].astype(np.int64), 10.0)
+    how = {"threshold_db": -75.0, "promise": promise}
+    found = place_station(gsparc.load(path), [-80, 0, 80, 60], count=9, **how)
+    left, right, low, high = found.grid.extent
+    square = {"height_m": found.grid.height, "step_m": found.grid.step}
+    field = predict_map(gsparc.load(path), [left, low, right, high], **square, **how)
+    assert found.refused == pytest.approx(field.refused.mean()) and 0.4 < found.refused < 0.6
+    assert found.before == pytest.approx(1 - np.nanmean(field.outage))
+    assert found.places[0, 0] > 0  # not where nothing was tested
+
+
 def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
-    (tmp_path / "roofs.csv").write_text("x,y,z\n5,5,20\n75,5,12\n")
+    (tmp_path / "roofs.csv").write_text("name,x,y,z\nA,5,5,20\nB,75,5,12\n")
     predictor, how = gsparc.load(together[2]), {"threshold_db": -75.0, "sites": tmp_path / "roofs.csv"}
     found = place_station(predictor, **how)
-    assert sorted(found.places.tolist()) == [[5, 5, 20], [75, 5, 12]]
+    named = dict(zip(found.given["name"].tolist(), found.places.tolist(), strict=True))
+    assert named == {"A": [5, 5, 20], "B": [75, 5, 12]}
     louder = place_station(predictor, **how, antenna=Antenna(power_db=10))
     assert louder.coverage[0] > found.coverage[0] + 0.05
     with pytest.raises(DataError, match="knows no patterns"):
