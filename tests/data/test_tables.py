@@ -88,9 +88,17 @@ def test_every_guess_is_said_and_what_is_not_used(write):
 
 def test_levels_without_a_unit_were_said_to_be_in_dbm(write):
     """A map of the same levels said dB."""
-    table = parse_table(write("x,y,z,RSRP\n1,2,3,-80\n4,5,6,-81\n"))
-    assert "column 'RSRP' taken as rssi_db [dB]" in table.notes
+    table = parse_table(write("x,y,z,RSSI\n1,2,3,-80\n4,5,6,-81\n"))
+    assert "column 'RSSI' taken as rssi_db [dB]" in table.notes
     assert interpret(table, "table").data.site.level_unit == "dB"
+
+
+def test_rsrp_was_in_db_where_its_head_named_no_unit(write):
+    """3GPP TS 36.214 defines it in dBm; the measurements, and so their hash, are the same."""
+    tables = [parse_table(write(f"x,y,z,{head}\n1,2,3,-80\n4,5,6,-81\n")) for head in ("RSRP_1", "RSSI")]
+    assert any("taken as rssi_db [dBm]" in note for note in tables[0].notes)
+    rsrp, rssi = (interpret(table, "table").data.site for table in tables)
+    assert rsrp.level_unit == "dBm" and rsrp.sha256 == rssi.sha256
 
 
 def test_many_transmitters_did_not_become_one_without_a_word(write):

@@ -112,7 +112,9 @@ def _static(site: Site) -> str:
         lost = len(stations) - len(known)
         where = _box(known) if len(known) else ""
         where += f", {lost} of them at unknown places" if lost else ""
-        return f"the {end}, {len(stations)} stations{where}: {list_first(stations.name, 4)}"
+        pairs = zip(stations.label or stations.name, stations.name, strict=True)
+        names = [own if own == name else f"{own} ({name})" for own, name in pairs]
+        return f"the {end}, {len(stations)} stations{where}: {list_first(names, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64

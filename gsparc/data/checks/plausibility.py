@@ -166,17 +166,21 @@ def find_outlier_rows(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]
 def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Warn of stations whose level changes at a row, unexplained by places (`level_steps`)."""
     names, rows, warnings = levels.names, levels.rows, []
-    for t, step in steps:
+    for t in dict.fromkeys(t for t, _ in steps):
         who = f"station {names[t]}" if len(names) > 1 else "the level"
-        verb = "rises" if step.change_db > 0 else "falls"
-        before, after = rows[step.last], rows[step.first]
-        what, _, number = after.partition(" ")
-        named = what == "row" and number.isdigit() and len(names) > 1
-        setting = f"{{{names[t]}:[{number}]}}" if named else "{STATION:[ROW]}"
+        own = [step for one, step in steps if one == t]
+        said = " and ".join(
+            f"{'rises' if step.change_db > 0 else 'falls'} by {abs(step.change_db):.0f} dB between "
+            f"{rows[step.last]} and {rows[step.first]}"
+            for step in own
+        )
+        after = [rows[step.first].partition(" ") for step in own]
+        named = all(what == "row" and number.isdigit() for what, _, number in after) and len(names) > 1
+        setting = f"{{{names[t]}:[{','.join(number for *_, number in after)}]}}"
         warnings.append(
-            f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the places do "
-            f"not explain: another gain or antenna? dataset.level_steps={setting} makes it another station "
-            "from there on"
+            f"{who} {said}, which the places do not explain: another gain or antenna? "
+            f"dataset.level_steps={setting if named else '{STATION:[ROW]}'} makes it another station from "
+            "there on"
         )
     return warnings
 

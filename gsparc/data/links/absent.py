@@ -51,10 +51,12 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     of_list, station, below = lists.bound_unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
+    every = int(np.isnan(lists.level).sum())
+    used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
     check.notes.append(
         f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
-        f" below its weakest, in others below {floor.min():.4g} dB; {len(below)} such rows beside"
-        f" {len(heard)} listed, those that say most of a station (dataset.absent=unknown takes none)"
+        f" below its weakest, in lists shorter than {lists.length}: below {floor.min():.4g} dB; beside"
+        f" {len(heard)} listed, {used} {every} unlisted are used (dataset.absent=unknown takes none)"
     )
 
 

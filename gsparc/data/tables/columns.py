@@ -342,7 +342,9 @@ def _note(columns: tuple[Column, ...]) -> str:
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
     unit = SCHEMA.get(KINDS[column.role], "deg")
-    # Levels of which nobody said more are in dB; calling them dBm would invent a reference.
+    if column.unit is None and "rsrp" in heads.words_of(column.head or ""):
+        return unit  # dBm by definition (3GPP TS 36.214)
+    # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
     return "dB" if unit == "dBm" and (column.unit is None or column.unit.name == "dB") else unit
 
 

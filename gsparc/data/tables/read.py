@@ -84,10 +84,11 @@ def parse_table(
     sheet.problems.raise_if_any()
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
     about = {"name": "+".join(Path(one).stem for one in path.paths)} if isinstance(path, SeveralFiles) else {}
-    if power is not None and power.unit is not None:
-        about |= {"level_unit": schema_unit(power)} if "rssi_db" in chosen else {}
-        if not power.unit.name.startswith("x "):  # a column that is scaled has the schema's unit
-            about["unit"] = power.unit.name
+    if power is not None and "rssi_db" in chosen:
+        about["level_unit"] = schema_unit(power)
+    # A column that is scaled has the schema's unit.
+    if power is not None and power.unit is not None and not power.unit.name.startswith("x "):
+        about["unit"] = power.unit.name
     return Raw(arrays, about, notes=(*notes, *guessed, *builder.notes))
 
 

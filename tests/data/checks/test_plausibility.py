@@ -180,12 +180,13 @@ def campus(stations=slice(None)) -> LinkLevels:
 
 
 def test_a_real_station_that_lost_its_gain():
-    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1162 on, where it was off."""
+    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1461 on, after it was off."""
     some = campus(slice(5, 9))
     found = plausibility.step_warnings(some, plausibility.find_level_steps(some))
-    assert len(found) == 2 and all("ebc-nuc1" in line for line in found)
-    assert "rises by 17 dB between row 349 and row 350" in found[0]
-    assert "falls by 19 dB between row 1161 and row 1461" in found[1]
+    # Two lines proposed [350] and [1461], of which the later setting replaces the first.
+    assert len(found) == 1 and "dataset.level_steps={ebc-nuc1-b210:[350,1461]}" in found[0]
+    assert "rises by 17 dB between row 349 and row 350 and falls" in found[0]
+    assert "falls by 19 dB between row 1161 and row 1461" in found[0]
 
 
 def test_real_outages_are_not_taken_for_silence():
