@@ -210,6 +210,9 @@ def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measure
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
         **scores.samples,
     }  # fmt: skip
+    if data.site.kind == "rssi":
+        levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
+        columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     if data.site.static_end is None:
         other = data.tx[scores.row] + data.site.origin
         columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}

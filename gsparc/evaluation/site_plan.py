@@ -209,9 +209,14 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
         draw_stations(axis, place[list(jumping)], "its level jumps", zorder=2, color="red")
     if site.stations is None or len(place) > NAMED:
         return
-    for number, (where, name) in enumerate(zip(place, site.stations.name, strict=True)):
+    names = site.stations.label or site.stations.name
+    # All sectors of a mast in one text: one above the other the last alone would be read.
+    masts, mast = np.unique(place.round(1), axis=0, return_inverse=True)
+    for number, where in enumerate(masts):
+        own = np.flatnonzero(mast.reshape(-1) == number)
         if np.isfinite(where).all():
-            annotate(axis, name, where, "red" if number in jumping else "black")
+            colour = "red" if set(own) & set(jumping) else "black"
+            annotate(axis, ", ".join(names[t] for t in own), where, colour)
 
 
 def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray) -> None:

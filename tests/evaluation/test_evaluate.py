@@ -56,6 +56,9 @@ def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
     write_summary(tmp_path / "summary.json", facts)
     write_samples(tmp_path / "per_sample.csv", found.columns)
     assert len((tmp_path / "per_sample.csv").read_text().splitlines()) == 1 + len(split.folds[0].test)
+    if kind == "rssi":
+        errors = found.columns["predicted_db"] - found.columns["measured_db"]
+        assert np.allclose(errors, found.columns["error_db"])
 
 
 def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):

@@ -56,6 +56,12 @@ def test_levels_are_means_over_what_was_heard():
     assert found.label == "received power, mean of the stations heard [dB]"
 
 
+def test_of_the_sectors_of_a_mast_the_last_alone_was_named(figures):
+    mast = scattered(2)[[0, 0, 1]]
+    arrays = {"rx_position": scattered(), "station_position": mast, "rssi_db": np.full((80, 3), -60.0)}
+    assert "A-1, A-2" in shown(from_arrays({**arrays, "station_name": ["A-1", "A-2", "B-1"]}), figures)[1]
+
+
 def test_levels_in_dbm_were_drawn_as_db(figures):
     place, level = scattered(), np.linspace(-90, -40, 80)
     arrays = {"rx_position": place, "station_position": np.array([[3.0, 3, 5]]), "rssi_db": level[:, None]}
