@@ -162,9 +162,10 @@ def place_station(
     # Refused squares are left out: as unserved they would count against the stations that stand,
     # and draw a new one to where nothing was tested.
     known = np.isfinite(now.outage[grid.inside])
-    rest: Any = (1 - float(known.mean()), grid, still[:, :2], error)
+    share, left_out = np.full(len(candidates), np.nan), 1 - float(known.mean())
+    found = Placement(candidates, share, share, share, np.nan, left_out, grid, still[:, :2], error, given)
     if dry:
-        return Placement(candidates, *np.full((3, len(candidates)), np.nan), np.nan, *rest, given)
+        return found
     if not known.any():
         raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
     old_outage, cells = now.outage[grid.inside][known], cells[known]
@@ -188,7 +189,9 @@ def place_station(
     order = np.argsort(-scores[:, 0], kind="stable")
     value, low, high = scores[order].T
     given = {head: words[order] for head, words in given.items()}
-    return Placement(candidates[order], value, low, high, before, *rest, given)
+    return replace(
+        found, places=candidates[order], coverage=value, low=low, high=high, before=before, given=given
+    )
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
