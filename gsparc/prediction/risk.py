@@ -296,11 +296,11 @@ def explain_too_few(count: int, promise: Guarantee, bad: float = 0.0) -> str | N
     >>> explain_too_few(32, Guarantee(alpha=0.2), bad=0.1).split(";")[0]
     '32 test positions are too few: alpha=0.2, delta=0.1 with 10% bad need 35 to calibrate on, 88 in all'
     """
+    # A share of alpha or more passes with no number: what none bad would need is the least.
+    bad = bad if bad < promise.alpha else 0.0
     least = np.arange(promise.least, MOST_CALIBRATED)
     passed = least[_tail(bad * least, least, promise.alpha) <= promise.delta]
-    # A share of alpha or more passes with no number: there too few is not what is wrong.
-    needed = int(np.ceil(passed[0] / SHARES[1])) if bad < promise.alpha and len(passed) else 0
-    if count >= needed:
+    if not len(passed) or count >= (needed := int(np.ceil(passed[0] / SHARES[1]))):
         return None
     return (
         f"{count} test positions are too few: alpha={promise.alpha:g}, delta={promise.delta:g} with "

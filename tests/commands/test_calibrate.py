@@ -95,6 +95,7 @@ def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
     assert min(accepted) >= promise.least  # 19 of 50 accepted none
     assert explain_too_few(27, promise).startswith("27 test positions are too few: alpha=0.2, delta=0.1 with")
     assert explain_too_few(32, promise) is None and "88 in all" in explain_too_few(32, promise, 0.1)
+    assert explain_too_few(27, promise, 0.9) == explain_too_few(27, promise)
     # Valid still: a fifth and more of all are bad, whatever the score, and one set in ten is misled.
     rng = np.random.default_rng(0)
     score, bad = rng.normal(size=(2000, 19)), rng.random((2000, 13)) < 0.2
