@@ -229,7 +229,7 @@ def propose_side(data: Measurements) -> float | None:
     return side if side < extent / 2 else None
 
 
-def test_block_rows(data: Measurements, side: float) -> np.ndarray:
+def held_out_block_rows(data: Measurements, side: float) -> np.ndarray:
     """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
@@ -243,6 +243,6 @@ def propose_split(data: Measurements) -> str:
     """Propose a split, in one sentence for `gsparc check`."""
     between = "split=random asks about places between these"
     side = propose_side(data)
-    if side is None or not len(test_block_rows(data, side)):
+    if side is None or not len(held_out_block_rows(data, side)):
         return f"{between}; too few places to hold out squares of floor"
     return f"{between}; split=blocks split.side_m={side:g} about holes of {side:g} m"
