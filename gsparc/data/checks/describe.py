@@ -58,9 +58,11 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
 
 def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     """Return five (topic, sentence) pairs about a dataset and how a run divides it."""
-    train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
-    folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
-    rows = f"{train} training, {val} validation and {test} test rows{folds}"
+    count = len(split.folds)
+    whole = [sum(len(getattr(fold, part)) for fold in split.folds) for part in ("train", "val", "test")]
+    train, val, test = (round(rows / count) for rows in whole)
+    folds = f"each of {count} folds has about " if count > 1 else ""
+    rows = f"{folds}{train} training, {val} validation and {test} test rows"
     return [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),

@@ -1,8 +1,15 @@
 """The split that `gsparc check` proposes can be cut, and asks about holes wider than the places are apart."""
 
 import numpy as np
+from invented import divide, invent
 
-from gsparc.data.checks.describe import held_out_block_rows, propose_side, propose_split, spacing_words
+from gsparc.data.checks.describe import (
+    held_out_block_rows,
+    propose_side,
+    propose_split,
+    spacing_words,
+    summarise,
+)
 from gsparc.data.own import load_own, write_own
 
 
@@ -38,3 +45,9 @@ def test_copies_of_places_were_neighbours_at_no_distance(tmp_path):
 def test_one_place_alone_has_no_squares(tmp_path):
     data = powers(tmp_path / "a.npz", np.tile([1.0, 2.0, 3.0], (5, 1)) + [[0, 0, 0.1 * i] for i in range(5)])
     assert propose_side(data) is None
+
+
+def test_rows_of_folds_were_told_as_a_sum_over_them():
+    """Of 160 spectra in five folds a run said that 560 train."""
+    said = dict(summarise(invent(rows=160), divide(160, 5)))["split"]
+    assert said.endswith(": each of 5 folds has about 125 training, 3 validation and 32 test rows")
