@@ -32,6 +32,6 @@ def draw(tables: Path, pictures: Path) -> None:
                     lines["rows"], lines[quantity], errors, label=label, capsize=2, **style_of(name).marked
                 )
             place.set(title=title, xlabel="rows", yscale="linear" if quantity == "peak_gb" else "log")
-            set_log_axis(place, fine=False)
+            set_log_axis(place, 0)
         figure.legend(*places[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         save(figure, pictures / f"scale-{source}.png")

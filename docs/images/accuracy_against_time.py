@@ -57,7 +57,7 @@ def main() -> None:
     labels = ("training, seconds of one processor", "one query [ms], one thread")
     for axis, label, limits in zip(axes, labels, ((3e-4, 600), (0.01, 20)), strict=False):
         axis.set(xlabel=label, xlim=limits, ylim=(15, 30.5))
-        set_log_axis(axis, fine=False)
+        set_log_axis(axis, 0)
     axes[0].set_ylabel("PSNR of 32 test spectra [dB]")
     save(figure, HERE / "accuracy-against-time.png")
 

@@ -47,7 +47,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     title = f"{known['dataset/name']}, {known['model/name']}"
     draw_calibration(evidence, divisions, promise, title, run_dir / "confidence.png")
     few = explain_too_few(len(evidence), promise)
-    stored_lines = [] if few is None else [few]
+    stored_lines = [] if few is None or config.store else [few]
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:

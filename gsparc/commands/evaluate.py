@@ -52,7 +52,7 @@ def evaluate_files(
         run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines,
         learned=run.trained if other else None,
     )  # fmt: skip
-    evaluation.facts.update({"split/foreign": run.foreign, "split/without_baselines": without})
+    evaluation.facts.update({"split/foreign": run.doubt, "split/without_baselines": without})
     return evaluation, run.data, run.split
 
 
@@ -76,4 +76,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)
-    return finish_run(run_dir, facts, results, lines=remarks(facts, config.eval_on))
+    # Who opened the files has warned of it, and warnings are repeated below the table.
+    said = remarks({**facts, "split/foreign": None}, config.eval_on)
+    return finish_run(run_dir, facts, results, lines=said)

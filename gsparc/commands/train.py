@@ -253,8 +253,9 @@ def _say(config: DictConfig, method: MethodFactory, data: Measurements, split: S
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
     guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
-    within = "" if config.budget_s is None else f", within {config.budget_s:g} s"
-    log.info("%-10s%s%s%s", "fitting", method.name, within, guessed)
+    limit, folds = method.time_limit(data.site, config.budget_s), len(split.folds)
+    each = f", each of {folds} folds" if limit and folds > 1 else ""
+    log.info("%-10s%s", "fitting", f"{method.name}{each}{', ' * bool(limit)}{limit}{guessed}")
 
 
 def _known_walls(config: DictConfig) -> Any:

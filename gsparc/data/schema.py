@@ -253,7 +253,7 @@ class Measurements:
     """A whole dataset, in memory but for large targets; arrays keep their stored precision and type.
 
     >>> predictor.site.name, predictor.site.kind  # facts of what a model learned from
-    ('gsparc', 'rssi')
+    ('arrays', 'rssi')
     >>> ends, turned = np.zeros((4, 3)), np.zeros((4, 3, 3))
     >>> data = Measurements(predictor.site, ends, ends, turned, target=np.ones((4, 1), np.float32))
     >>> data.batch([1, 3]).target.shape, data.moving.shape

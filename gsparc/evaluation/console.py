@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from hydra import errors
@@ -72,7 +73,7 @@ def repeated_warnings() -> list[str]:
     """Return a command's last line on warnings that its log's file has more of, or none."""
     screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
     more = [(n, first) for one in screens for n, first in one.warned.values() if n > 1]
-    again = [f"{n} like '{re.sub(PATH, '', first)[:AGAIN]} ...'" for n, first in more]
+    again = [f"{n} like '{shorten(re.sub(PATH, '', first), AGAIN, placeholder='')} ...'" for n, first in more]
     return [f"warnings that came again: {', '.join(again)}"] if again else []
 
 

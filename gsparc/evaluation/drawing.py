@@ -110,8 +110,8 @@ def panels(
     return figure, axes
 
 
-def set_log_axis(axes: Any, fine: bool | None = None) -> None:
-    """Horizontal axis in decades; plain numbers also between them if `fine`, None: where decades are few.
+def set_log_axis(axes: Any, decades: float = 3.0) -> None:
+    """Horizontal axis in decades, with plain numbers also between them where it has fewer `decades`.
 
     Linear where nothing is above zero.
     """
@@ -119,7 +119,7 @@ def set_log_axis(axes: Any, fine: bool | None = None) -> None:
         return
     axes.set_xscale("log")
     low, high = axes.get_xlim()
-    fine = high < 1000 * low if fine is None else fine
+    fine = np.log10(high / low) < decades
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if fine else (1,)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -123,11 +123,19 @@ def evaluate(
 def _about(
     methods: Sequence[Method], seconds: Sequence[float] | None, data: Measurements, split: Split
 ) -> dict[str, Any]:
-    """`model/*`, `dataset/*`, `split/*`, `machine/*`, `memory/*` and the seconds of training."""
-    first = methods[0]
+    """`model/*`, `dataset/*`, `split/*`, `machine/*`, `memory/*` and the seconds of training.
+
+    Steps are means over folds, the rest of `model/*` is of the first.
+    """
+    first, every = methods[0], [method.facts() for method in methods]
+    own = every[0] | {
+        key: np.mean([facts[key] for facts in every])
+        for key in ("model/steps", "model/steps_taken")
+        if len(every) > 1 and every[0].get(key) is not None
+    }
     return {
         "model/name": first.name, "model/label": common_label(first.name, methods),
-        "model/effects": first.effects, **first.facts(),
+        "model/effects": first.effects, **own,
         "time/train_s": None if seconds is None else float(np.mean(seconds)),
         "time/train_total_s": None if seconds is None else float(sum(seconds)),
         **dataset_facts(data), **split_facts(split), **timing.machine_facts(), **timing.peak_memory(),

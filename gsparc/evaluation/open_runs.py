@@ -69,8 +69,13 @@ class Opened:
 
     def facts(self) -> dict[str, Any]:
         """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
-        own = {"split/foreign": self.foreign, "model/name": self.methods[0].name}
+        own = {"split/foreign": self.doubt, "model/name": self.methods[0].name}
         return dataset_facts(self.data) | split_facts(self.split) | own
+
+    @property
+    def doubt(self) -> str | None:
+        """`foreign` where test rows may have been learned from."""
+        return None if self.learned == 0 else self.foreign
 
     @property
     def predictor(self) -> Predictor:
@@ -129,7 +134,8 @@ def open_files(
         chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
     foreign, learned, trained = _foreign(stored, data, chosen)
     if foreign is not None:
-        log.warning("%s was trained on %s", stored[0].path, foreign)
+        level = logging.INFO if learned == 0 else logging.WARNING
+        log.log(level, "%s was trained on %s", stored[0].path, foreign)
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
@@ -347,11 +353,11 @@ def collect_evidence(
     facts: dict[str, Any] = {}
     for path in paths:
         run = _unseen(path, dataset, split)
-        fold = run.split.folds[0]
+        own, fold = _learned_from(run)
         # Folds and seeds share test rows: a row counts in the evidence once, by the first checkpoint.
-        rows = np.setdiff1d(rows_to_score(fold, "test"), seen)
+        rows = np.setdiff1d(rows_to_score(run.split.folds[0], "test"), seen)
         if len(rows):
-            parts.append(confidence.gather_evidence(run.methods[0], run.data, fold, rows))
+            parts.append(confidence.gather_evidence(run.methods[0], run.data, fold, rows, own))
         seen = np.concatenate([seen, rows])
         facts = facts or run.facts()
     return join_evidence(parts), facts
@@ -363,13 +369,15 @@ def calibrate_and_store(
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
     run = _unseen(path, dataset, split)
-    method, data, fold = run.methods[0], run.data, run.split.folds[0]
+    own, fold = _learned_from(run)
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
-    evidence = confidence.gather_evidence(method, data, fold, rows_to_score(fold, "test"))
+    rows = rows_to_score(run.split.folds[0], "test")
+    evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
     kind_used, choice, _, _ = calibrate_threshold(evidence, promise, kind, spatial, seed)
     threshold = confidence.confidence_threshold(kind_used, choice)
-    known, kernel = confidence.known_positions(data, fold), confidence.position_kernel(data, fold)
-    stored = confidence.Trusted(kind_used, threshold, promise, known, kernel)
+    known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
+    box = confidence.calibrated_box(known, evidence.position)
+    stored = confidence.Trusted(kind_used, threshold, promise, known, kernel, box)
     earlier = confidence.read_trusted(run.stored[0].extra)
     before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
@@ -382,9 +390,10 @@ def calibrate_and_store(
     if np.isfinite(threshold):
         of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
-    if explain_too_few(len(evidence), promise) is not None:
-        return stored, f"{kind_changed}no threshold keeps the bound"
-    bad, limit = promise.is_bad(evidence.error).mean(), f"{promise.limit_db:g} dB"
+    bad, limit = float(promise.is_bad(evidence.error).mean()), f"{promise.limit_db:g} dB"
+    few = explain_too_few(len(evidence), promise, bad)
+    if few is not None:
+        return stored, f"{kind_changed}no threshold keeps the bound: {few}"
     other = relax_guarantee(evidence, promise, kind, spatial, seed)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
@@ -398,8 +407,14 @@ def calibrate_and_store(
 
 def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
     """A checkpoint with test rows that it has not learned from: on others no promise would hold."""
-    run = open_files([path], dataset, split)
+    run = open_files([path], dataset, split, others_whole=True)
     if run.learned != 0:
         advice = "calibrate with the data and split of its training"
         raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
     return run
+
+
+def _learned_from(run: Opened) -> tuple[Measurements, Fold]:
+    """What the first method learned from, of other data than `run.data` where it was trained on others."""
+    own, split = run.trained or (run.data, run.split)
+    return own, split.folds[0]

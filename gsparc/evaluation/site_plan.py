@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.checks.describe import distinct_places, propose_side, spacing_words, test_block_rows
+from gsparc.data.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.outliers import find_outliers, too_far
 from gsparc.data.checks.plausibility import LinkLevels, find_outlier_rows
@@ -181,7 +181,7 @@ def _draw_map(
         assert axis.figure is not None
         axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
     side = propose_side(data)
-    test = np.zeros(0, np.int64) if side is None else test_block_rows(data, side)
+    test = np.zeros(0, np.int64) if side is None else held_out_block_rows(data, side)
     if len(test):
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}

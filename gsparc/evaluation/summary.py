@@ -134,7 +134,9 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
     named = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
     learned = str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
-    return [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
+    lines = [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
+    folds = facts.get("split/folds") or 1
+    return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:

@@ -98,6 +98,10 @@ class MethodFactory(ABC):
             ValueError: this makes none of that class.
         """
 
+    def time_limit(self, site: Site, budget_s: float | None) -> str:
+        """Say what ends a fit at a site before all that is counted; "" where nothing does."""
+        return "" if budget_s is None else f"within {budget_s:g} s"
+
     def shares(self, site: Site) -> bool:
         """Whether it learns several stations of this site at once, told which by `Query.station`."""
         return False

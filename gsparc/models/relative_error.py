@@ -27,7 +27,7 @@ OUTLIERS = 1e-3  # share of the training errors beyond either bound of what is a
 
 
 @dataclass(frozen=True)
-class ErrorRegression(Stored):
+class RelativeErrorRegression(Stored):
     """Ridge regression of the logarithm of |e|^2 / |h|^2 on S columns and their products.
 
     Attributes:
@@ -56,7 +56,7 @@ class ErrorRegression(Stored):
         return self.smearing * logarithm.clamp(self.least, self.largest).exp()
 
     @classmethod
-    def of(cls, columns: Tensor, relative_error: Tensor) -> ErrorRegression:
+    def of(cls, columns: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
         """Fit to columns (n, S) float32, and |e|^2 / |h|^2 (n,) of rows that a fit did not see; n > 1."""
         centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(LEAST_SCALE)
         terms = _quadratic((columns - centre) / scale).double().numpy()

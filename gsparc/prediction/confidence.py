@@ -26,17 +26,20 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, restored, stored
 
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
+MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
-def gather_evidence(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
-    """Return what `method` predicts of rows, and the rivals of its confidence."""
+def gather_evidence(
+    method: Method, data: Measurements, fold: Fold, rows: np.ndarray, own: Measurements | None = None
+) -> Evidence:
+    """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `own` or `data`."""
     evidence = join_evidence(
         [
             Evidence(rows[chosen], data.moving[rows[chosen]], *errors_and_scores(said, batch.target))
             for chosen, batch, said in predict_in_batches(method, data, rows)
         ]
     )
-    return replace(evidence, scores=evidence.scores | position_scores(data, fold, evidence.row))
+    return replace(evidence, scores=evidence.scores | position_scores(own or data, fold, evidence.position))
 
 
 def errors_and_scores(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -62,10 +65,10 @@ def expected_score(prediction: Prediction) -> Tensor | None:
     return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
-def position_scores(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the confidences `RIVALS` (n,) of rows (n,), which rest on places alone."""
+def position_scores(data: Measurements, fold: Fold, places: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the confidences `RIVALS` (n,) of local places (n, 3) [m], by the rows learned from."""
     known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    return {kind: position_score(kind, known, kernel, data.moving[rows]) for kind in RIVALS}
+    return {kind: position_score(kind, known, kernel, places) for kind in RIVALS}
 
 
 def position_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray) -> np.ndarray:
@@ -82,6 +85,18 @@ def position_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndar
 def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
     """Return local places (n, 3) [m] of the moving end that a method may have learned from."""
     return data.moving[np.concatenate([fold.train, fold.val])]
+
+
+def calibrated_box(*places: np.ndarray) -> np.ndarray:
+    """Return the corners (2, 3) [m] around places (n, 3) each, grown by a tenth of the longest side.
+
+    >>> calibrated_box(np.zeros((1, 3)), np.array([[10.0, 5.0, 0.0]]))
+    array([[-1., -1., -1.],
+           [11.,  6.,  1.]])
+    """
+    every = np.concatenate(places)
+    margin = MARGIN * np.ptp(every, axis=0).max()
+    return np.stack([every.min(axis=0) - margin, every.max(axis=0) + margin])
 
 
 def position_kernel(data: Measurements, fold: Fold) -> Kernel:
@@ -114,6 +129,7 @@ class Trusted(Stored):
         promise: what the threshold promises; None where none was asked for.
         known: (n, 3) local positions of the moving end that the method learned from [m].
         kernel: of the process whose variance is a rival; None where no rival was stored.
+        box: `calibrated_box` of local places that the threshold is for; None (older files): not known.
     """
 
     kind: str | None = None
@@ -121,6 +137,13 @@ class Trusted(Stored):
     promise: Guarantee | None = None
     known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     kernel: Kernel | None = None
+    box: np.ndarray | None = None
+
+    def covers(self, places: np.ndarray) -> np.ndarray:
+        """Tell whether local places (B, 3) [m] lie in the box, (B,) bool; all where none is known."""
+        if self.box is None:
+            return np.ones(len(places), bool)
+        return np.all((places >= self.box[0]) & (places <= self.box[1]), axis=1)
 
     def confidence(
         self, prediction: Prediction, places: np.ndarray | None, kind: str | None = None
@@ -182,8 +205,9 @@ def read_trusted(extra: Mapping[str, Any]) -> Trusted:
 
 def confidence_threshold(kind: str, threshold: Threshold) -> float:
     """Return a threshold of scores as one of confidences."""
+    # -infinite accepts all, and confidences begin at 0.
     value = np.array(threshold.value)
-    return float(as_confidence(kind, value)) if np.isfinite(value) else float("inf")
+    return max(float(as_confidence(kind, value)), 0.0) if value < np.inf else float("inf")
 
 
 class ConfidenceMixin:
@@ -214,7 +238,8 @@ class ConfidenceMixin:
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
 
-        None is where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
+        False beyond the places learned from and calibrated on (their box, grown by a tenth of its longest
+        side), and where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
 
         >>> predictor.accepts(rx=[2.0, 1.0, 1.5])
         Traceback (most recent call last):
@@ -233,7 +258,11 @@ class ConfidenceMixin:
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
             )
         sure, single, as_torch = self._sure(tx, rx, uplink)
-        good = match_input(sure >= self.trusted.threshold, single, as_torch)
+        good = sure >= self.trusted.threshold
+        if uplink is None:  # an uplink has no place
+            places = self.queries.query(tx, rx).query.places(self.site).numpy()
+            good &= torch.from_numpy(self.trusted.covers(places))
+        good = match_input(good, single, as_torch)
         return bool(good) if single and not as_torch else good
 
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:

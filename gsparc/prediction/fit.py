@@ -67,6 +67,7 @@ def fit(
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
     given = {name: np.asarray(value) for name, value in inputs.items() if value is not None}
     raw = Raw(given, {}) if rssi is None else _of_powers(given, np.asarray(rssi), unit)
+    raw.attributes["name"] = "arrays"  # the source is of messages
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:

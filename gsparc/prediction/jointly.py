@@ -63,10 +63,10 @@ class JointMixin:
         level, covariance, noise = (part.numpy() for part in known.predict_joint(moving, stations))
         return level + 10 * np.log10(self.site.target_scale), covariance, noise
 
-    def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float] | None:
+    def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float]:
         """Return the covariance (B, B) of the power's errors at B places, and a measurement's noise [dB^2].
 
-        Of several stations of one of them, see `Predictor.at`. None: the model states none.
+        Of several stations of one of them, see `Predictor.at`.
 
         >>> covariance, noise = predictor.covariance(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
         >>> covariance.shape, bool(covariance[0, 1] < covariance[0, 0]), noise > 0
@@ -77,6 +77,9 @@ class JointMixin:
         >>> level = predictor.rssi(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])[:, 0]
         >>> np.random.default_rng(0).multivariate_normal(level, covariance, 100).shape
         (100, 2)
+
+        Raises:
+            ValueError: the model states none.
         """
         query = self.queries.query(tx, rx, torch.float64).query
         places = query.places(self.site)
@@ -87,7 +90,7 @@ class JointMixin:
             return (covariance[0] - noise.diag()).numpy(), float(noise[0])
         process = self.method.process() if isinstance(self.method, HasProcess) else None
         if process is None:
-            return None
+            raise ValueError(f"covariance: {self.method.name} states none of errors; model=gp of powers does")
         # Who learned all stations together tells them by their places: there both ends are a query's.
         places = query.places(getattr(self.method, "site", None) or self.site)
         covariance = process.posterior.covariance(places)  # type: ignore[attr-defined]

@@ -238,7 +238,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         >>> predictor.spectrum(rx=[2.0, 1.0, 1.5])  # of a model of powers
         Traceback (most recent call last):
             ...
-        ValueError: this model predicts rssi (dataset gsparc), not spectrum: call .rssi(...)
+        ValueError: this model predicts rssi (dataset arrays), not spectrum: call .rssi(...)
 
         Raises:
             ValueError: the model predicts something else, a position is missing or not finite, or `grad` as

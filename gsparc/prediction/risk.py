@@ -28,6 +28,7 @@ LEVELS = 50
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+MOST_CALIBRATED = 10_000  # positions that a message may ask for
 MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
 CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
 
@@ -99,7 +100,7 @@ class Threshold:
     0.099
 
     Attributes:
-        value: accept scores of at least this; infinite when nothing can be promised.
+        value: accept scores of at least this; infinite when nothing can be promised, -infinite: all.
         accepted: calibration positions it accepts.
         bad: how many of them are bad.
     """
@@ -140,17 +141,19 @@ def choose_threshold(
     Where neighbours err together, `group` (n,) names the patch each position belongs to: counts are divided
     by the design effect, how much more the share varies between patches than binomial counts would (Kish
     1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
-    could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
+    could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing. Where
+    all are, accepting everybody is tested.
 
     >>> score = np.linspace(0, 1, 100)
     >>> choose_threshold(score, score < 0.5, threshold_levels(score), Guarantee()).accepted >= 50
     True
     """
     threshold = Threshold(float("inf"), 0, 0)
-    for level in levels:
+    # The laxest of few levels may be too strict to be tested; the last is fixed without the labels, too.
+    for level in (*levels, -np.inf):
         rows = score >= level
         accepted, wrong = int(rows.sum()), int(bad[rows].sum())
-        if accepted < promise.least:
+        if accepted < promise.least or (level == -np.inf and threshold.accepted):
             continue
         effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
         # A fixed sequence: as the first test that fails ends it, delta need not be divided among the tests.
@@ -182,10 +185,10 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     return max(1.0, float(bound * between / (share * (1 - share))))
 
 
-def _tail(wrong: float, accepted: float, alpha: float) -> float:
+def _tail(wrong: Any, accepted: Any, alpha: float) -> Any:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
     # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
-    return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
+    return betainc(np.maximum(accepted - wrong, 1e-9), wrong + 1, 1 - alpha)
 
 
 def bounded_loss(relative_error: np.ndarray) -> np.ndarray:
@@ -286,14 +289,22 @@ def split_evidence(
     return choose_on, calibrate, test
 
 
-def explain_too_few(count: int, promise: Guarantee) -> str | None:
-    """Say what is missing for any promise on so many positions; None where there are enough."""
-    needed = int(np.ceil(promise.least / SHARES[1]))
-    if count >= needed:
+def explain_too_few(count: int, promise: Guarantee, bad: float = 0.0) -> str | None:
+    """Say how many test positions a promise needs of which a share `bad` is bad; None: not more than `count`.
+
+    >>> explain_too_few(32, Guarantee(alpha=0.2))  # enough
+    >>> explain_too_few(32, Guarantee(alpha=0.2), bad=0.1).split(";")[0]
+    '32 test positions are too few: alpha=0.2, delta=0.1 with 10% bad need 35 to calibrate on, 88 in all'
+    """
+    # A share of alpha or more passes with no number: what none bad would need is the least.
+    bad = bad if bad < promise.alpha else 0.0
+    least = np.arange(promise.least, MOST_CALIBRATED)
+    passed = least[_tail(bad * least, least, promise.alpha) <= promise.delta]
+    if not len(passed) or count >= (needed := int(np.ceil(passed[0] / SHARES[1]))):
         return None
     return (
-        f"{count} test positions can promise nothing: alpha={promise.alpha:g}, delta={promise.delta:g} need "
-        f"{promise.least} good ones to calibrate on, {needed} in all; measure more, or promise less"
+        f"{count} test positions are too few: alpha={promise.alpha:g}, delta={promise.delta:g} with "
+        f"{bad:.0%} bad need {passed[0]} to calibrate on, {needed} in all; measure more, or promise less"
     )
 
 
@@ -303,7 +314,7 @@ def relax_guarantee(
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(promise, limit_db=float(limit))
-        if np.isfinite(calibrate_threshold(evidence, other, kind, spatial, seed)[1].value):
+        if calibrate_threshold(evidence, other, kind, spatial, seed)[1].accepted:
             return other
     return None
 

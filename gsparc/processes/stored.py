@@ -83,6 +83,8 @@ def find_kind(name: str) -> type[Stored]:
     if name in KINDS:
         return KINDS[name]
     module = name.rpartition(".")[0]
+    if not module:
+        raise ValueError(f"{name!r} is of another version of gsparc: fit again")
     if module == MAIN:
         raise ValueError(f"{name!r} is of a notebook or script: define it here, too, before it is read")
     raise ValueError(

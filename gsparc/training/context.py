@@ -57,6 +57,7 @@ class FitContext:
         seed: of whatever is random and has no seed of its own.
         effort: that all counts of `Effort` are multiplied by.
         budget_s: seconds after which searches and steps end with what they have; None: no end.
+        asked_s: `budget_s` of the whole fit, which a part's has what is left of.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
             `choose_stations` says.
@@ -83,6 +84,7 @@ class FitContext:
     seed: int = 0
     effort: float = 1.0
     budget_s: float | None = None
+    asked_s: float | None = None
     budget_clock: Clock = "wall"
     stations: StationModels = "auto"
     split: SplitSettings | FileSettings | None = None
@@ -104,6 +106,8 @@ class FitContext:
             raise ValueError(f"effort={self.effort!r}: a positive number is needed; 1 is usual")
         if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
             raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
+        if self.asked_s is None:
+            object.__setattr__(self, "asked_s", self.budget_s)
         if self.budget_clock not in get_args(Clock):
             raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
         if self.stations not in get_args(StationModels):

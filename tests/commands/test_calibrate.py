@@ -20,8 +20,10 @@ from gsparc.prediction.risk import (
     Threshold,
     Trial,
     best_kind,
+    calibrate_threshold,
     calibration_facts,
     choose_threshold,
+    explain_too_few,
     number_patches,
     rank_correlation,
     risk_coverage,
@@ -86,13 +88,31 @@ def test_too_few_to_test_promise_nothing() -> None:
         Guarantee(alpha=1.5)
 
 
+def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
+    """The laxest of levels from six scores mostly accepts fewer than eleven of thirteen others."""
+    good, promise = replace(_evidence(32), error=np.full(32, 0.01)), Guarantee(0.0, alpha=0.2)
+    accepted = [calibrate_threshold(good, promise, "auto", False, seed)[1].accepted for seed in range(50)]
+    assert min(accepted) >= promise.least  # 19 of 50 accepted none
+    assert explain_too_few(27, promise).startswith("27 test positions are too few: alpha=0.2, delta=0.1 with")
+    assert explain_too_few(32, promise) is None and "88 in all" in explain_too_few(32, promise, 0.1)
+    assert explain_too_few(27, promise, 0.9) == explain_too_few(27, promise)
+    # Valid still: a fifth and more of all are bad, whatever the score, and one set in ten is misled.
+    rng = np.random.default_rng(0)
+    score, bad = rng.normal(size=(2000, 19)), rng.random((2000, 13)) < 0.2
+    misled = [
+        choose_threshold(s[6:], b, threshold_levels(s[:6]), promise).accepted > 0
+        for s, b in zip(score, bad, strict=True)
+    ]
+    assert 0.02 < np.mean(misled) < 0.1
+
+
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
-    run.stored = [SimpleNamespace(extra={})]
+    run.stored, run.trained = [SimpleNamespace(extra={})], None
     monkeypatch.setattr(command, "_unseen", lambda *_: run)
     monkeypatch.setattr(command, "rows_to_score", lambda *_: None)
     for name in ("known_positions", "position_kernel"):
-        monkeypatch.setattr(command.confidence, name, lambda *_: None)
+        monkeypatch.setattr(command.confidence, name, lambda *_: evidence.position)
     kept = []
     monkeypatch.setattr(command.confidence, "store_trusted", lambda *stored: kept.append(stored))
     monkeypatch.setattr(command.confidence, "gather_evidence", lambda *_: evidence)
@@ -222,12 +242,27 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
             collect_evidence([path], file, {})
             pytest.fail(name)
     elsewhere = written("elsewhere", every, 0.05)
-    assert len(collect_evidence([path], elsewhere, {})[0]) == len(objects.split.folds[0].test)
+    again = collect_evidence([path], elsewhere, {"name": "random"})[0]
+    assert len(again) == len(objects.split.folds[0].test)
     (tmp_path / "own.npz").unlink()
     with pytest.raises(
         ValueError, match=r"\(content hashes differ\); these test rows may have been TRAINED on"
     ):
         collect_evidence([path], elsewhere, {})
+
+
+def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest(tmp_path) -> None:
+    path = str(_trained(tmp_path).checkpoints[0])
+    with np.load(tmp_path / "own.npz") as stored:
+        arrays = dict(stored)
+    arrays["tx_position"] = arrays["tx_position"] + 0.05
+    np.savez(tmp_path / "later.npz", **arrays)
+    other = {"file": str(tmp_path / "later.npz")}
+    evidence, facts = collect_evidence([path], other, {"name": None})
+    assert len(evidence) == len(arrays["tx_position"]) and facts["split/name"] == "whole"
+    assert facts["split/foreign"] is None  # nothing of it was learned from
+    trusted, _ = command.calibrate_and_store(path, other, {}, Guarantee(), "distance", False, 0)
+    assert len(trusted.known) == 32 and trusted.covers(evidence.position).all()
 
 
 def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:

@@ -71,6 +71,13 @@ def test_a_sweep_names_the_job_that_failed(tmp_path):
     assert done.err[-1] == "error: none.ckpt: no such checkpoint"
 
 
+def test_rows_that_were_trained_on_were_warned_of_twice(trained, tmp_path):
+    given = [f"ckpt={trained}", "split.name=corner", "baselines=[]", f"hydra.run.dir={tmp_path}"]
+    done = knock(COMMANDS["evaluate"].run, "evaluate", given)
+    assert done.status == 0, done
+    assert sum("TRAINED on" in line for line in (*done.out, *done.err)) == 1, done
+
+
 def test_another_subset_and_split(trained, caplog):
     found, _, _ = evaluate_files([trained], eval_on="val", baselines=["nearest"])
     assert found.facts["val/samples"] == found.facts["split/val"] and "TRAINED" not in caplog.text
@@ -116,7 +123,8 @@ def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_it
         moved = stored["rx_position"] + [0.02, 0.01, 0]
         np.savez(later, **{**stored, "rx_position": moved, "csi": np.roll(stored["csi"], 1, axis=0)})
     found, data, split = evaluate_files([model], {"file": str(later)}, {"name": None})
-    assert split.name == "whole"
+    assert split.name == "whole" and found.facts["split/foreign"] is None
+    assert not any("TRAINED" in one.message for one in caplog.records if one.levelname == "WARNING")
     assert found.facts["test/samples"] == found.facts["split/test"] == len(data) == 80
     assert "baseline/nearest/nmse" not in found.facts  # as asked
     found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None)

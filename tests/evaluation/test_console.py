@@ -50,14 +50,18 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
         logging.getLogger("gsparc.models.per_station").warning("%g s are too few", 5 - station / 7)
         logging.getLogger("gsparc.models.per_station").warning("data/a.npz: no level of station s%d", station)
         logging.getLogger("gsparc.models.per_station").info("station %d of 12", station)
+    for _ in range(2):
+        logging.getLogger("gsparc.models.vectors").warning("1 spectrum cannot come from this array (see it)")
     logging.getLogger("gsparc.modelling").warning("data/a.npz: 3 places were measured twice")
     logging.getLogger("gsparc.modelling").info("fitting")
     assert screen.stream.getvalue().splitlines() == [
         "warning: 5 s are too few", "warning: data/a.npz: no level of station s0",
+        "warning: 1 spectrum cannot come from this array (see it)",
         "warning: data/a.npz: 3 places were measured twice", "fitting",
     ]  # fmt: skip
     assert repeated_warnings() == [
-        "warnings that came again: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
+        "warnings that came again: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...', "
+        "2 like '1 spectrum cannot come from this array ...'"
     ]
 
 

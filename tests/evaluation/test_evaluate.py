@@ -97,15 +97,18 @@ def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     assert heads == ["method", "rmse_db", "mae_db", "skill", "train s/fold", "query ms p50"]
 
 
-def test_folds_are_pooled(campaign, folds, tmp_path):
+def test_folds_are_pooled(campaign, folds, monkeypatch):
     data, split = campaign("spectrum", 45), folds(45, 5)
     methods, seconds = fit_all(Mean, data, split)
+    for steps, method in enumerate(methods):
+        monkeypatch.setattr(method, "facts", lambda steps=steps: {"model/steps_taken": steps})
     scores = score_methods(methods, data, split)
     assert sorted(scores.row) == list(range(45)) and list(np.unique(scores.fold)) == [0, 1, 2, 3, 4]
     first = score_methods(methods[:1], data, dataclasses.replace(split, folds=split.folds[:1]))
     assert np.array_equal(scores.samples["ssim"][:9], first.samples["ssim"])
     facts = evaluate(methods, seconds, data, split, baselines=("nearest", "gp"), clock=QUICK).facts
     assert facts["test/ssim"] == pytest.approx(scores.samples["ssim"].mean())
+    assert facts["model/steps_taken"] == 2, "the mean, not the first fold's"
     assert facts["split/folds"] == 5 and facts["test/samples"] == 45
     assert facts["time/train_total_s"] == pytest.approx(5 * facts["time/train_s"])
 

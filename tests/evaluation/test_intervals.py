@@ -81,7 +81,10 @@ def test_whether_std_is_right_was_in_no_table():
 def test_silent_rows_counted_nowhere(drawn):
     """Beside lists of the strongest methods that predict what was heard everywhere had the better rmse."""
     data, mean_db = drawn
-    heard, level = data.side(np.arange(COUNT)) == 0, 10 * np.log10(data.target[:, 0] * data.site.target_scale)
+    heard, level = (
+        data.censored_side(np.arange(COUNT)) == 0,
+        10 * np.log10(data.target[:, 0] * data.site.target_scale),
+    )
     lifted = np.maximum(mean_db, LEVEL + 6)  # as if every place heard
     honest, other = (
         {"error_db": said - level, **scored(data, said, 6.0).samples} for said in (mean_db, lifted)
@@ -123,7 +126,7 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
 
 def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_decibels(drawn):
     data = drawn[0]
-    side = np.where(np.arange(COUNT) == 0, -1, data.side(np.arange(COUNT))).astype(np.int8)
+    side = np.where(np.arange(COUNT) == 0, -1, data.censored_side(np.arange(COUNT))).astype(np.int8)
     silent = replace(data, censored=side)
     one = scored(silent, np.full(COUNT, -np.inf), 6.0)
     one = replace(one, samples={**one.samples, "error_db": np.zeros(COUNT)})

@@ -117,6 +117,8 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
 def test_the_console_never_said_which_method_was_chosen(kind, made, learned, said):
     facts = {"dataset/kind": "csi", "model/label": "gsparc", "model/class": kind, "model/made": made}
     assert remarks({**facts, "model/learned": learned}) == said
+    folds = remarks({**facts, "model/learned": learned, "split/folds": 5})
+    assert folds == ["of the first of 5 folds:", *said], "steps of one fold were shown as those of all"
 
 
 @pytest.mark.parametrize("prefix", ["train", "val"])

@@ -11,6 +11,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.confidence import (
     Trusted,
     as_confidence,
+    calibrated_box,
     gather_evidence,
     known_positions,
     position_kernel,
@@ -75,3 +76,16 @@ def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None
     store_trusted(file, Trusted(kind, float(laxest), Guarantee(), known, kernel))
     near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
     assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()
+
+
+def test_a_place_outside_of_all_measurements_was_accepted(site) -> None:
+    """A model that found sources is sure 30 m beyond its room."""
+    data, fold, file = site
+    known, kernel = known_positions(data, fold), position_kernel(data, fold)
+    trusted = Trusted("learned", 0.0, Guarantee(), known, kernel)
+    near = data.tx[fold.train[:2]] + data.site.origin
+    places = np.concatenate([near, near + np.array([30.0, 0, 0])])
+    store_trusted(file, trusted)
+    assert gsparc.load(file).accepts(tx=places).all()  # as files of before
+    store_trusted(file, replace(trusted, box=calibrated_box(known)))
+    assert gsparc.load(file).accepts(tx=places).tolist() == [True, True, False, False]

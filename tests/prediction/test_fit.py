@@ -27,6 +27,7 @@ KINDS = {
 def test_arrays_of_every_kind_become_a_predictor_that_is_stored(kind, model, tmp_path):
     file = tmp_path / "model.ckpt"
     found = gsparc.fit(rx=PLACES, tx=END, model=model, budget_s=1.0, save=file, **KINDS[kind])
+    assert " on arrays; " in repr(found)  # and not on gsparc
     again = gsparc.load(file)
     one, two = (np.asarray(getattr(each, kind)(rx=PLACES[:3])) for each in (found, again))
     assert len(one) == 3 and np.isfinite(one).all() and np.array_equal(one, two)

@@ -33,7 +33,8 @@ def test_stations_at_a_place_and_places_of_a_station_have_one_variance():
 
 
 def test_who_knows_no_covariance_says_so():
-    assert gsparc.load(STORED / "kriging.ckpt").covariance(rx=PLACES) is None
+    with pytest.raises(ValueError, match="states none of errors"):
+        gsparc.load(STORED / "kriging.ckpt").covariance(rx=PLACES)
     assert gsparc.load(STORED / "stations-each.ckpt").predict_joint(PLACES, [0]) is None
 
 

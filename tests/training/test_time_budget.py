@@ -2,6 +2,7 @@
 
 import pickle
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -93,3 +94,9 @@ def test_an_effort_multiplies_every_count_and_rows_by_its_cube_root():
     assert more.chosen_on == 2 * usual.chosen_on and Effort().times(1e-6).chosen_on == 150
     with pytest.raises(ValueError, match="effort=0: a positive number is needed"):
         FitContext(effort=0)
+
+
+def test_a_warning_named_what_reading_had_left_of_the_seconds():
+    """`budget_s=6` was told as `budget_s=0.6: none is left`, which nobody had set."""
+    part = replace(FitContext(budget_s=6.0), budget_s=0.6).for_part("fold0", budget_s=0.3)
+    assert (part.budget_s, part.asked_s) == (0.3, 6.0)

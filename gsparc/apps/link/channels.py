@@ -99,7 +99,7 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
 def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     error, own = errors_and_scores(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
-    return Evidence(rows, data.moving[rows], error, own | position_scores(data, fold, rows))
+    return Evidence(rows, data.moving[rows], error, own | position_scores(data, fold, data.moving[rows]))
 
 
 @lru_cache(maxsize=1)

@@ -10,7 +10,6 @@ from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.making import predict_levels, query_ends, to_local
 from gsparc.apps.maps.promise import Promise
-from gsparc.data.errors import DataError
 from gsparc.prediction.predictor import Predictor
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
@@ -56,17 +55,13 @@ def error_covariances(
     Held-out blocks of `promise` scale the variances.
 
     Raises:
-        DataError: the model has no process.
+        ValueError: the model has no process.
     """
     covariances = []
     for name in stations:
         asking = predictor if predictor.site.stations is None else predictor.at(name)
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
-        known = asking.covariance(**query_ends(asking.site, places, other_end))
-        if known is None:
-            fault = "states no covariance of its errors; plan with model=gp or gsparc of powers"
-            raise DataError(f"{asking.method.name} {fault}")
-        covariance, noise = known
+        covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,12 +31,17 @@ def in_multirun() -> bool:
 def show_result(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
     """Show what a command ends with: tables, sentences, and `before` with where everything was written."""
     console = open_console()
+    console.record = True
     for one in tables:
         console.print(one)
     # Hydra opens a log for every job; one without a line is not worth a word.
     log = "".join(f"; full log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
     for line in (*repeated_warnings(), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
+    files = [one for one in logging.getLogger().handlers if isinstance(one, logging.FileHandler)]
+    text = console.export_text().rstrip()
+    for file in files:  # to the log's file alone: the console has it
+        file.handle(logging.LogRecord(__name__, logging.INFO, __file__, 0, f"result:\n{text}", None, None))
 
 
 def finish_run(

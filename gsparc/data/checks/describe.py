@@ -58,9 +58,11 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
 
 def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     """Return five (topic, sentence) pairs about a dataset and how a run divides it."""
-    train, val, test = (sum(len(getattr(f, part)) for f in split.folds) for part in ("train", "val", "test"))
-    folds = f", in {len(split.folds)} folds" if len(split.folds) > 1 else ""
-    rows = f"{train} training, {val} validation and {test} test rows{folds}"
+    count = len(split.folds)
+    whole = [sum(len(getattr(fold, part)) for fold in split.folds) for part in ("train", "val", "test")]
+    train, val, test = (round(rows / count) for rows in whole)
+    folds = f"each of {count} folds has about " if count > 1 else ""
+    rows = f"{folds}{train} training, {val} validation and {test} test rows"
     return [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),
@@ -229,7 +231,7 @@ def propose_side(data: Measurements) -> float | None:
     return side if side < extent / 2 else None
 
 
-def test_block_rows(data: Measurements, side: float) -> np.ndarray:
+def held_out_block_rows(data: Measurements, side: float) -> np.ndarray:
     """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
@@ -243,6 +245,6 @@ def propose_split(data: Measurements) -> str:
     """Propose a split, in one sentence for `gsparc check`."""
     between = "split=random asks about places between these"
     side = propose_side(data)
-    if side is None or not len(test_block_rows(data, side)):
+    if side is None or not len(held_out_block_rows(data, side)):
         return f"{between}; too few places to hold out squares of floor"
     return f"{between}; split=blocks split.side_m={side:g} about holes of {side:g} m"

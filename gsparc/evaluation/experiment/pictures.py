@@ -37,7 +37,8 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
         for own, horizontal, label in wanted:
             axis = free.pop(0)
             _panel(axis, own, horizontal, ours)
-            axis.set(title=f"{own.dataset.iloc[0]}, {own.split.iloc[0]}", xlabel=label)
+            shows = own.split.iloc[0] if horizontal == "train_cpu_s" else "queries"
+            axis.set(title=f"{own.dataset.iloc[0]}, {shows}", xlabel=label)
         figure_name = here.figure.iloc[0]
         line[0].set_ylabel(score_heading(figure_name))
         if lower_is_better(figure_name):
@@ -63,7 +64,7 @@ def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
         x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
         level = [shown(*one) for one in zip(own.figure, own.score_db, strict=True)]
         axis.errorbar(x, level, spread, label=name, **style)
-    set_log_axis(axis, fine=False)
+    set_log_axis(axis, 1.5)
 
 
 LINE = 0.34  # height of a method [inch]

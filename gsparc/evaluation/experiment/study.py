@@ -138,7 +138,7 @@ class Study:
         """
         cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
         work = partial(self._tried, data=data, split=split, context=context, state=state)
-        found = dict(run_each(work, cells, "rounds of variants"))
+        found = dict(run_each(work, cells, "rounds of variants, possible here or not"))
         rows = list[dict[str, Any]]()
         for number, (variant, turn) in enumerate(cells):
             facts, folder = found[number], context.run_dir / variant / str(turn)
@@ -194,12 +194,13 @@ class Study:
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
                 "value": defined_figure(outcome.figures, figure), "train_s": float(np.mean(outcome.train_s)),
                 "train_cpu_s": float(np.mean(outcome.train_cpu_s)),
-                "effects": str(outcome.methods[0].effects or "none"),
+                "effects": str(outcome.methods[0].effects or "none").replace("+", ", "),
             }  # fmt: skip
             facts |= {f"{condition}/{name}": value for name, value in own.items()}
             log.info(
-                "%s, %s, round %d of %d: %s %.4g after %.3g s of training a fold",
-                variant, condition, turn + 1, self.rounds, figure, own["value"], own["train_s"],
+                "%s%s, round %d of %d: %s %.4g after %.3g s of training a fold",
+                variant, "" if condition == Condition() else f", {condition}", turn + 1, self.rounds,
+                figure, own["value"], own["train_s"],
             )  # fmt: skip
         write_summary(folder / SUMMARY, {"figure": figure, "seed": seed, **facts, **provenance()})
 

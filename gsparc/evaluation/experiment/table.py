@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -60,8 +61,9 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         second = DECIDING[own["kind"]] if own["figure"] == WITH_SILENT else SECOND[own["kind"]]
         label = str(own["label"] or "")
         rows.append({
-            **own, **asdict(one.cell), "draws": one.drawn, "score_db": score_db(own), "second": second,
-            "second_value": own.get(second), **{name: own.get(key) for name, key in BESIDE.items()},
+            **own, **asdict(one.cell), "folder": one.folder, "draws": one.drawn, "score_db": score_db(own),
+            "second": second, "second_value": own.get(second),
+            **{name: own.get(key) for name, key in BESIDE.items()},
             "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
     if not rows:
@@ -81,7 +83,8 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
             of fewer measurements answer faster.
 
     Returns:
-        Columns `ROW` (those of `compare.csv`); NaN where something is not known.
+        Columns `ROW` (those of `compare.csv`) and `folder`, of the first seed's run; NaN where something is
+        not known.
         `budget_s` [s]: NaN for a method without one, which stands in the tables of all budgets.
         `score_db`: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE; `spread_db`: its standard
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
@@ -103,7 +106,7 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     groups = cells.groupby(GROUP, dropna=False, sort=False)
     means = ["score_db", "value", "behind_db", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
-    rows[["figure", "second"]] = groups[["figure", "second"]].first()
+    rows[["figure", "second", "folder"]] = groups[["figure", "second", "folder"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
     rows["draws"] = several
     # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
@@ -125,7 +128,7 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
         rows[name] = [getattr(one, field, np.nan) for one in times]
     order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
     rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
-    return rows[ROW].reset_index(drop=True)
+    return rows[[*ROW, "folder"]].reset_index(drop=True)
 
 
 def _behind(cells: pd.DataFrame) -> pd.Series:
@@ -155,7 +158,7 @@ def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
 def title_of(block: pd.DataFrame) -> str:
     """Names and budget of a block, and how often its split was drawn."""
     budget = block.budget_s.max()
-    timed = "" if np.isnan(budget) else f", {budget:g} s of training per model"
+    timed = "" if np.isnan(budget) else f", {budget:g} processor seconds of training per model"
     draws = int(block.seeds.max()) if block.draws.any() else 0
     count = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
     return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{timed}{count}"
@@ -166,7 +169,9 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     rows = list(block.itertuples())
     first = rows[0]
     level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
-    lines = [f"first: {first.method}, {level} after {first.train_s:.3g} s of training"]
+    lines = [f"first: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
+    if len(rows) > 1:
+        lines[0] += _lead(first, rows[1])
     own = next((row for row in rows if row.method == ours), None)
     if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
@@ -194,6 +199,46 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if old:
         lines.append(f"measured with another program (at commit): {old}")
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
+
+
+def _lead(first: Any, second: Any) -> str:
+    """What the first has more than the second, with its standard error: of the same draws, or the same rows.
+
+    Rows count as independent, which neighbours are not: their error is a lower bound.
+    """
+    ahead, error, of = second.behind_db, second.behind_error_db, "draws"
+    if first.draws and (first.behind_db != 0 or not np.isfinite(error)):
+        return ""
+    if not first.draws:
+        files = [Path(str(row.folder)) / "per_sample.csv" for row in (first, second)]
+        if not all(file.exists() for file in files):
+            return ""
+        one, other = (pd.read_csv(file) for file in files)
+        gains = paired_gains(one, other, first.figure) if list(one.row) == list(other.row) else None
+        if gains is None or len(gains) < 2:
+            return ""
+        ahead, error, of = gains.mean(), gains.sem(), f"{len(gains)} test rows"
+        of += " of the first seeds" if max(first.seeds, second.seeds) > 1 else ""
+    return f"; {ahead:.2f} ± {error:.2f} dB before {second.method} (standard error over the same {of})"
+
+
+def paired_gains(one: pd.DataFrame, other: pd.DataFrame, figure: str) -> pd.Series | None:
+    """Return numbers (n,) whose mean is what the score of `one` has more than that of `other` [dB].
+
+    Args:
+        one, other: columns of `per_sample.csv` of the same n rows.
+        figure: the deciding one; None for those that are no mean over rows.
+    """
+    if figure == "psnr_db":
+        return (one.psnr_db - other.psnr_db).dropna()
+    if figure == "nmse":  # the difference of logarithms, and to first order what each row adds to it
+        ratios = [(error / error.mean()).rename(None) for error in (one.error_power, other.error_power)]
+        ahead = np.log(other.error_power.mean() / one.error_power.mean())
+        return (10 / np.log(10) * (ahead + ratios[1] - ratios[0])).dropna()
+    if figure == "rmse_db":  # a^2 - b^2 = (a - b) (a + b)
+        squares = [frame.error_db**2 for frame in (one, other)]
+        return ((squares[1] - squares[0]) / sum(square.mean() ** 0.5 for square in squares)).dropna()
+    return None
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:

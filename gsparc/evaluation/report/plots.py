@@ -112,7 +112,7 @@ def draw_distributions(runs: Sequence[Run], title: str, path: Path) -> None:
         _cdfs(axes, runs, name, labels)
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else heading_of(name))
         if name == TIMES:
-            set_log_axis(axes, fine=True)
+            set_log_axis(axes, np.inf)
         if name in ("mse", "error_power") and np.isfinite(axes.dataLim.minposx):
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap

@@ -59,7 +59,7 @@ class Run:
         """Rows of the plain baselines beside it, in the order of `BASELINES`."""
         # A baseline that could not be fitted has a row without a value.
         beside = {row["method"]: row for row in self.rows[1:] if row["value"] is not None}
-        return [{**beside[n], "setting": n, "run": self} for n in BASELINES if n in beside]
+        return [{**beside[n], "setting": f"{n} (baseline)", "run": self} for n in BASELINES if n in beside]
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:

@@ -165,4 +165,4 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
             head = [run.setting, run.row["seed"], str(own["name"][i]), place]
             rows.append([*head, float(own[name][i]), there, float(own["confidence"][i])])
     note = "The moving end's position; the Gaussian process there shows whether it is hard for all."
-    return Table("The three worst receivers", columns, rows, note)
+    return Table("The three worst places", columns, rows, note)

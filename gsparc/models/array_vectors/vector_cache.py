@@ -75,6 +75,7 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
     if len(bad):
         more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
         log.warning(
-            "%d spectra are none that this array can make (array_position? a fault? see %s): %s%s",
-            len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
+            "%d %s cannot come from this array (array_position? a fault? see %s): %s%s",
+            len(bad), "spectrum" if len(bad) == 1 else "spectra", path.name,
+            ", ".join(names[i] for i in bad[:NAMED]), more,
         )  # fmt: skip

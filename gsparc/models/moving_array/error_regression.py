@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.models.relative_error import LEAST_ERROR, ErrorRegression
+from gsparc.models.relative_error import LEAST_ERROR, RelativeErrorRegression
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, matern32
 from gsparc.processes.stored import Stored
@@ -56,7 +56,7 @@ class ImageErrors(Stored):
     near: Tensor
     precision: Tensor
     errors: Tensor
-    regression: ErrorRegression
+    regression: RelativeErrorRegression
     kernel: Kernel
     farthest: float
     reach: float
@@ -104,7 +104,7 @@ def fit_errors(
     distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
     near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
-    regression = ErrorRegression.of(columns, relative_error)
+    regression = RelativeErrorRegression.of(columns, relative_error)
     precision, farthest = _precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M)
     return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 

@@ -140,6 +140,18 @@ class TrainedPeer(Method):
                 f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
 
+    def _own_steps(self, kind: Kind) -> int:
+        """As many as the seconds hold on the idle processor that `step_s` was measured on."""
+        assert self.budget_s is not None
+        own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
+        return max(round(own), 1)
+
+    def time_limit(self, site: Site, budget_s: float | None) -> str:
+        """See `MethodFactory.time_limit`; steps stand for the seconds."""
+        told = self.max_steps is None and site.kind in self.step_s
+        steps = f"{self._own_steps(site.kind)} steps, " if told else ""
+        return f"{steps}about {self.budget_s:g} s of an idle processor"
+
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return tensors computed from the training rows (n,) before training; stored with the weights."""
         return {}
@@ -167,8 +179,7 @@ class TrainedPeer(Method):
         self.network = self.makes(_scene(data, rows), self)
         if context.resume is not None:
             origin.require_same(read_interrupted(context.resume))
-        own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
-        module = self.module(max(round(own), 1) if asked is None else asked, context.run_dir)
+        module = self.module(self._own_steps(kind) if asked is None else asked, context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.marks())
         all_rows = Fold(rows, rows[:0], fold.test)
         trainer, batches = make_trainer(module, data, all_rows, context, files, budget)

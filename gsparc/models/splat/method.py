@@ -285,7 +285,7 @@ class LearnedField(Method):
         if not stage.steps:
             return None
         if budget.is_spent():
-            log.warning("budget_s=%.3g: none is left for gradient steps", context.budget_s)
+            log.warning("budget_s=%.3g: none is left for gradient steps", context.asked_s)
             blind = stage.name == "train" and self.choices.closed_form  # nothing shows that steps would gain
             self._paying = 0 if blind else self._paying
         if self._paying == 0:

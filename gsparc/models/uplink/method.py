@@ -14,7 +14,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.relative_error import ErrorRegression
+from gsparc.models.relative_error import RelativeErrorRegression
 from gsparc.models.uplink.error_model import SearchedSnapshots, estimate_noise
 from gsparc.models.uplink.interface import UplinkMethod, mean_power
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
@@ -51,7 +51,7 @@ class UplinkField(UplinkMethod):
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
         self.settings, self.teachers = search, teachers
         self.shrink, self.seed = shrink, seed
-        self.error_model: ErrorRegression | None = None
+        self.error_model: RelativeErrorRegression | None = None
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -69,7 +69,7 @@ class UplinkField(UplinkMethod):
         self._prepare(self.site, replace(self.settings, leakage=best))
         # The search is not fitted to training rows: their errors are unbiased.
         rows = rng.permutation(fold.train)[: self.teachers]
-        self.error_model = ErrorRegression.of(*self._training_errors(data, rows, rng, PIECES))
+        self.error_model = RelativeErrorRegression.of(*self._training_errors(data, rows, rng, PIECES))
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
         return FitReport(started.spent, (note,))
 
@@ -168,7 +168,7 @@ class UplinkField(UplinkMethod):
         self.site = site
         self._prepare(site, SearchSettings(**state["search"]))
         said = state["error_model"]
-        self.error_model = None if said is None else ErrorRegression.read(said)
+        self.error_model = None if said is None else RelativeErrorRegression.read(said)
 
     def size(self) -> int:
         """Return the number of sources of a snapshot."""

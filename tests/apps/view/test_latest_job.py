@@ -48,10 +48,10 @@ def job(done, *said, begun=None, go=None):
 def test_order(work, first, then, order):
     done, begun, go = [], threading.Event(), threading.Event()
     key, said = first
-    work.ask(key, job(done, *said, begun=begun, go=go))
+    work.put(key, job(done, *said, begun=begun, go=go))
     assert begun.wait(5)
     for key, said, urgent in then:
-        work.ask(key, job(done, *said), urgent=urgent)
+        work.put(key, job(done, *said), urgent=urgent)
     go.set()
     settle(work)
     assert done == order
@@ -64,8 +64,8 @@ def test_a_job_that_fails_does_not_end_the_others(work, caplog):
         raise ZeroDivisionError("a plane without cells")
         yield
 
-    work.ask("a", wrong)
+    work.put("a", wrong)
     settle(work)
-    work.ask("a", job(done, 1))
+    work.put("a", job(done, 1))
     settle(work)
     assert done == [1] and "a step of a failed" in caplog.text

@@ -38,7 +38,7 @@ def run(monkeypatch, tmp_path):
 class Slow(Nearest):
     """Answers as the nearest does, after a while; says that it took three times as long to train."""
 
-    effects = "sleep"
+    effects = "sleep+wake"
     seconds, query_s = 3.0, 0.004
     contexts: ClassVar[list] = []
 
@@ -68,13 +68,15 @@ class NeedsUplink(Quick):
         return super().predict(query)
 
 
-def test_variants_are_timed_in_turns_and_what_cannot_be_is_left_out(monkeypatch, run):
+def test_variants_are_timed_in_turns_and_what_cannot_be_is_left_out(monkeypatch, run, caplog):
+    caplog.set_level("INFO")
     monkeypatch.setattr(timing.time, "perf_counter", WATCH)
     made = dict(plain=Quick, slow=Slow, impossible=Impossible, needs=NeedsUplink)
     rows = run(Study(made, rounds=2, clock=CLOCK), invent("csi"), divide(48))
     found = {row.variant: row for row in rows.itertuples()}
     assert list(found) == ["plain", "slow", "needs"]
-    assert found["slow"].train_s == 3 * found["plain"].train_s and found["slow"].effects == "sleep"
+    assert found["slow"].train_s == 3 * found["plain"].train_s and found["slow"].effects == "sleep, wake"
+    assert "plain, round 1 of 2" in caplog.text, "it said plain, none, round 1"
     assert 3 < found["slow"].query_ms / found["plain"].query_ms < 4  # 4.1 ms to 1.1
     assert found["slow"].value == found["needs"].value == pytest.approx(found["plain"].value)
     assert found["plain"].spread == 0 and found["plain"].rows == 36

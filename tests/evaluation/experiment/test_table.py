@@ -1,6 +1,9 @@
 """The table says who is first, who is fast, and when a simple baseline wins."""
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from gsparc.evaluation.experiment import pictures
@@ -11,6 +14,7 @@ from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.experiment.table import (
     average_cells,
     markdown,
+    paired_gains,
     remarks,
     split_by_problem,
     table_of_cells,
@@ -41,8 +45,8 @@ TIMED = {"rfid": {"gp": Latency(2.0, 3.0, 1.5, 60), "gsparc": Latency(0.5, 0.6, 
 def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
     found = split_by_problem(average_cells(FOUND, TIMED))
     assert [(title_of(block), list(block.method)) for block in found] == [
-        ("rfid, split random, 60 s of training per model", ["gp", "gsparc", "gsrf"]),
-        ("rfid, split random, 300 s of training per model", ["gp", "gsrf"]),
+        ("rfid, split random, 60 processor seconds of training per model", ["gp", "gsparc", "gsrf"]),
+        ("rfid, split random, 300 processor seconds of training per model", ["gp", "gsrf"]),
         ("rfid, split grouped", ["gp"]),
     ]
     _, gsparc, gsrf = found[0].itertuples()
@@ -67,6 +71,8 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert "| 0.80 |" in page
     assert "| outage, Brier score |" in page and "| 0.0125 |" in page
     assert "simple baseline wins" not in page, "there are no others"
+    (said, *_) = remarks(block, "gsparc")
+    assert said.endswith("; 1.10 ± 0.06 dB before idw (standard error over the same draws)")
     assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
 
 
@@ -149,3 +155,40 @@ def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
     assert "| RMSE dB, silent too (less is better) |" in page and "gp, RMSE dB, silent too 4.20" in page
     assert "std of gp is 5 times too small" in page and "gsparc map" in page
     draw_budgets(found, tmp_path / "compare.png", "gsparc")
+
+
+def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
+    """A remark named a winner by .1 dB on 32 spectra, whose difference to the second is known to .2."""
+    ahead = np.array([1.0, 3.0, 2.0, 2.0])
+    cells = []
+    for method, level in (("gp", 28.0 + ahead), ("idw", np.full(4, 28.0))):
+        (tmp_path / method).mkdir()
+        pd.DataFrame({"row": range(4), "psnr_db": level}).to_csv(tmp_path / method / "per_sample.csv")
+        cells.append(replace(filled(method, level.mean()), folder=tmp_path / method))
+    (block,) = split_by_problem(average_cells(cells, {}))
+    (said, *_) = remarks(block, "gsparc")
+    assert "; 2.00 ± 0.41 dB before idw (standard error over the same 4 test rows)" in said
+
+
+@pytest.mark.parametrize(("figure", "column"), [("nmse", "error_power"), ("rmse_db", "error_db")])
+def test_gains_of_rows_have_the_difference_of_scores_as_their_mean(figure, column):
+    one, other = (
+        pd.DataFrame({column: np.random.default_rng(seed).exponential(seed, 50)}) for seed in (1, 2)
+    )
+    means = [(frame[column] ** (2 if figure == "rmse_db" else 1)).mean() for frame in (one, other)]
+    score = (lambda x: -(x**0.5)) if figure == "rmse_db" else (lambda x: -10 * np.log10(x))
+    gains = paired_gains(one, other, figure)
+    assert gains.mean() == pytest.approx(score(means[0]) - score(means[1])) and gains.sem() > 0
+
+
+def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
+    near = [filled("gp", 30.0), filled("gsparc", 29.0, **{"time/train_cpu_s": 4.0})]
+    draw_budgets(average_cells(near, TIMED), tmp_path / "compare.png", "gsparc")
+    figures[0].canvas.draw()
+    axes = figures[0].axes[:2]
+    assert [axis.get_title() for axis in axes] == ["rfid, random", "rfid, queries"]
+    for axis in axes:
+        low, high = axis.get_xlim()
+        assert sum(low <= tick <= high for tick in axis.get_xticks()) >= 2

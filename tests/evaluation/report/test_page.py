@@ -33,7 +33,7 @@ def written(three_for_all, tmp_path_factory):
 def test_it_writes_a_page_markdown_and_a_csv_file_per_table(written):
     facts, out = written
     text = (out / "report.html").read_text()
-    assert facts["report/runs"] == 3 and "toy, split random" in text and "The three worst receivers" in text
+    assert facts["report/runs"] == 3 and "toy, split random" in text and "The three worst places" in text
     names = {path.stem for path in out.glob("*.csv")}
     assert {"toy-split-random-results", "toy-split-random-settings-over-seeds"} <= names and len(names) >= 3
     assert (out / "report.md").read_text().count("### ") == len(names)

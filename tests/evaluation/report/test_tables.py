@@ -53,7 +53,7 @@ def test_results_have_accuracy_beside_time_memory_and_origin(three):
     assert row["commit"] == "c" * 8 and row["s simulated"] is None
     assert cells(table, 2)["points measured"] == 60
     named = [r[0] for r in table.rows]
-    assert named[3:] == ["mean", "gp"] and cells(table, 4)["query ms p50"] == 0.7
+    assert named[3:] == ["mean (baseline)", "gp (baseline)"] and cells(table, 4)["query ms p50"] == 0.7
 
 
 def test_seeds_are_put_together_with_their_spread(three):

@@ -213,9 +213,9 @@ def test_left_out_is_what_refitting_gives(correlated):
 def test_variances_have_the_digits_they_need(noise, plain):
     data, dtype = _sent(60), torch.float64 if noise < 1e-3 else torch.float32
     prior = _prior(data, mirrors=0, angles=0 if plain else 4)
-    prior = prior.changed(replace(prior[Noise], power=torch.full((1,), noise).double()))
+    prior = prior.with_terms(replace(prior[Noise], power=torch.full((1,), noise).double()))
     if plain:
-        prior = prior.changed(replace(prior[Direct], power=torch.zeros(0).double()))
+        prior = prior.with_terms(replace(prior[Direct], power=torch.zeros(0).double()))
     (known,) = conditioned(prior, data, np.arange(40)).weights
     here = SlotPlaces(known.group.slot, torch.from_numpy(data.moving[30:50]).double())
     cross = _signal(prior, here, known.group)
