@@ -213,7 +213,7 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     # All sectors of a mast in one text: one above the other the last alone would be read.
     masts, mast = np.unique(place.round(1), axis=0, return_inverse=True)
     for number, where in enumerate(masts):
-        own = np.flatnonzero(mast.reshape(-1) == number)
+        own = np.flatnonzero(mast.reshape(-1) == number).tolist()
         if np.isfinite(where).all():
             colour = "red" if set(own) & set(jumping) else "black"
             annotate(axis, ", ".join(names[t] for t in own), where, colour)

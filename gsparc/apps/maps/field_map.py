@@ -238,8 +238,7 @@ def read_loads(
         wrong = next((name for name in load if name not in {*stations, *labels}), None)
         if wrong is not None:
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
-        pairs = zip(stations, labels or stations, strict=True)
-        load = [load.get(name, load.get(label, 1.0)) for name, label in pairs]
+        load = [load.get(a, load.get(b, 1.0)) for a, b in zip(stations, labels or stations, strict=True)]
     values = finite_array(load)
     if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():
         fault = f"shares from 0 to 1 are needed: one number, or {len(stations)}, one per station"

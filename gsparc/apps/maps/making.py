@@ -324,9 +324,8 @@ def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
         return {"stations": ("",), "station_place": still[None, :2], "bands": ()}
     carrier = np.zeros(1) if stations.carrier_hz is None else stations.carrier_hz[numbers]
     several = len(np.unique(carrier)) > 1
-    called = getattr(stations, "label", None) or stations.name
     return {
-        "stations": tuple(called[number] for number in numbers),
+        "stations": tuple((stations.label or stations.name)[number] for number in numbers),
         "station_place": stations.position[numbers, :2] + site.origin[:2],
         "azimuth": np.zeros(0) if stations.sector is None else stations.sector[numbers, 0],
         "bands": tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier) if several else (),

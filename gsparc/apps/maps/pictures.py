@@ -311,8 +311,7 @@ def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: st
     left, right, low, high = placing.grid.extent
     figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
     dots = axis.scatter(*placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis")
-    of = f"the {1 - placing.refused:.0%} of the area that was tested" if placing.refused else "the area"
-    label = f"share of {of} with {threshold_db:g} {unit} or more, with a station here"
+    label = f"share of the predicted area with {threshold_db:g} {unit} or more, with a station here"
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     from_above.draw_stations(axis, placing.stations)
     from_above.draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)

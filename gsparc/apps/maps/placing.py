@@ -28,6 +28,8 @@ from gsparc.prediction.refit import Learned
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
+Levels = tuple[np.ndarray, np.ndarray]
+Candidates = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -162,11 +164,7 @@ def place_station(
     # Refused squares are left out: as unserved they would count against the stations that stand,
     # and draw a new one to where nothing was tested.
     known = np.isfinite(now.outage[grid.inside])
-    share, left_out = np.full(len(candidates), np.nan), 1 - float(known.mean())
-    found = Placement(candidates, share, share, share, np.nan, left_out, grid, still[:, :2], error, given)
-    if dry:
-        return found
-    if not known.any():
+    if not known.any() and not dry:
         raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
     old_outage, cells = now.outage[grid.inside][known], cells[known]
     # A 90 % interval of Student's t, as few stations tell the deviation: the normal's 1.645 held too little.
@@ -182,16 +180,15 @@ def place_station(
             goals[k] = np.mean(1 - np.minimum(old_outage, outage))
         return goals
 
-    scores = np.empty((len(candidates), 3))
-    for row, goals in run_each(tried, list(candidates), "candidates"):
+    scores = np.full((len(candidates), 3), np.nan)
+    for row, goals in run_each(tried, list(candidates), "candidates", wanted=lambda place: not dry):
         scores[row] = goals
-    before = float(np.mean(1 - old_outage))
+    before = np.nan if dry else float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
-    value, low, high = scores[order].T
     given = {head: words[order] for head, words in given.items()}
-    return replace(
-        found, places=candidates[order], coverage=value, low=low, high=high, before=before, given=given
-    )
+    value, low, high = scores[order].T
+    lost = 1 - float(known.mean())
+    return Placement(candidates[order], value, low, high, before, lost, grid, still[:, :2], error, given)
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
@@ -220,9 +217,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     return NewStationError(float(np.sqrt(np.mean(means**2))), within, len(means))
 
 
-def _candidates(
-    grid: Grid, sites: Any, predictor: Predictor, height: float, count: int
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Candidates:
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and is_table(sites):
         site, end = predictor.site, predictor.site.static_end or "tx"
@@ -239,12 +234,9 @@ def _candidates(
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
 
-def _new(
-    predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna
-) -> tuple[np.ndarray, np.ndarray]:
+def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna) -> Levels:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
-    sectors = antenna.sectors()
-    known = predictor.predict_new(cells, place, sectors)
+    known = predictor.predict_new(cells, place, antenna.sectors())
     if known is None and antenna.azimuth is not None:
         raise DataError(f"antenna.azimuth: {predictor.method.name} knows no patterns; model=gsparc does")
     if known is None:
@@ -252,8 +244,7 @@ def _new(
     else:
         strongest = known[0].argmax(1)[:, None]
         level, spread = (np.take_along_axis(part, strongest, 1)[:, 0] for part in known)
-    level = level + antenna.power_db
-    return np.nan_to_num(level, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
+    return np.nan_to_num(level + antenna.power_db, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 
 def assumption(site: Site, height: float, antenna: Antenna) -> str:
