@@ -14,7 +14,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared.run_lock import locked
 
 ROOT = Path(__file__).parents[2]
-FILLED = re.compile(r"own/\S+: \S+ dB after ")  # a line of each cell
+FILLED = re.compile(r"own/\S+: \S+ \S+ after ")  # a line of each cell
 
 
 def words(tmp_path, *more: str) -> list[str]:

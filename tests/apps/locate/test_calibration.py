@@ -45,7 +45,7 @@ def test_areas_hold_the_promised_share(monkeypatch):
     field = replace(Trust(1.0, 1.0, 100.0), level=0.9)
     seen = list(zip(looked(tested, cells), others, strict=True))
     held, believed = (
-        [one.posterior(how).level(place) <= how.level for one, place in seen] for how in (trust, field)
+        [one.posterior(how).mass_above(place) <= how.level for one, place in seen] for how in (trust, field)
     )
     assert 0.84 < np.mean(held) < 0.96, "within two deviations of 150 and 400 drawn places"
     assert np.mean(believed) < 0.7, "as the field itself says they would not"
