@@ -13,7 +13,7 @@ from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.making import read_place
 from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
-from gsparc.apps.view.site_view import SiteView, plane_grid
+from gsparc.apps.view.site_view import SiteView, lay_power_plane
 from gsparc.apps.view.viewed import open_model
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
@@ -60,7 +60,7 @@ def view_of(settings: dict[str, Any]) -> SiteView:
     plan = read_plan_settings(settings)
     viewed = open_model(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     at, other = (None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end"))
-    return SiteView(viewed, plan, plane_grid(viewed, settings, plan), at, other)
+    return SiteView(viewed, plan, lay_power_plane(viewed, settings, plan), at, other)
 
 
 def serve(view: SiteView, host: str, port: int) -> str:

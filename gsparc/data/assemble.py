@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.blocks import iterate_bytes, row_blocks
-from gsparc.data.checks.outliers import peak_magnitudes, too_far, too_strong
+from gsparc.data.checks.outliers import find_strong_outliers, peak_magnitudes, too_far
 from gsparc.data.errors import Problems
 from gsparc.data.schema import Measurements
 
@@ -33,12 +33,11 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Return the root mean square of rows `values` (S, ...), real or complex, in whole dB; 0 if all are zero.
 
-    This is a constant of the site, taken over all rows but those that are `too_strong` for the others:
-    rounding keeps any single row (which may be a test row) from influencing it. `weight` is a bool mask of
-    measured entries.
+    This is a constant of the site, taken over all rows but those of `find_strong_outliers`: rounding keeps any
+    single row (which may be a test row) from influencing it. `weight` is a bool mask of measured entries.
     """
     highest = peak_magnitudes(values, weight)
-    usual = ~too_strong(highest)
+    usual = ~find_strong_outliers(highest)
     peak = float(highest[usual].max(initial=0.0))
     if peak == 0.0:
         return 0.0

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
-from gsparc.data.checks.outliers import check_static_ends, peak_magnitudes, too_strong
+from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
@@ -377,7 +377,7 @@ def _scaled(
         values = 10 ** (values / 10) * (1 if mask_or_level is None else mask_or_level)
     if name == "spectrum":
         highest = peak_magnitudes(values)
-        largest = float(highest[~too_strong(highest)].max(initial=0.0))
+        largest = float(highest[~find_strong_outliers(highest)].max(initial=0.0))
         scale = 1.0 if 0.1 <= largest <= 1 else largest
     elif name == "csi":
         scale = rounded_rms(values, mask)

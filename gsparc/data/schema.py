@@ -410,10 +410,10 @@ MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
 NORMALISATIONS = ("max", "minmax", "power", "none")
 
 
-def axes_from(letter: str) -> dict[str, set[int]]:
+def list_arrays_with_axis(letter: str) -> dict[str, set[int]]:
     """Return arrays that may have a row per sample (S), station (T) or path (P), and how many axes.
 
-    >>> axes_from("T")["carrier_hz"]  # a frequency for each station
+    >>> list_arrays_with_axis("T")["carrier_hz"]  # a frequency for each station
     {1}
     """
     shapes = {name: re.findall(rf"\({letter}(,[^)]*)\)", field.shape) for name, field in FIELDS.items()}

@@ -18,13 +18,13 @@ from gsparc.data.errors import DataError, list_first, suggest_name
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
-from gsparc.data.schema import FIELDS, Stations, axes_from
+from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
 SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample or path, and how many axes they then have.
-ROW_AXES, PATH_AXES = axes_from("S"), axes_from("P")
+ROW_AXES, PATH_AXES = list_arrays_with_axis("S"), list_arrays_with_axis("P")
 # Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
 ALWAYS = ("mask", "place", "file_row",
           *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))  # fmt: skip

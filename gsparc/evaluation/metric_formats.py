@@ -91,7 +91,7 @@ def score_heading(name: str) -> str:
     return f"{heading_of(name)}{ratio}{' (less is better)' if lower_is_better(name) else ''}"
 
 
-def form_of(name: str) -> str:
+def number_format(name: str) -> str:
     """Format of its numbers."""
     return _look_up(name).form
 

@@ -19,7 +19,14 @@ from uuid import uuid4
 import numpy as np
 
 from gsparc.data.files import whole_file
-from gsparc.evaluation.metric_formats import CALIBRATION, TABLES, WITH_SILENT, form_of, main_figure, score_of
+from gsparc.evaluation.metric_formats import (
+    CALIBRATION,
+    TABLES,
+    WITH_SILENT,
+    main_figure,
+    number_format,
+    score_of,
+)
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
@@ -107,7 +114,7 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
             continue  # fitted once: its row is the method's own
         costs = [facts.get(f"{times}/{key}") for key in ("train_s", "render_ms_p50")]
         rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *values, *costs])
-    columns = [Column("method", ""), *(Column(name, form_of(name)) for name in wanted), TRAIN, P50]
+    columns = [Column("method", ""), *(Column(name, number_format(name)) for name in wanted), TRAIN, P50]
     return Table(title, columns, rows, bold=method)
 
 

@@ -121,7 +121,7 @@ class SiteView:
         return plane
 
 
-def plane_grid(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
+def lay_power_plane(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
     """Cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
     if viewed.site.kind not in MAPPED:
         return None

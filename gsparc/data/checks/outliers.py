@@ -21,7 +21,7 @@ FAR = 10.0  # times the farthest distance of the others from the median place
 FAR_M = 50.0  # and this much farther: in a small box nothing is far
 
 
-def too_strong(peaks: np.ndarray) -> np.ndarray:
+def find_strong_outliers(peaks: np.ndarray) -> np.ndarray:
     """Tell which rows (S,) have a largest magnitude, `peaks` (S,), far above all others'; no silent ones."""
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
@@ -78,7 +78,7 @@ def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
     amplitude = peak_magnitudes(data.target, data.mask)
     amplitude = np.sqrt(amplitude) if data.site.kind == "rssi" else amplitude
     rows_by_fault = {
-        "measure far more power than all others": np.flatnonzero(too_strong(amplitude)),
+        "measure far more power than all others": np.flatnonzero(find_strong_outliers(amplitude)),
         "lie far outside the region of all others": np.flatnonzero(too_far(data.moving)),
     }
     return {what: rows for what, rows in rows_by_fault.items() if len(rows)}

@@ -22,7 +22,7 @@ from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, Problems, shorten
 from gsparc.data.files import read_text
 from gsparc.data.limits import finite_array, number
-from gsparc.data.links.georeference import bad_degrees
+from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.raw import Raw
 
 CARRIER_HZ = 462.7e6
@@ -138,7 +138,7 @@ def read_station_places(path: Path) -> dict[str, tuple[float, float]]:
         degrees = finite_array(value)
         if value is not None and degrees.shape != (2,):
             problems.add(f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}")
-        elif value is not None and (fault := bad_degrees(*degrees)):
+        elif value is not None and (fault := find_invalid_coordinate(*degrees)):
             problems.add(f"{path}, {name}", fault[1])
         elif value is not None:
             places[str(name).strip()] = (degrees[0], degrees[1])

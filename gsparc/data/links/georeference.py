@@ -32,7 +32,7 @@ class Georeference:
     longitude: float
 
     def __post_init__(self) -> None:
-        fault = bad_degrees(self.latitude, self.longitude)
+        fault = find_invalid_coordinate(self.latitude, self.longitude)
         if fault is not None:
             raise DataError(f"origin: {fault[1]}")
 
@@ -44,7 +44,7 @@ class Georeference:
             DataError: no places, or a value is not in range.
         """
         latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
-        fault = bad_degrees(latitude, longitude) if latitude.size else (0, "no places")
+        fault = find_invalid_coordinate(latitude, longitude) if latitude.size else (0, "no places")
         if fault is not None:
             raise DataError(f"origin: {fault[1]}")
         # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
@@ -58,7 +58,7 @@ class Georeference:
         Raises:
             DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
         """
-        fault = bad_degrees(latitude, longitude)
+        fault = find_invalid_coordinate(latitude, longitude)
         if fault is not None:
             raise DataError(fault[1])
         there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
@@ -85,7 +85,9 @@ class Georeference:
         return np.asarray(latitude), np.asarray(longitude)
 
 
-def bad_degrees(latitude: np.ndarray | float, longitude: np.ndarray | float) -> tuple[int, str] | None:
+def find_invalid_coordinate(
+    latitude: np.ndarray | float, longitude: np.ndarray | float
+) -> tuple[int, str] | None:
     """Return the first row of (n,) [deg] that is not on Earth, and what is wrong; None when all are."""
     latitude, longitude = np.atleast_1d(latitude, longitude)
     for name, values, low, high in (("latitude", latitude, -90, 90), ("longitude", longitude, -180, 360)):

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.errors import Caution, list_first, name_row_ranges
-from gsparc.data.links.georeference import Georeference, bad_degrees
+from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
 from gsparc.data.own_checks import Checker
 from gsparc.data.selection import take_rows
 
@@ -145,7 +145,7 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(0), np.zeros(0)
     absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
     # Zeros stand in for places that nobody knows, which would be refused as no degrees.
-    fault = bad_degrees(*np.where(absent, 0, (latitude, longitude)))
+    fault = find_invalid_coordinate(*np.where(absent, 0, (latitude, longitude)))
     if fault:
         check.refuse(f"{prefix}latitude", "row {}: {}".format(*fault))
     return latitude, longitude

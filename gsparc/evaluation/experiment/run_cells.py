@@ -19,7 +19,7 @@ from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.done import State, read_finished, run_once
 from gsparc.evaluation.experiment.problem import Problem, compose
-from gsparc.evaluation.metric_formats import form_of
+from gsparc.evaluation.metric_formats import number_format
 from gsparc.evaluation.results import result_rows
 from gsparc.models.checkpoint import MODEL
 
@@ -154,7 +154,7 @@ def run_cells(
                 continue
             found[str(result.cell)] = result
             row = result.row
-            value = format(row["value"], form_of(row["figure"]))
+            value = format(row["value"], number_format(row["figure"]))
             log.info("%s: %s %s after %.1f s", result.cell, row["figure"], value, row["train_s"])
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"

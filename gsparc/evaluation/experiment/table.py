@@ -18,9 +18,9 @@ from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     DECIDING,
     WITH_SILENT,
-    form_of,
     heading_of,
     lower_is_better,
+    number_format,
     score_heading,
 )
 from gsparc.evaluation.results import score_db
@@ -39,7 +39,7 @@ BESIDE = {  # figures beside the score, by their columns
 BESIDE_COLUMNS = (
     Column("after a constant, dB", ".2f", of="after_constant"),
     Column("in 90 % interval", ".2f", of="coverage"), Column("outage, Brier score", ".4f", of="outage"),
-    Column(heading_of(CALIBRATION), form_of(CALIBRATION), of="chi2"),
+    Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2"),
 )  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5

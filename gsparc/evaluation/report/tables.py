@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, form_of, heading_of
+from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
 from gsparc.evaluation.report.runs import Run
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
@@ -69,7 +69,7 @@ def interval_over_seeds(values: Sequence[float | None]) -> Interval | None:
 
 def accuracy_column(figure: str, note: str = "") -> Column:
     """Return a test figure, with its interval."""
-    return Column(heading_of(figure), form_of(figure), note, partial(interval_of_figure, figure=figure))
+    return Column(heading_of(figure), number_format(figure), note, partial(interval_of_figure, figure=figure))
 
 
 def _figures(row: Row) -> list[str]:
@@ -90,7 +90,7 @@ def table_of_results(runs: Sequence[Run]) -> Table:
     note = "95 % interval: bootstrap over test samples"
     columns = [
         SETTING, SEED, *(accuracy_column(f, note) for f in _figures(runs[0].row)),
-        Column(heading_of(CALIBRATION), form_of(CALIBRATION), "1: deviations are right", CALIBRATION),
+        Column(heading_of(CALIBRATION), number_format(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
         Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
@@ -123,10 +123,12 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
 
 
 def _spread_columns(runs: Sequence[Run]) -> list[Column]:
-    figures = [Column(heading_of(f), form_of(f), of=f) for f in _figures(runs[0].row)]
+    figures = [Column(heading_of(f), number_format(f), of=f) for f in _figures(runs[0].row)]
     if any(run.row["alone"] is not None for run in runs):
         deciding = runs[0].row["figure"]
-        figures.append(Column(f"{heading_of(deciding)} of Gaussians alone", form_of(deciding), of="alone"))
+        figures.append(
+            Column(f"{heading_of(deciding)} of Gaussians alone", number_format(deciding), of="alone")
+        )
     return [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.links.georeference import Georeference, bad_degrees
+from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
 from gsparc.simulate.scenes.solid import Solid, sheet
 
 LEVEL_M = 3.0  # of a storey
@@ -82,7 +82,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     if not shapes:
         raise ValueError(f"scene.file={path}: no building in it; expected ways or relations with building=*")
     degrees = np.concatenate([np.array(shape.exterior.coords)[:, :2] for shape, _ in shapes])
-    fault = bad_degrees(degrees[:, 1], degrees[:, 0])
+    fault = find_invalid_coordinate(degrees[:, 1], degrees[:, 0])
     if fault is not None:
         raise ValueError(f"scene.file={path}: {fault[1]}")
     origin = Georeference.about(degrees[:, 1], degrees[:, 0])

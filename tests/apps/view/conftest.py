@@ -8,7 +8,7 @@ import pytest
 from campaigns import brief, compose, spectra
 from towns import town_model
 
-from gsparc.apps.view.site_view import SiteView, plane_grid
+from gsparc.apps.view.site_view import SiteView, lay_power_plane
 from gsparc.apps.view.viewed import open_model
 from gsparc.commands.train import train
 
@@ -31,4 +31,4 @@ def spectrum_view() -> SiteView:
 def power_view() -> SiteView:
     """A model of powers of two stations."""
     viewed = open_model(town_model())
-    return SiteView(viewed, grid=plane_grid(viewed, {"area": [0, 0, 80, 60], "step_m": 2.0}))
+    return SiteView(viewed, grid=lay_power_plane(viewed, {"area": [0, 0, 80, 60], "step_m": 2.0}))

@@ -7,7 +7,7 @@ from towns import trained
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import predict_answer
 from gsparc.apps.view.plane import plane_sheet, refine_plane, weakest_place
-from gsparc.apps.view.site_view import plane_grid
+from gsparc.apps.view.site_view import lay_power_plane
 from gsparc.apps.view.viewed import open_model
 
 
@@ -43,7 +43,7 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
 def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):
     """It was of the mean alone: up to 24 dB below the answer where the mean fades and the error does not."""
     viewed = open_model(trained(channels(tmp_path / "room.npz", shape="S"), "gp"))
-    *_, plane = refine_plane(viewed.predictor_of(None), plane_grid(viewed, {"step_m": 0.5}))
+    *_, plane = refine_plane(viewed.predictor_of(None), lay_power_plane(viewed, {"step_m": 0.5}))
     said = [predict_answer(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()]
     assert any(one.response is not None and one.spread_db > 2 for one in said)
     np.testing.assert_allclose(plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3)

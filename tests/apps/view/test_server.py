@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from towns import trained
 
-from gsparc.apps.view.site_view import SiteView, plane_grid
+from gsparc.apps.view.site_view import SiteView, lay_power_plane
 from gsparc.apps.view.viewed import open_model
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
@@ -132,7 +132,7 @@ def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
     file = tmp_path / "both.npz"
     np.savez(file, tx_position=ends[0], rx_position=ends[1], rssi_db=power, carrier_hz=1e9)
     viewed = open_model(trained(file, "idw"))
-    session = visit(SiteView(viewed, grid=plane_grid(viewed, {"step_m": 2.0})))
+    session = visit(SiteView(viewed, grid=lay_power_plane(viewed, {"step_m": 2.0})))
     settle(session)
     before = session.plane.level_db
     drag(session, "rx", [1.0, 1.0, 1.0])

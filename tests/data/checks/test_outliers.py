@@ -6,7 +6,7 @@ from campaigns import channels, powers, spectra
 from releases import real
 
 from gsparc.commands.check import main as check
-from gsparc.data.checks.outliers import find_outliers, too_far, too_strong
+from gsparc.data.checks.outliers import find_outliers, find_strong_outliers, too_far
 from gsparc.data.load import load, split_for
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
@@ -93,10 +93,10 @@ def test_rows_to_leave_out_may_be_numbers_of_numpy(rows, tmp_path):
 def test_real_dynamics_are_no_outliers():
     """Free space from 3 cm to 30 m is 60 dB, and a silent half leaves nothing suspicious."""
     distance = np.geomspace(0.03, 30, 200)
-    assert not too_strong(1 / distance).any()
-    assert not too_strong(np.where(np.arange(200) % 2, 1 / distance, 0)).any()
-    assert not too_strong(np.zeros(9)).any()
-    assert too_strong(np.append(1 / distance, 1e12)).nonzero()[0].tolist() == [200]
+    assert not find_strong_outliers(1 / distance).any()
+    assert not find_strong_outliers(np.where(np.arange(200) % 2, 1 / distance, 0)).any()
+    assert not find_strong_outliers(np.zeros(9)).any()
+    assert find_strong_outliers(np.append(1 / distance, 1e12)).nonzero()[0].tolist() == [200]
     track = np.stack([np.linspace(0, 5e3, 300), np.zeros(300), np.zeros(300)], 1)
     assert not too_far(track).any() and not too_far(np.zeros((5, 3))).any()
 
@@ -113,8 +113,8 @@ def test_a_row_beyond_float32_is_refused(tmp_path):
 def test_rows_with_signal_are_no_outliers_among_rows_without(others):
     """Where most rows stood at a floor, all rows with signal were called outliers and left out of scale."""
     heard = np.linspace(-95, -50, 40)
-    assert not too_strong(10 ** (np.concatenate([others, heard]) / 20)).any()
-    assert too_strong(10 ** (np.append(heard, 20.0) / 20)).sum() == 1
+    assert not find_strong_outliers(10 ** (np.concatenate([others, heard]) / 20)).any()
+    assert find_strong_outliers(10 ** (np.append(heard, 20.0) / 20)).sum() == 1
 
 
 def test_a_robot_that_waits_makes_no_outliers():
@@ -129,4 +129,4 @@ def test_a_robot_that_waits_makes_no_outliers():
 def test_passing_a_station_is_no_outlier():
     """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
     for column in arrays_of(real("real/powder-rss-462mhz.npz"))["rssi_db"].T:
-        assert not too_strong(10 ** (column[np.isfinite(column)] / 20)).any()
+        assert not find_strong_outliers(10 ** (column[np.isfinite(column)] / 20)).any()
