@@ -33,8 +33,8 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Return the root mean square of rows `values` (S, ...), real or complex, in whole dB; 0 if all are zero.
 
-    This is a constant of the site, taken over all rows but those of `find_strong_outliers`: rounding keeps any
-    single row (which may be a test row) from influencing it. `weight` is a bool mask of measured entries.
+    This is a constant of the site, taken over all rows but those of `find_strong_outliers`: rounding keeps
+    any single row (which may be a test row) from influencing it. `weight` is a bool mask of measured entries.
     """
     highest = peak_magnitudes(values, weight)
     usual = ~find_strong_outliers(highest)
