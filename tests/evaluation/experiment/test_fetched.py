@@ -24,6 +24,6 @@ def test_a_fetched_set_needs_no_path(monkeypatch, tmp_path, caplog):
     GlobalHydra.instance().clear()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         problems = load_every_problem(settings)
-    assert [one.split for one in problems] == ["redrawn"] * 5
-    assert {one.draw for one in problems} == set(range(5)) and len(problems[0].data) == 433
+    assert [one.split for one in problems] == ["redrawn"] * 10
+    assert {one.draw for one in problems} == set(range(10)) and len(problems[0].data) == 433
     assert "or gsparc data" in caplog.text  # of the other sets
