@@ -103,7 +103,7 @@ def table_of_results(runs: Sequence[Run]) -> Table:
         "Brackets: 95 % intervals over test samples (independent samples assumed). Baselines are timed "
         "in turns within a run, the models of a sweep alone after it."
     )
-    return Table.of("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
+    return Table.from_rows("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
 
 
 def table_of_seeds(runs: Sequence[Run]) -> Table:

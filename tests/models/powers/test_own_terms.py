@@ -93,7 +93,7 @@ def test_stations_say_one_weight_of_all():
     rng = np.random.default_rng(0)
     told = rng.normal(-3.0, np.hypot(0.5, 1.0), 12)  # 1 dB between stations beside what each is unsure of
     numbers = [np.array([[weight], [0.5], [0.0], [5.0]]) for weight in told]
-    alone = [own_terms.LearnedWeights.of("Wood", one) for one in numbers]
+    alone = [own_terms.LearnedWeights.from_numbers("Wood", one) for one in numbers]
     (line,) = set(own_terms.over_stations(["a law", *alone]).values())
     mean, error = line.numbers[:2, 0]
     assert abs(mean + 3.0) < 3 * error and 0.2 < error < 0.5
