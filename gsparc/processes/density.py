@@ -120,7 +120,7 @@ class Profiled(torch.autograd.Function):
 def covariance_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> Tensor:
     """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
 
-    >>> covariance_of(Kernel.of_one(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
+    >>> covariance_of(Kernel.from_length(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
     tensor([[1.5000]], dtype=torch.float64)
 
     Args:

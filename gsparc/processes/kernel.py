@@ -295,7 +295,7 @@ class Kernel(Stored):
     def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
         """Return bounds of the parameters, for rows at distances (...) [m].
 
-        >>> [round(low, 2) for low, _ in Kernel.of_one(1.0, 1.0).bounds(torch.tensor([10.0]))]
+        >>> [round(low, 2) for low, _ in Kernel.from_length(1.0, 1.0).bounds(torch.tensor([10.0]))]
         [-4.61, -13.82]
         """
         # All rows may stand at one place, whose distances are 0.

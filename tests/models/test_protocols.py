@@ -129,7 +129,7 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     told = again.predict(query)
     for part in ("mean", "confidence", "variance"):
         torch.testing.assert_close(getattr(told, part), getattr(said, part))
-    assert again.size() == method.count_components()
+    assert again.count_components() == method.count_components()
 
 
 @pytest.mark.parametrize(

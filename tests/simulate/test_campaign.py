@@ -290,7 +290,7 @@ class Rays(ShoeboxEngine):
 
     random, samples, off = True, None, 1.05
 
-    def thinned(self, samples):
+    def with_samples(self, samples):
         other = Rays(self.room, self.transmitter, LIGHT / self.wavelength)
         other.samples = samples
         return other
@@ -345,7 +345,7 @@ def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
         choice = real(*arguments)
         return replace(choice, verdict=replace(choice.verdict, kept=False, met=0.9))
 
-    monkeypatch.setattr(deciding.auto, "verify", refuted)
+    monkeypatch.setattr(deciding.auto, "verify_choice", refuted)
     settings = replace(FEW_PROBES, full=full)
     outcome = simulate(plan(effects=settings), tmp_path / "box.h5")
     assert outcome.effects == outcome.choice.effects == full

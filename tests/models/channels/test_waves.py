@@ -222,7 +222,7 @@ def test_variances_have_the_digits_they_need(noise, plain):
     white = torch.linalg.solve_triangular(known.given.factor.lower, cross.mH, upper=False)
     exact = white.abs().square().sum(0)
     assert known.root.dtype == (dtype if plain else dtype.to_complex())
-    assert (known.learned(cross) - exact).abs().max() < 2e-3 * noise + 1e-10
+    assert (known.explained_variance(cross) - exact).abs().max() < 2e-3 * noise + 1e-10
 
 
 def test_directions_in_blocks_are_those_at_once(monkeypatch):
