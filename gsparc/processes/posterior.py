@@ -33,7 +33,7 @@ class Exact(Posterior):
     >>> places = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)  # on a line [m]
     >>> posterior = Exact.from_values(prior, places, places.sin())
     >>> answer = posterior.answer(torch.tensor([[1.0], [90.0]], dtype=torch.float64))
-    >>> answer.mean[:, 0].round(decimals=1), answer.left.round(decimals=1)  # at a row, and far away
+    >>> answer.mean[:, 0].round(decimals=1), answer.variance.round(decimals=1)  # at a row, far away
     (tensor([0.8000, 0.0000], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
 
     Attributes:

@@ -28,7 +28,7 @@ class Streets:
 
     >>> block, none = np.array([[[10.0, -5.0], [20.0, 5.0]]]), np.zeros(0)
     >>> streets = Streets(block, np.array([-0.8]), np.zeros((0, 3)), none, none, base=np.zeros(3))
-    >>> streets.are_blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))  # behind the block, beside it
+    >>> streets.are_blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))  # behind it, beside it
     array([ True, False])
 
     Attributes:
