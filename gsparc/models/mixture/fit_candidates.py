@@ -85,7 +85,8 @@ def fit_candidates(
                 field = parts[name](settings, clutter, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             fields[name] = field
-            if name not in OPEN_ENDED:
+            # Every group costs a fit: when the seconds are over, validation rows alone weigh solutions.
+            if name not in OPEN_ENDED and not budget.is_spent():
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
                 target = in_error_unit(data.batch(field.held.rows).target, data.site)
