@@ -28,7 +28,7 @@ template <class S, class From> KernelSettings<S> in_precision(const KernelSettin
 }
 
 constexpr int kRecord = 12;     // scalars of one footprint, see pixels.h
-constexpr int kMoments = 9;     // scalars of Moments
+constexpr int kMoments = 8;     // scalars of Moments
 constexpr int kLanes = 16;      // most pixels done at a time by any instruction set
 
 // What a plan returns of a pose, and of equal ids at one distance; of a Gaussian 4 i + parameter.
@@ -63,8 +63,8 @@ template <class S> struct PlanView {
 };
 
 template <class S> struct Model {
-    const S *means, *quats, *scales, *opacities, *extinctions;  // extinctions may be null
-    const S *positions, *rotations;                             // (P, 3), (P, 3, 3)
+    const S *means, *quats, *scales, *opacities;
+    const S *positions, *rotations;  // (P, 3), (P, 3, 3)
 };
 
 // One call of a kernel from Python; `Call` of calls.py has the same fields. What sizes, numbers and tensors mean is the
@@ -91,7 +91,7 @@ struct Reader {
 
 template <class S> Model<S> read_model(Reader& in) {
     Model<S> m;
-    in.read(m.means, m.quats, m.scales, m.opacities, m.extinctions, m.positions, m.rotations);
+    in.read(m.means, m.quats, m.scales, m.opacities, m.positions, m.rotations);
     return m;
 }
 

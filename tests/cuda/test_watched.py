@@ -99,7 +99,7 @@ def everything(dtype: torch.dtype) -> None:
     """Each kernel: both projections, one pose and several, few and many channels, long and short lists."""
     for projection in ("tangent", "equirect"):
         for count in (0, 3):
-            scene = random_scene(n=30, hides=True).to(dtype)
+            scene = random_scene(n=30).to(dtype)
             render(scene, poses(count), GRIDS["patch"], projection=projection)
         scene = random_scene(n=150, seed=12, size=1.5).to(dtype)
         model = (scene.means, scene.quats, scene.scales, 0.3 * scene.opacities)
