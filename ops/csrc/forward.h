@@ -25,16 +25,16 @@ template <class S> struct WeightArgs : ViewArgs<S> {
 };
 
 // No std::integral_constant: nothing of the standard library is compiled per instruction set.
-template <class T, T kValue> struct Constant {
-    static constexpr T value = kValue;
+template <int kValue> struct Constant {
+    static constexpr int value = kValue;
 };
 
 // Calls run(P, kChannels) with both as constants; kChannels 0 stands for any number.
 template <class F> inline void with_switches(int projection, int channels, F run) {
     with_projection(projection, [&](auto p) {
-        if (channels == 1) run(p, Constant<int, 1>());
-        else if (channels == 2) run(p, Constant<int, 2>());
-        else run(p, Constant<int, 0>());
+        if (channels == 1) run(p, Constant<1>());
+        else if (channels == 2) run(p, Constant<2>());
+        else run(p, Constant<0>());
     });
 }
 

@@ -6,7 +6,7 @@ from compute_kernels import KIND_SHAPES, assert_equals_reference
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render, truth
 
 from gsparc.field.losses import _Kernel
-from gsparc.ops import SphereGrid, calls, cuda, freeze, make_plan, networks, operators, rasterize, similarity
+from gsparc.ops import SphereGrid, calls, cuda, freeze, make_plan, networks, operators, rasterize
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 
@@ -81,13 +81,6 @@ def test_similarity_of_flat_images_stays_finite(where):
     value = _Kernel.apply(leaf, b)
     value.sum().backward()
     assert abs(float(value.detach()) - 1) < 1e-5 and torch.isfinite(leaf.grad).all()
-
-
-@pytest.mark.parametrize("taps", [[0.2, 0.5, 0.3], [1 / 13] * 13], ids=["askew", "wide"])
-def test_windows_that_the_kernel_does_not_take_are_refused(where, taps):
-    images = torch.rand(1, 20, 20)
-    with pytest.raises(ValueError, match="symmetric and has at most 11 taps"):
-        similarity.similarity_op(images, images, taps, [1e-4, 9e-4], True)
 
 
 def test_more_positions_than_a_grid_has_rows(where):
