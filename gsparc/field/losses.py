@@ -39,7 +39,7 @@ class LossSettings(Checked):
     snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
-def _written_out(prediction: Tensor, target: Tensor) -> Tensor:
+def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean SSIM (B,) of images (B, H, W) that no kernel serves."""
     # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
     shift = target.mean(dim=(-2, -1), keepdim=True)
@@ -55,7 +55,7 @@ def _written_out(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 class _Kernel(torch.autograd.Function):
-    """`_written_out` as a kernel for float32 images, with its gradient."""
+    """`_ssim_by_convolution` as a kernel for float32 images, with its gradient."""
 
     @staticmethod
     def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
     kernel = prediction.dtype == target.dtype and has_similarity_kernel(prediction)
     kernel = kernel and not target.requires_grad and not carries_tangent(target)  # it knows one slope
-    return (_Kernel.apply if kernel else _written_out)(prediction, target)
+    return (_Kernel.apply if kernel else _ssim_by_convolution)(prediction, target)
 
 
 def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
