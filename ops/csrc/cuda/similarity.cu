@@ -127,7 +127,7 @@ extern "C" int64_t gsparc_similarity(const gsparc::Call* call) {
     int64_t samples;
     in.sizes(samples, a.height, a.width);
     a.c1 = float(call->numbers[0]), a.c2 = float(call->numbers[1]);
-    for (int k = 0; k < kTaps; ++k) a.taps[k] = float(call->numbers[2 + (k <= kRadius ? k : 2 * kRadius - k)]);
+    for (int k = 0; k < gsparc::kTaps; ++k) a.taps[k] = float(call->numbers[2 + (k <= gsparc::kRadius ? k : 2 * gsparc::kRadius - k)]);
     in.read(a.prediction, a.target, a.shift, a.sums, a.slope);
     Arena arena(reinterpret_cast<void*>(uintptr_t(call->scratch)));
     a.by = a.slope ? arena.take<float>(kDerivatives * samples * a.places()) : nullptr;
