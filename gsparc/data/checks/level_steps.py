@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.data.errors import DataError
 from gsparc.processes.factor import Factor
 
 MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
@@ -57,13 +56,7 @@ def detect_level_steps(
         level_db: (n,) [dB], NaN where there is none.
         station_position: (2,) or (3,) [m]; None: the level is not tied to a distance.
         most_blocks: rows are averaged to at most so many (median), against outliers and for speed.
-
-    Raises:
-        DataError: shapes that do not fit, or positions that are not finite.
     """
-    position, level_db = np.asarray(position, np.float64), np.asarray(level_db, np.float64)
-    if position.ndim != 2 or level_db.shape != position.shape[:1] or not np.isfinite(position).all():
-        raise DataError("level_steps: expected finite positions (n, 2) or (n, 3) and as many levels")
     rows = np.flatnonzero(np.isfinite(level_db))
     if len(rows) < LEAST_ROWS or not np.ptp(position[rows], axis=0).any():
         return ()
