@@ -54,7 +54,8 @@ class Located:
     @classmethod
     def of(cls, posterior: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Self:
         """Return what is known at a place (3,) [m, local], with the area of cells of a mass `level`."""
-        area = float(posterior.cells.size[posterior.densest_cells(level)].sum())
+        size = posterior.cells.size
+        area = float(size[densest_cells(posterior.log_density, size, level)].sum())
         return cls(place, area, len(posterior.modes(level)), posterior, seconds)
 
 
