@@ -12,7 +12,7 @@ PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0
 def gaussians(cells, middles, width=0.2):
     apart = np.linalg.norm(cells.centre[:, None, :2] - np.asarray(middles, float), axis=2)
     density = np.log(np.exp(-0.5 * (apart / width) ** 2).sum(1) + 1e-30)
-    return Posterior(cells, density - np.log((np.exp(density) * cells.size).sum()))
+    return Posterior(cells, density - np.log((np.exp(density) * cells.volume).sum()))
 
 
 def test_cells_cover_the_plane_that_was_walked():
