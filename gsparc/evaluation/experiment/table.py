@@ -50,14 +50,10 @@ GROUP = [*PROBLEM, "budget_s", "method"]
 CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
     *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
-    "behind_error_db", *BESIDE, "second", "second_value", "train_s",
+    "behind_error_db", *BESIDE, "second_figure", "second_value", "train_s",
     "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
 ]  # fmt: skip
-CSV = [
-    *GROUP, "score_db", "score_error_db", "score_std_db", "seeds", "draws", "figure", "value", "value_error",
-    "behind_db", "behind_error_db", *BESIDE, "second_figure", "second_value", "train_s", "train_cpu_s",
-    "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
-]  # fmt: skip
+CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spread_db` by what it is
 
 
 def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
@@ -69,7 +65,7 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         label = str(own["label"] or "")
         rows.append({
             **own, **asdict(one.cell), "folder": one.folder, "draws": one.drawn, "score_db": score_db(own),
-            "second": second, "second_value": own.get(second),
+            "second_figure": second, "second_value": own.get(second),
             **{name: own.get(key) for name, key in BESIDE.items()},
             "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
@@ -113,7 +109,7 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     groups = cells.groupby(GROUP, dropna=False, sort=False)
     means = ["score_db", "value", "behind_db", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
-    rows[["figure", "second", "folder"]] = groups[["figure", "second", "folder"]].first()
+    rows[["figure", "second_figure", "folder"]] = groups[["figure", "second_figure", "folder"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
     rows["by_draw"] = groups[["seed", "score_db"]].apply(lambda own: dict(own.itertuples(index=False)))
     rows["draws"] = several
@@ -154,8 +150,8 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
 
 def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
     """Return the columns of `compare.csv`, with the signs of the tables and errors by what they are."""
-    several, own = rows.draws.astype(bool), rows.rename(columns={"second": "second_figure"})
-    columns = own.assign(
+    several = rows.draws.astype(bool)
+    columns = rows.assign(
         score_db=[shown(*one) for one in zip(rows.figure, rows.score_db, strict=True)],
         score_error_db=rows.spread_db.where(several), score_std_db=rows.spread_db.where(~several),
         draws=rows.seeds.where(several, 1), seeds=rows.seeds.where(~several, 1),
@@ -259,7 +255,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (True, Column(score_heading(figure), ".2f", of=_score)),
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
-        (True, Column(block.second.iloc[0], of="second_value")),
+        (True, Column(block.second_figure.iloc[0], of="second_value")),
         *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),

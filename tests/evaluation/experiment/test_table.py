@@ -145,7 +145,7 @@ def test_lists_were_compared_by_their_listed_rows_alone():
     found = [filled(m, e, 0, kind="rssi", **{"test/rmse_db_with_silent": silent}) for m, e, silent in errors]
     (block,) = split_by_problem(average_cells(found, {}))
     first = next(block.itertuples())
-    assert (first.method, first.figure, first.second) == ("gsparc", "rmse_db_with_silent", "rmse_db")
+    assert (first.method, first.figure, first.second_figure) == ("gsparc", "rmse_db_with_silent", "rmse_db")
 
 
 def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
