@@ -39,8 +39,10 @@ class Lead:
     @staticmethod
     def from_facts(facts: Mapping[str, Any], stem: str) -> Lead | None:
         """Return what `facts` stored under `stem`; None where a summary has none."""
-        known = [facts.get(f"{stem}{key}") for key in ("_db", "_error_db", "_pairs")]
-        return None if None in known else Lead(float(known[0]), float(known[1]), str(known[2]))
+        ahead, error = facts.get(f"{stem}_db"), facts.get(f"{stem}_error_db")
+        if ahead is None or error is None:
+            return None
+        return Lead(ahead, error, str(facts.get(f"{stem}_pairs")))
 
     def facts(self) -> dict[str, Any]:
         """Return it as values of a summary, by the ends of their names."""

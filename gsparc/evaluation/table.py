@@ -101,7 +101,7 @@ class Table:
     ends: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_rows(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: str) -> Table:
+    def from_rows(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: Any) -> Table:
         """Return a row per result; `more` are `note` and `bold`."""
         return cls(title, columns, [[column.value(row) for column in columns] for row in results], **more)
 

@@ -189,6 +189,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if len(rows) > 1 and (lead := leads[rows[1].method]):
         before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
+        lines[0] += "" if lead.sure or lead.same else ": they do not differ"
     own = next((row for row in rows if row.method == ours), None)
     lead = None if own is None else leads.get(own.method)
     figure = heading_of(first.figure)
@@ -209,9 +210,10 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
         lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
     for row in rows[1:]:
-        better = own is not None and row.method in SIMPLE and row.score_db > own.score_db
-        ahead = _lead(row, own) if better else None
-        if better and (ahead is None or ahead.sure):
+        if own is None or row.method not in SIMPLE or row.score_db <= own.score_db:
+            continue
+        ahead = _lead(row, own)
+        if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
     spent = [
         f"{row.method} {row.train_cpu_s:.3g}"
