@@ -69,7 +69,7 @@ class CostLedger(L.Callback):
         if trainer.is_global_zero and trainer.global_step:
             # Rows after the checkpoint are of steps that are taken again.
             self._rows = [row for row in self._rows if int(row["step"]) <= trainer.global_step]
-            curve.write(module.run_dir, self._rows)
+            curve.write_curve(module.run_dir, self._rows)
         self._start()
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
@@ -104,8 +104,8 @@ class CostLedger(L.Callback):
             **shown, **({} if loss is None else {"train/task_loss": float(loss)}),
         )  # fmt: skip
         self._rows.append(row)
-        curve.write(module.run_dir, self._rows)
-        curve.log(trainer.loggers, row)
+        curve.write_curve(module.run_dir, self._rows)
+        curve.log_row(trainer.loggers, row)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the time and the curve so far, so that a resumed run goes on with both."""

@@ -24,14 +24,11 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Gather, resample, write; returns the facts of `summary.json`."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     settings = to_dict(config)
     evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
-    # Refused here, before hundreds of draws would fail in the same way.
-    if config.confidence != "auto" and config.confidence not in evidence.scores:
-        raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
     divisions = [run_trials(evidence, promise, "random", *draws)]
@@ -85,8 +82,8 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     kept = f"of accepted answers at most {facts['promise/alpha']:.0%} have an error above"
     promise = f"Is the promise kept, {kept} {facts['promise/limit_db']:g} dB? By random calibration sets"
     return [
-        Table.of(heading, curves, [row for row in kinds if "area" in row]),
-        Table.of(promise, draws, [row for row in trials_of if "coverage" in row]),
+        Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
+        Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row]),
     ]
 
 

@@ -366,7 +366,7 @@ def collect_evidence(
 
 
 def calibrate_and_store(
-    path: str, dataset: dict[str, Any], split: dict[str, Any], promise: Guarantee, kind: str, spatial: bool,
+    path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: Guarantee, kind: str, spatial: bool,
     seed: int, apart_m: float = 0.0,
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
@@ -376,11 +376,11 @@ def calibrate_and_store(
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
     how = kind, spatial, seed, apart_m
-    kind_used, choice, _, _ = calibrate_threshold(evidence, promise, *how, tested=False)
+    kind_used, choice, _, _ = calibrate_threshold(evidence, guarantee, *how, tested=False)
     threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
     box = confidence.calibrated_box(known, evidence.position)
-    stored = confidence.Trusted(kind_used, threshold, promise, known, kernel, box)
+    stored = confidence.Trusted(kind_used, threshold, guarantee, known, kernel, box)
     earlier = confidence.read_trusted(run.stored[0].extra)
     before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
@@ -391,21 +391,20 @@ def calibrate_and_store(
     else:
         confidence.store_trusted(path, stored)
     if np.isfinite(threshold):
-        of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
+        of = f"at most {guarantee.alpha:.0%} of these are worse than {guarantee.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
-    wrong, limit = promise.is_bad(evidence.error), f"{promise.limit_db:g} dB"
+    wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
     effect = design_effect(wrong, number_patches(evidence.position)) if spatial else 1.0
     bad = float(wrong.mean())
-    few = explain_too_few(len(evidence), promise, bad, effect)
-    if few is not None:
+    if few := explain_too_few(len(evidence), guarantee, bad, effect):
         return stored, f"{kind_changed}no threshold keeps the bound: {few}"
-    other = relax_guarantee(evidence, promise, *how)
+    other = relax_guarantee(evidence, guarantee, *how)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
     )
     reason = "the others are not told from them surely enough"
-    if bad < promise.alpha:
-        reason = f"that no more than alpha={promise.alpha:g} are is not sure of so few"
+    if bad < guarantee.alpha:
+        reason = f"so few do not show that at most alpha={guarantee.alpha:g} are"
     return stored, (
         f"{kind_changed}no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse "
         f"than {limit}, and {reason}; {hint} kept, more training rows may help"

@@ -22,7 +22,7 @@ DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in t
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
 
 
-def _written_out(prediction: Tensor, target: Tensor) -> Tensor:
+def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean SSIM (B,) of images (B, H, W) that no kernel serves."""
     # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
     shift = target.mean(dim=(-2, -1), keepdim=True)
@@ -38,7 +38,7 @@ def _written_out(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 class _Kernel(torch.autograd.Function):
-    """`_written_out` as a kernel for float32 images, with its gradient."""
+    """`_ssim_by_convolution` as a kernel for float32 images, with its gradient."""
 
     @staticmethod
     def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
     kernel = prediction.dtype == target.dtype and has_similarity_kernel(prediction)
     kernel = kernel and not target.requires_grad and not carries_tangent(target)  # it knows one slope
-    return (_Kernel.apply if kernel else _written_out)(prediction, target)
+    return (_Kernel.apply if kernel else _ssim_by_convolution)(prediction, target)
 
 
 def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:

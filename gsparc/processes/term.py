@@ -38,7 +38,7 @@ class Term(Stored, ABC, Generic[Rows]):
         """Return bounds of each parameter, for rows whose distances are about `scale` [m]."""
         return []
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """Return the term with other parameters (p,), through which gradients flow."""
         return self
 

@@ -67,7 +67,7 @@ def test_the_curve_has_accuracy_beside_seconds(clock, module):
         clock.value += 2
         bill.on_validation_start(run, module)
         bill.on_validation_end(run, module)
-    rows = curve.read(module.run_dir)
+    rows = curve.read_curve(module.run_dir)
     assert [row["seconds"] for row in rows] == ["0.0", "2.0", "4.0"]
     assert [row["what"] for row in rows] == ["start", "step 7", "step 14"]
     assert rows[0]["val/psnr_db"] == "21.5" and rows[0]["error"] == "0.25"
@@ -85,7 +85,7 @@ def test_the_curve_of_a_resumed_run_ends_with_its_checkpoint(clock, module):
     again, run.global_step = CostLedger(), 7
     again.load_state_dict(state)
     again.on_train_start(run, module)
-    assert [row["step"] for row in curve.read(module.run_dir)] == ["7"]
+    assert [row["step"] for row in curve.read_curve(module.run_dir)] == ["7"]
 
 
 def test_a_resumed_run_keeps_counting_and_an_exception_stops_the_watch(clock):

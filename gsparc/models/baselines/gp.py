@@ -93,10 +93,10 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
-        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
+        return Kernel.from_length(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
-    starts = [Kernel.of_one(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
+    starts = [Kernel.from_length(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
     distance = distances(places, places)
     # The figures move by 1e-4 beyond this.
@@ -141,7 +141,8 @@ class GaussianProcess(Differentiable, ClosedForm):
             thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
             looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
-        self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
+        at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
+        self.scores = Exact.from_values(Prior(kernel), at, scores)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
         notes = [f"gp: length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"]
@@ -178,7 +179,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return None if self.powers is None else self.powers.exact()
+        return None if self.powers is None else self.powers.with_exact_posterior()
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
@@ -197,8 +198,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
         mean = self._composed(result.mean, dtype)
         # What the components leave out is an error of every prediction.
-        variance = (kernel.amplitude * result.left + self.lost).to(dtype)
-        unknown = (result.left / (1 + kernel.noise)).to(dtype)
+        variance = (kernel.amplitude * result.variance + self.lost).to(dtype)
+        unknown = (result.variance / (1 + kernel.noise)).to(dtype)
         return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
 
     def mean_at(self, query: Query) -> Tensor:
@@ -272,7 +273,7 @@ def choose_nearest_kernel(
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     once = torch.ones(rows.shape, dtype=torch.float64)
-    sample = NeighbourSample.of(torch.from_numpy(places[rows]), values, once)
+    sample = NeighbourSample.from_rows(torch.from_numpy(places[rows]), values, once)
     result = fit_kernel_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"

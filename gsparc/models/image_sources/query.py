@@ -92,7 +92,7 @@ class EnsembleMeans:
         return torch.addcmul(decay, root, decay)
 
     @cached_property
-    def exact(self) -> EnsembleMeans:
+    def in_float64(self) -> EnsembleMeans:
         """The same in float64."""
         return to_double(self)
 

@@ -86,7 +86,7 @@ class ComplexGaussians(GaussianNetwork):
         sent = self.radiance(tx, rx)[0].norm(dim=1)
         return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
-    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
         seen = self(batch.tx, batch.rx)
         plain = task_loss(seen, batch, self).mean()

@@ -54,7 +54,7 @@ class Scene:
     def receiver(self) -> Pose | None:
         """Pose of the static receiver; None when it moves."""
         moves = self.site.static_end == "tx" or self.site.static_position is None
-        return None if moves else Query.at(self.site, self.box).rx
+        return None if moves else Query.from_places(self.site, self.box).rx
 
     @property
     def reach(self) -> float:
@@ -79,8 +79,8 @@ class Network(nn.Module):
         super().__init__()
         self.scene, self.count = scene, count
 
-    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Return the training loss () of a batch; `draw` for whatever is drawn at random."""
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Return the training loss () of a batch; `generator` for whatever is drawn at random."""
         return task_loss(self(batch.tx, batch.rx), batch, self).mean()
 
     @torch.no_grad()
@@ -170,7 +170,7 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
-        origin = Origin.of(data, fold, context)
+        origin = Origin.from_fit(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
         asked = requested_steps(context, len(rows), self.max_steps)
         budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
@@ -208,7 +208,7 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.network
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of Gaussians or virtual transmitters; 0 without, and before `fit`."""
         return 0 if self.network is None else self.network.count
 
