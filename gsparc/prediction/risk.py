@@ -26,9 +26,9 @@ RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
 # Thresholds that are tried: more of them resolve finer, but each one may end the search.
 LEVELS = 50
-# Logistic curves of bad by rank, all equally likely before positions are seen: slopes and offsets.
-CURVES = np.array([0, 1, 2, 4, 8])[:, None, None], np.linspace(-6, 6, 25)[:, None]
-NEARLY_BEST = 0.95  # of the best level's chance to pass: the laxest such level is tried first
+# Odds of bad as powers of the rank, all equally likely before positions are seen: powers and log factors.
+CURVES = np.array([0, 0.5, 1, 2, 4])[:, None, None], np.linspace(-6, 6, 25)[:, None]
+NEARLY_BEST = 0.98  # of the best level's chance to pass: the laxest such level is tried first
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose kind and levels, and that calibrate where the rest tests
@@ -139,9 +139,9 @@ def threshold_levels(score: np.ndarray, bad: np.ndarray, guarantee: Guarantee, c
     the mean over `CURVES`, weighed by their likelihoods.
     """
     levels = np.unique(np.quantile(score, np.linspace(0, 1, LEVELS)))[::-1]
-    order, (slopes, offsets) = np.argsort(-score), CURVES
-    # Bad by rank, the surest first: (slopes, offsets, n).
-    odds = offsets + slopes * (np.arange(len(score)) / len(score) - 0.5)
+    order, (powers, factors) = np.argsort(-score), CURVES
+    # Log odds of bad by rank, the surest first: (powers, factors, n).
+    odds = factors + powers * np.log((np.arange(len(score)) + 0.5) / len(score))
     fit = np.where(bad[order], log_expit(odds), log_expit(-odds)).sum(-1)
     accepted = np.searchsorted(-score[order], -levels, side="right")
     share = np.cumsum(np.exp(log_expit(odds)), -1)[..., accepted - 1] / accepted

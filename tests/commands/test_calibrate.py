@@ -115,9 +115,9 @@ def _accepting(share: np.ndarray, aside: int, promise: Guarantee, least: float =
 
 @pytest.mark.parametrize("share", [0.08, 0.22])
 def test_one_bad_row_of_the_surest_ended_the_search(share) -> None:
-    """Of 60 rows the first test was one of five: sets that promised something were .67 and .21 of all."""
+    """Of 60 rows the first test was one of five: sets that promised something were .67 and .24 of all."""
     promise = Guarantee(alpha=0.3, delta=0.2)
-    assert _accepting(np.full(60, share), 12, promise, sets=200) > (0.95 if share == 0.08 else 0.38)
+    assert _accepting(np.full(60, share), 12, promise, sets=200) > (0.95 if share == 0.08 else 0.42)
 
 
 def test_where_the_search_begins_misleads_no_more_sets_than_promised() -> None:
@@ -125,7 +125,7 @@ def test_where_the_search_begins_misleads_no_more_sets_than_promised() -> None:
     promise = Guarantee(alpha=0.3, delta=0.2)
     assert _accepting(np.full(60, 0.3), 12, promise) < 0.2
     growing = np.where(np.arange(60) < 30, 0.3, 0.6)
-    assert _accepting(growing, 12, promise) < 0.2 and _accepting(growing, 12, promise, -0.5) < 0.05
+    assert _accepting(growing, 12, promise) < 0.2 and _accepting(growing, 12, promise, -0.5) < 0.1
 
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
