@@ -100,7 +100,7 @@ def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
     assert 0.02 < _accepting(0.2 * np.ones(19), 6, promise) < 0.1
 
 
-def _accepting(share: np.ndarray, aside: int, promise: Guarantee, least: float = -np.inf, sets: int = 2000):
+def _accepting(share: np.ndarray, aside: int, promise: Guarantee, least: float = -np.inf, sets: int = 300):
     """Of sets of rows that are bad with `share` (n,), surest first, how many accept scores below `least`."""
     rng = np.random.default_rng(0)
     found = 0
