@@ -205,7 +205,7 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     return max(1.0, float(bound * between / (share * (1 - share))))
 
 
-def _tail(wrong: Any, accepted: Any, alpha: float) -> Any:
+def _tail(wrong: Any, accepted: Any, alpha: Any) -> Any:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
     # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
     return betainc(np.maximum(accepted - wrong, 1e-9), wrong + 1, 1 - alpha)
@@ -331,11 +331,13 @@ def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0, effect: 
     )
 
 
-def relax_guarantee(evidence: Evidence, guarantee: Guarantee, *how: Any) -> Guarantee | None:
+def relax_guarantee(
+    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int, apart_m: float
+) -> Guarantee | None:
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(guarantee, limit_db=float(limit))
-        if calibrate_threshold(evidence, other, *how, tested=False)[1].accepted:
+        if calibrate_threshold(evidence, other, kind, spatial, seed, apart_m, False)[1].accepted:
             return other
     return None
 
