@@ -14,6 +14,7 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from gsparc.data.blocks import row_blocks
+from gsparc.data.limits import check_arguments, choice, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
@@ -124,10 +125,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     scores: Posterior | None = None  # of what is not
 
     def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
-        if components < 1:
-            raise ValueError(f"gp: components must be at least 1, got {components}")
-        if mean not in MEANS:
-            raise ValueError(f"gp: mean={mean!r} is none of {', '.join(MEANS)}")
+        check_arguments(locals(), components=whole(1), mean=choice(*MEANS))
         self.limit, self.about = components, mean
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
