@@ -268,9 +268,9 @@ class Kernel(Stored):
         parts = [f"{length:.4g} m" for length in self.lengths]
         if len(parts) == 2:
             parts = [f"{part} ({share:.0%})" for part, share in zip(parts, self.shares, strict=True)]
-        word = "length" if len(parts) == 1 else "lengths"
-        word = f"exponential {word}" if isinstance(self.terms[0], ExponentialShadowing) else word
-        return f"{word} {' and '.join(parts)}, noise {self.noise:.3g} of the signal's variance"
+        kind = "exponential " * isinstance(self.terms[0], ExponentialShadowing)
+        word = "lengths" if len(parts) == 2 else "length"
+        return f"{kind}{word} {' and '.join(parts)}, noise {self.noise:.3g} of the signal's variance"
 
     @property
     def compiled(self) -> list[float] | None:

@@ -33,7 +33,7 @@ from gsparc.processes.prior import Prior
 
 LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
 STRONGEST = 32  # components that they are chosen by
-STARTS = (0.01, 0.05, 0.25)  # lengths that a search starts from, of the extent
+STARTS = np.array([0.01, 0.05, 0.25])  # lengths that a search starts from, of the extent
 ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
 
 
@@ -103,12 +103,10 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2))] * count
     bounds += [*[(-SHARES, SHARES)] * (count - 1), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
-    lengths = combinations([spread * share for share in STARTS], count)
-    starts = [Kernel.matern(one, [1 / count] * count, 0.01) for one in lengths]
+    starts = [Kernel.matern(one, [1 / count] * count, 0.01) for one in combinations(spread * STARTS, count)]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    distance = distances(places, places)
     # The figures move by 1e-4 beyond this.
-    known = starts, distance, None, values, bounds
+    known = starts, distances(places, places), None, values, bounds
     return fit_kernel_by_left_out(*known, tolerance=2 * SETTLED, entries=entries, bounded=False)[1]
 
 
@@ -142,12 +140,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
         self.powers = None
-        thinned: list[str] = []
         parts = principal_components(targets, self.kind, self.limit)
-        looked_at: np.ndarray | slice = slice(None)
-        if len(targets) > CHOSEN_ON:
-            thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
-            looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
@@ -155,7 +149,9 @@ class GaussianProcess(Differentiable, ClosedForm):
         notes = [f"gp: {kernel.description}"]
         if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
             notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
-        return (*notes, *thinned)
+        if len(looked_at) < len(targets):
+            notes.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
+        return tuple(notes)
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
