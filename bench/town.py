@@ -67,10 +67,10 @@ def city(count: int) -> Measurements:
         place[:, :2] += JITTER_M * part.normal(size=(number, 2))
         parts.append(place)
     places = np.concatenate(parts)
-    prior = Prior(Kernel.matern((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
-    posterior = condition_on_nearest(prior, PlaceValues.of(known, torch.from_numpy(powers)[:, None]), 0)
+    prior = Prior(Kernel.from_lengths((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
+    process = condition_on_nearest(prior, PlaceValues.from_rows(known, torch.from_numpy(powers)[:, None]), 0)
     with torch.no_grad():
-        decibels = posterior.mean_at(torch.from_numpy(places))[:, 0].numpy()
+        decibels = process.mean_at(torch.from_numpy(places))[:, 0].numpy()
     decibels += CITY_NOISE_DB * rng.standard_normal(len(places))
     arrays = {"tx_position": places, "rx_position": station, "rssi_db": decibels}
     return from_arrays(arrays, {"name": "city"})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 import lightning.pytorch as L
@@ -27,18 +27,6 @@ class CostLedger(L.Callback):
         self.seconds = 0.0
         self._rows: list[dict[str, Any]] = []
         self._running_since: float | None = None
-
-    @staticmethod
-    def pause_ledger(trainer: L.Trainer) -> AbstractContextManager[None]:
-        """Pause the trainer's ledger, if it has one, for work that is not training."""
-        ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
-        return ledgers[0].paused() if ledgers else nullcontext()
-
-    @staticmethod
-    def training_seconds(trainer: L.Trainer) -> float | None:
-        """Return seconds on the trainer's ledger [s]; None when it keeps none."""
-        ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
-        return ledgers[0].elapsed() if ledgers else None
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -69,7 +57,7 @@ class CostLedger(L.Callback):
         if trainer.is_global_zero and trainer.global_step:
             # Rows after the checkpoint are of steps that are taken again.
             self._rows = [row for row in self._rows if int(row["step"]) <= trainer.global_step]
-            curve.write(module.run_dir, self._rows)
+            curve.write_curve(module.run_dir, self._rows)
         self._start()
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
@@ -104,8 +92,8 @@ class CostLedger(L.Callback):
             **shown, **({} if loss is None else {"train/task_loss": float(loss)}),
         )  # fmt: skip
         self._rows.append(row)
-        curve.write(module.run_dir, self._rows)
-        curve.log(trainer.loggers, row)
+        curve.write_curve(module.run_dir, self._rows)
+        curve.log_row(trainer.loggers, row)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the time and the curve so far, so that a resumed run goes on with both."""

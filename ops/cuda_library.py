@@ -117,10 +117,10 @@ def compiler() -> str | None:
 def library_path(*architectures: str) -> Path:
     """Return where the library of these sources for these GPUs is kept between runs."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return cache / "gsparc" / f"cuda-{'-'.join(architectures)}-{fingerprint(*FLAGS)}.so"
+    return cache / "gsparc" / f"cuda-{'-'.join(architectures)}-{hash_sources(*FLAGS)}.so"
 
 
-def fingerprint(*also: str) -> str:
+def hash_sources(*also: str) -> str:
     """Return the hash of the sources and of `also`, such as compiler flags."""
     digest = hashlib.sha256(repr(also).encode())
     for source in sorted([*SOURCES.glob("*.h"), *SOURCES.glob("projection/*"), *SOURCES.glob("cuda/*")]):

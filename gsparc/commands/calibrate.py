@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Gather, resample, write; returns the facts of `summary.json`."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     settings = to_dict(config)
@@ -85,8 +85,8 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     kept = f"of accepted answers at most {facts['promise/alpha']:.0%} have an error above"
     promise = f"Is the promise kept, {kept} {facts['promise/limit_db']:g} dB? By random calibration sets"
     return [
-        Table.of(heading, curves, [row for row in kinds if "area" in row]),
-        Table.of(promise, draws, [row for row in trials_of if "coverage" in row]),
+        Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
+        Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row]),
     ]
 
 

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods and report."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     run_dir = run_directory()
     settings = to_dict(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
@@ -72,12 +72,12 @@ def task(config: DictConfig) -> pd.DataFrame:
     return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 
-def train_cell(one: PreparedCell, left: str | None) -> None:
+def train_cell(one: PreparedCell, interrupted: str | None) -> None:
     """Train a cell into its folder; of a split that is drawn several times, models of the first are kept."""
     config = deepcopy(one.config)
     forget_vectors()  # solved for another cell, they would be missing from this one's processor seconds
     # What an interrupted try has left is gone on from, unless the settings name something else.
-    config.ckpt_path = config.ckpt_path or left
+    config.ckpt_path = config.ckpt_path or interrupted
     _, made = train(config, one.folder, read_inputs(config, one.problem.data), in_full=False)
     for file in made.checkpoints if one.problem.draw else ():  # queries are timed with those of the first
         file.unlink()

@@ -58,7 +58,7 @@ def evaluate_files(
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Test checkpoints; return the facts written to `summary.json` in the run directory."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     evaluation, data, split = evaluate_files(

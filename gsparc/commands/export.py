@@ -33,14 +33,14 @@ Facts = tuple[dict[str, Any], list[str]]
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Export, and say what is lost; returns the facts of `summary.json`."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     check_arguments(config, **LIMITS)
     path = Path(config.ckpt)
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
     # The files of an export belong together: none is written beside those of another one.
     if out.exists():
         raise SettingError(f"out={out}: is there already; remove it or name another folder")
-    predictor = load(path) if config.station is None else load(path).at(config.station)
+    predictor = load(path) if config.station is None else load(path).select_station(config.station)
     # The folder appears by renaming: an export that fails leaves nothing behind.
     with whole_folder(out) as folder:
         facts, lines = WRITERS[config.to](predictor, config, folder, out)

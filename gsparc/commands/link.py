@@ -36,7 +36,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:
         raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     # Bits, noise and channels of PUSCH are drawn from torch's global generator.
     torch.manual_seed(int(config.seed))
     run_dir, settings = run_directory(), to_dict(config)

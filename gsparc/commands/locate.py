@@ -28,7 +28,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     """Locate as conf/locate.yaml says, into a folder; returns the facts of its `summary.json`."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     check_arguments(config, **LIMITS)
     for name in config.against:
         choice(*PLAIN).check("against", name)

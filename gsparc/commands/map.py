@@ -25,7 +25,7 @@ SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
 
 def settings_of(config: DictConfig) -> RunSettings:
     """Check the settings of a run, of which `stations` is not one here: it holds names."""
-    return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
+    return RunSettings.from_config(OmegaConf.masked_copy(config, [str(k) for k in config if k != "stations"]))
 
 
 def stations_of(setting: Any) -> list[str | int] | None:

@@ -19,7 +19,7 @@ from gsparc.prediction.operating_point import load
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Try candidates, draw and write; returns the facts of `summary.json`."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     run_dir, settings, path = run_directory(), to_dict(config), str(config.ckpt)
     stored = checkpoint.read(path)
     if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):

@@ -14,7 +14,7 @@ from gsparc.prediction.operating_point import load
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Predict at places of a table; return the facts written to `summary.json` in the run directory."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     station = None if config.station is None else str(config.station)
     how: dict[str, Any] = {"columns": to_dict(config.columns), "overwrite": bool(config.overwrite)}

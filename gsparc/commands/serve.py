@@ -31,7 +31,7 @@ def is_loopback(host: str) -> bool:
 
 def task(config: DictConfig) -> None:
     """Serve until Ctrl-C or SIGTERM; requests under way are answered."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     whole(0, 65535).check("port", config.port)
     token = config.token or os.environ.get("GSPARC_TOKEN")
     # Without a token only this machine's own users may be answered.
@@ -47,7 +47,7 @@ def task(config: DictConfig) -> None:
         files = f"{needed} open files may be needed, {allowed} are allowed"
         raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     predictor = load(config.ckpt, unit=config.unit)
-    predictor = predictor if config.station is None else predictor.at(config.station)
+    predictor = predictor if config.station is None else predictor.select_station(config.station)
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")

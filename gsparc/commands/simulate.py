@@ -53,7 +53,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 def task(config: DictConfig) -> Outcome | None:
     """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     run_dir, console = run_directory(), open_console()
     if config.scene.name == "help":
         console.print(simulated.table_of_scenes())

@@ -52,7 +52,7 @@ def study_of(config: DictConfig) -> Study:
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
-    settings = RunSettings.of(config)
+    settings = RunSettings.from_config(config)
     build(config.model)  # its parts check themselves
     run_dir = run_directory()
     study = study_of(config)
@@ -60,7 +60,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     split = split_for(to_dict(config.split), data)
     try:
         # Rounds that were done on other data, splits or settings do not count as these.
-        state = State.of(config, measurements_hash(data), split.sha256)
+        state = State.from_config(config, measurements_hash(data), split.sha256)
         rows = study.run(data, split, fit_context(config, run_dir=run_dir), state)
     except KeyboardInterrupt:  # whose advice is that of a training
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
@@ -83,4 +83,4 @@ def table_of(rows: pd.DataFrame, title: str) -> Table:
     words += changed if (rows.what != "none").any() else []
     value = Column(rows.figure.iloc[0], of=value_with_error("value", "spread"))
     columns = [*words, Column("rows", "g", of="rows"), value, TRAIN, CPU, P50, P95]
-    return Table.of(title, columns, rows.to_dict("records"))  # type: ignore[arg-type]
+    return Table.from_rows(title, columns, rows.to_dict("records"))  # type: ignore[arg-type]

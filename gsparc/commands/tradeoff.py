@@ -39,7 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
-    state = State.of(config, measurements_hash(run.data), run.split.sha256)
+    state = State.from_config(config, measurements_hash(run.data), run.split.sha256)
     trained = run.stored[0].extra.get("run_id")  # the front is stored in the file itself, which changes it
     state = replace(state, files=state.files | ({"ckpt": trained} if trained else {}))
     with locked(run_dir / ".job"):
@@ -89,7 +89,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     front_rows = table_of_points[table_of_points.front == 1].to_dict("records")
-    sheet = Table.of(title, [*tradeoff.POINT, Column(figure, of=figure)], front_rows)
+    sheet = Table.from_rows(title, [*tradeoff.POINT, Column(figure, of=figure)], front_rows)
     with tracking.open_loggers(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.log_table(loggers, "operating points", *sheet.texts())

@@ -112,7 +112,7 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
         ValueError: bad data or settings, one line each.
     """
     method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     tracking.refuse_missing_loggers(config)
     watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
     with heeded.record_reads(reads):
@@ -300,7 +300,7 @@ def _keep(
     context = contexts[number]
     for note in report.notes:
         log_of_models.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
-    if not curve.read(context.run_dir):  # a method that trains in one piece
+    if not curve.read_curve(context.run_dir):  # a method that trains in one piece
         context.log_curve(report.seconds, fitted.name)
     marks = fitting.run_marks(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
@@ -364,15 +364,15 @@ def task(config: DictConfig) -> float:
         unread = State.unread(config) if job else None
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
         if facts is None:
-            begun = read_inputs(config)
-            state = State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
+            read = read_inputs(config)
+            state = State.from_config(config, measurements_hash(read.module.measurements), read.split.sha256)
             facts = read_finished(run_dir, state, config.reuse) if job else None
         if facts is not None:
             log.info("%s: was done before", run_dir)
         else:
             with recorded(run_dir, state, unread) as left:
                 config.ckpt_path = config.ckpt_path or left
-                facts, objects = train(config, run_dir, begun)
+                facts, objects = train(config, run_dir, read)
                 made = f"{objects.data.site.name}, split {objects.split.name}"
                 title = f"{made}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)

@@ -29,7 +29,7 @@ SAVED = (".html", ".ply")
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
-    RunSettings.of(config)
+    RunSettings.from_config(config)
     save = None if config.save is None else Path(str(config.save))
     # Before model and data are read, which takes seconds.
     check(save, int(config.port))

@@ -55,10 +55,10 @@ class OnDisk(np.memmap):
 
     file: IO[bytes] | None = None
 
-    @classmethod
-    def of(cls, file: IO[bytes], dtype: Any, mode: Any, shape: tuple[int, ...], offset: int = 0) -> OnDisk:
+    @staticmethod
+    def from_file(file: IO[bytes], dtype: Any, mode: Any, shape: tuple[int, ...], offset: int = 0) -> OnDisk:
         """Return what lies in an open file from `offset` on [bytes]."""
-        array = cls(file, dtype, mode, offset, shape)
+        array = OnDisk(file, dtype, mode, offset, shape)
         array.file = file
         return array
 
@@ -71,7 +71,7 @@ class OnDisk(np.memmap):
 
 
 def _opened(handle: Any, dtype: Any, shape: tuple[int, ...], offset: int) -> OnDisk:
-    return OnDisk.of(os.fdopen(handle.detach(), "rb"), dtype, "r", shape, offset)
+    return OnDisk.from_file(os.fdopen(handle.detach(), "rb"), dtype, "r", shape, offset)
 
 
 def allocate_on_disk(shape: tuple[int, ...], dtype: Any) -> OnDisk:
@@ -84,7 +84,7 @@ def allocate_on_disk(shape: tuple[int, ...], dtype: Any) -> OnDisk:
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size and hasattr(os, "posix_fallocate"):  # a full disk would end the process at the first write
         os.posix_fallocate(file.fileno(), 0, size)
-    return OnDisk.of(file, dtype, "w+", shape)
+    return OnDisk.from_file(file, dtype, "w+", shape)
 
 
 def allocate(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
@@ -112,7 +112,7 @@ def map_from_disk(dataset: h5py.Dataset) -> OnDisk:
     offset = dataset.id.get_offset()
     if offset is not None and dataset.dtype.isnative:
         file = open(dataset.file.filename, "rb")  # noqa: SIM115 (the array keeps it)
-        return OnDisk.of(file, dataset.dtype, "r", dataset.shape, offset)
+        return OnDisk.from_file(file, dataset.dtype, "r", dataset.shape, offset)
     copy = allocate_on_disk(dataset.shape, dataset.dtype)
     for part in row_blocks(dataset):
         copy[part] = dataset[part]

@@ -95,7 +95,7 @@ class DataError(ValueError):
 
 @contextmanager
 def readable(
-    where: str | Path, fault: str, errors: type[Exception] | tuple[type[Exception], ...], missing: str = ""
+    where: str | Path, fault: str, errors: type[Exception] | tuple[type[Exception], ...], if_absent: str = ""
 ) -> Iterator[None]:
     """Raise `DataError` in place of what other libraries raise in the block: WHERE: FAULT (what they say).
 
@@ -103,15 +103,15 @@ def readable(
         where: file, and part of it.
         fault: in words.
         errors: that are so turned; a `DataError` is left as it is.
-        missing: said of a file that is not there, alone; empty: nothing else than of other errors.
+        if_absent: said of a file that is not there, alone; empty: nothing else than of other errors.
     """
     try:
         yield
     except DataError:
         raise
     except errors as error:
-        lacking = missing and isinstance(error, FileNotFoundError)
-        raise DataError(f"{where}: {missing if lacking else f'{fault} ({explain_error(error)})'}") from None
+        lacking = if_absent and isinstance(error, FileNotFoundError)
+        raise DataError(f"{where}: {if_absent if lacking else f'{fault} ({explain_error(error)})'}") from None
 
 
 class Problems(list[str]):

@@ -50,15 +50,15 @@ class SeveralFiles(str):
         return result
 
 
-def read_text(path: Path, missing: str, kind: str = "text") -> str:
-    """Read a text in UTF-8; `DataError` says `missing`, or that the file is not readable as `kind`."""
-    with readable(path, f"not readable as {kind}", (UnicodeDecodeError, OSError), missing):
+def read_text(path: Path, missing_message: str, kind: str = "text") -> str:
+    """Read a text in UTF-8; `DataError` says `missing_message`, or that it is not readable as `kind`."""
+    with readable(path, f"not readable as {kind}", (UnicodeDecodeError, OSError), missing_message):
         return path.read_text(encoding="utf-8-sig")
 
 
-def read_csv(path: Path, missing: str) -> list[list[str]]:
+def read_csv(path: Path, missing_message: str) -> list[list[str]]:
     """Read cells of each line, between commas; `DataError` as of `read_text`."""
-    text = read_text(path, missing, "CSV text")
+    text = read_text(path, missing_message, "CSV text")
     with readable(path, "not readable as CSV text", csv.Error):
         return list(csv.reader(map(partial(check_line_length, path), count(1), io.StringIO(text))))
 
@@ -103,7 +103,7 @@ def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
     return sizes[id(node)]
 
 
-def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
+def read_yaml(path: Path, missing_message: str, expected: str) -> Mapping[str, Any]:
     """Read a table in YAML.
 
     Args:
@@ -114,7 +114,7 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
         DataError: missing, not readable, or no table.
     """
     with readable(path, "not readable as YAML", (yaml.YAMLError, ValueError, RecursionError)):
-        content = load_yaml(read_text(path, f"missing; expected {missing}", "YAML"), path)
+        content = load_yaml(read_text(path, f"missing; expected {missing_message}", "YAML"), path)
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")
     return content

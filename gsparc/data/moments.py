@@ -34,7 +34,7 @@ class Snapshots:
     run: np.ndarray
 
     @classmethod
-    def of(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
+    def from_rows(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
         """Arrange rows (S,): the i-th visit of each station to a place is one moment."""
         station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
         moment = number_moments(data, rows)

@@ -221,7 +221,7 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
         linear = "W" if level_unit == "dBW" else LINEAR
         unit = attributes.get("unit", linear if measured == "rssi" else None)
     try:
-        PowerUnit.of(unit, level_unit)
+        PowerUnit.from_name(unit, level_unit)
     except ValueError as fault:
         check.refuse("unit", str(fault))
     return {

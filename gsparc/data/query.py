@@ -67,7 +67,7 @@ class Query:
         return site.moving(self.tx, self.rx).expand(len(self), -1).cpu().double()
 
     @staticmethod
-    def at(site: Site, places: Tensor, station: Tensor | None = None) -> Query:
+    def from_places(site: Site, places: Tensor, station: Tensor | None = None) -> Query:
         """Return what is asked of the moving end at places (B, 3) [m], with the static end where it stood.
 
         Where nobody knows that it is NaN; receivers are turned as they were when measured.

@@ -56,7 +56,7 @@ class Stations:
     def __len__(self) -> int:
         return len(self.position)
 
-    def at(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
+    def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
         optional = (self.rotation, self.carrier_hz, self.sector)
         rotation, carrier, sector = (None if one is None else one[numbers] for one in optional)
@@ -224,9 +224,9 @@ class Site:
         """Return what turns stored powers into a unit and back; None: that of the measurements.
 
         Raises:
-            ValueError: see `PowerUnit.of`.
+            ValueError: see `PowerUnit.from_name`.
         """
-        return PowerUnit.of(name or self.unit, self.level_unit, self.target_scale)
+        return PowerUnit.from_name(name or self.unit, self.level_unit, self.target_scale)
 
     def in_levels(self, unit: str | None) -> Site:
         """Return the same, its levels and answers in a unit of levels; None: as they are.
@@ -234,7 +234,7 @@ class Site:
         Raises:
             ValueError: another unit, or one that these levels cannot be turned into.
         """
-        wanted = PowerUnit.of(unit, self.level_unit, levels=True)
+        wanted = PowerUnit.from_name(unit, self.level_unit, levels=True)
         # Powers scale linearly, amplitudes of channels and spectra with the root.
         scale = self.target_scale * (wanted.scale if self.kind == "rssi" else wanted.scale**0.5)
         return replace(self, level_unit=wanted.name, unit=wanted.name, target_scale=scale)
@@ -324,14 +324,14 @@ class Measurements:
     def subset(self, rows: np.ndarray, site: Site | None = None) -> Measurements:
         """Return rows (n,) alone, seen as measurements of `site`."""
 
-        def of(value: Any) -> Any:
+        def take_rows(value: Any) -> Any:
             # Lists may be empty, for instance row names of data made from arrays.
             return [value[i] for i in rows if value] if isinstance(value, list) else take(value, rows)
 
         # A release's split names rows of the whole, which the subset numbers otherwise.
         whole = ("site", "provenance", "release_split")
         arrays = {name: value for name, value in vars(self).items() if name not in whole}
-        parts = {name: of(value) for name, value in arrays.items() if value is not None}
+        parts = {name: take_rows(value) for name, value in arrays.items() if value is not None}
         return Measurements(site=site or self.site, provenance=self.provenance, **parts)
 
     def batch(self, index: np.ndarray | Tensor) -> Batch:

@@ -119,7 +119,7 @@ def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selec
         numbers = (_number(stations, one, f"dataset.stations={one}", source) for one in part.stations)
         chosen = np.unique([t for one in numbers for t in _parts(stations, one)])
         arrays = dict(kept("dataset.stations", np.isin(arrays["station"], chosen)))
-        arrays["station"], stations = np.searchsorted(chosen, arrays["station"]), stations.at(chosen)
+        arrays["station"], stations = (np.searchsorted(chosen, arrays["station"]), stations.subset(chosen))
     if part.runs is not None:
         arrays = kept(f"dataset.runs={','.join(map(str, part.runs))}", _of_runs(arrays, part.runs, source))
     if part.min_rssi_db is not None:
@@ -163,7 +163,7 @@ def _split(arrays: Arrays, of: Stations, name: str, first: int, source: str) -> 
     number = _number(of, name, option, source)
     last = _parts(of, number)[-1]  # later steps divide the part after earlier ones
     after = (arrays["station"] == last) & (arrays["file_row"] >= first)
-    more = of.at(np.array([*range(len(of)), last]), [*of.name, f"{of.name[number]}{FROM_ROW}{first}"])
+    more = of.subset(np.array([*range(len(of)), last]), [*of.name, f"{of.name[number]}{FROM_ROW}{first}"])
     return {**arrays, "station": np.where(after, len(of), arrays["station"])}, more
 
 

@@ -73,7 +73,7 @@ class PowerUnit:
     scale: float
 
     @classmethod
-    def of(cls, name: str | None, level_unit: str, scale: float = 1.0, levels: bool = False) -> Self:
+    def from_name(cls, name: str | None, level_unit: str, scale: float = 1.0, levels: bool = False) -> Self:
         """Return the unit of a name, for stored powers that times `scale` have levels in `level_unit`.
 
         Levels whose reference nobody said (`dB`) are in whatever unit of levels is asked for.

@@ -161,7 +161,7 @@ def predict_places(
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
-            own = predictor if stations is None else predictor.at(stations.name[one])
+            own = predictor if stations is None else predictor.select_station(stations.name[one])
         except ValueError as error:
             if named:
                 raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None

@@ -117,5 +117,5 @@ def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, 
     else:
         figures |= rmse_with_silent(scores, data) | power_intervals(scores, data)
         if split.name == "stations" and data.station is not None:
-            figures["rmse_db_after_constant"] = scores.after_constant(data.station)
+            figures["rmse_db_after_constant"] = scores.rmse_without_station_bias(data.station)
     return figures

@@ -364,7 +364,7 @@ def collect_evidence(
 
 
 def calibrate_and_store(
-    path: str, dataset: dict[str, Any], split: dict[str, Any], promise: Guarantee, kind: str, spatial: bool,
+    path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: Guarantee, kind: str, spatial: bool,
     seed: int,
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
@@ -373,11 +373,11 @@ def calibrate_and_store(
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
-    kind_used, choice, _, _ = calibrate_threshold(evidence, promise, kind, spatial, seed)
+    kind_used, choice, _, _ = calibrate_threshold(evidence, guarantee, kind, spatial, seed)
     threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
     box = confidence.calibrated_box(known, evidence.position)
-    stored = confidence.Trusted(kind_used, threshold, promise, known, kernel, box)
+    stored = confidence.Trusted(kind_used, threshold, guarantee, known, kernel, box)
     earlier = confidence.read_trusted(run.stored[0].extra)
     before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
@@ -388,13 +388,13 @@ def calibrate_and_store(
     else:
         confidence.store_trusted(path, stored)
     if np.isfinite(threshold):
-        of = f"at most {promise.alpha:.0%} of these are worse than {promise.limit_db:g} dB"
+        of = f"at most {guarantee.alpha:.0%} of these are worse than {guarantee.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
-    bad, limit = float(promise.is_bad(evidence.error).mean()), f"{promise.limit_db:g} dB"
-    few = explain_too_few(len(evidence), promise, bad)
+    bad, limit = float(guarantee.is_bad(evidence.error).mean()), f"{guarantee.limit_db:g} dB"
+    few = explain_too_few(len(evidence), guarantee, bad)
     if few is not None:
         return stored, f"{kind_changed}no threshold keeps the bound: {few}"
-    other = relax_guarantee(evidence, promise, kind, spatial, seed)
+    other = relax_guarantee(evidence, guarantee, kind, spatial, seed)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
     )

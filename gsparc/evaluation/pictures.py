@@ -125,7 +125,7 @@ NAMES = {
 
 
 def draw_calibration(
-    evidence: Evidence, trials: Sequence[Trial], promise: Guarantee, title: str, path: Path
+    evidence: Evidence, trials: Sequence[Trial], guarantee: Guarantee, title: str, path: Path
 ) -> None:
     """Save risk against coverage, and what came of the draws, as one PNG."""
     figure, ((left, right),) = panels(11, 4.2, 1, 2)
@@ -144,12 +144,12 @@ def draw_calibration(
         label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
         right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)
     # a draw that accepts nobody has no share of bad ones: NaN
-    worst = max(promise.alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
+    worst = max(guarantee.alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
     right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
     if not any(trial.coverage.any() for trial in trials):
         right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
-    right.axhline(promise.alpha, color="black", linewidth=1)
-    right.set_title(f"promise: at most {promise.alpha:.0%} bad, broken in at most {promise.delta:.0%}")
+    right.axhline(guarantee.alpha, color="black", linewidth=1)
+    right.set_title(f"promise: at most {guarantee.alpha:.0%} bad, broken in at most {guarantee.delta:.0%}")
     right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
     for axis in (left, right):
         axis.legend(fontsize=8)

@@ -68,7 +68,7 @@ class Scores:
         facts = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
         return {f"decided_by/{name}": value for name, value in facts.items()}
 
-    def after_constant(self, station: np.ndarray) -> float | None:
+    def rmse_without_station_bias(self, station: np.ndarray) -> float | None:
         """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
 
         Stations that nobody calibrated differ by constants which nothing tells of a station never heard.

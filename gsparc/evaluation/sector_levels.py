@@ -37,9 +37,9 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
     down = -(-len(chosen) // ACROSS)
     figure, axes = panels(9, 2.0 * down + 0.8, down, ACROSS, sharex=True, sharey=True)
     for axis, t in zip(axes.flat, chosen, strict=False):
-        at = torch.from_numpy(np.c_[heard.of(t).places, np.full(count[t], t)])
+        at = torch.from_numpy(np.c_[heard.select_station(t).places, np.full(count[t], t)])
         angle, distance = _about(at, float(trend.table[t, 0]))
-        rest = torch.from_numpy(heard.of(t).decibels) - trend.mean(at) - trend.loss(at)
+        rest = torch.from_numpy(heard.select_station(t).decibels) - trend.mean(at) - trend.pattern_loss(at)
         axis.plot(angle, rest, ".", color=PALETTE[0], markersize=3, alpha=0.5)
         turn = np.linspace(-180, 180, 181)
         # Bearings from north, clockwise: east = sin, north = cos.
@@ -48,8 +48,8 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
         height = np.full((len(ring), 1), float(at[:, 2].median()))
         around = np.c_[ring + field.places[t, :2], height, np.tile(np.r_[field.places[t], t], (len(ring), 1))]
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
-        gain = float((rest + trend.loss(at)).median())
-        axis.plot(turn, gain - trend.loss(torch.from_numpy(around)), color=PALETTE[1])
+        gain = float((rest + trend.pattern_loss(at)).median())
+        axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
         axis.set(title=f"{data.site.stations.name[t]}, {float(trend.table[t, 0]):.0f} deg", xlim=(-180, 180))
         axis.set_xticks([-180, -90, 0, 90, 180])
     for axis in axes.flat[len(chosen) :]:

@@ -73,7 +73,7 @@ def table_of_scenes() -> Table:
     rows = []
     for name in list_shipped_scenes():
         tracer = RayTracer(name, np.zeros(3), CARRIER_HZ)
-        size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.box(), axis=0))
+        size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.bounding_box(), axis=0))
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
         rows.append([name, size, f"{len(tracer.triangles()):,}", used])
     heads = ["scene", "size [m]", "triangles", "materials"]

@@ -99,7 +99,7 @@ class Table:
     bold: str | None = None
 
     @classmethod
-    def of(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: str) -> Table:
+    def from_rows(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: str) -> Table:
         """Return a row per result; `more` are `note` and `bold`."""
         return cls(title, columns, [[column.value(row) for column in columns] for row in results], **more)
 

@@ -50,7 +50,7 @@ class ErrorModel(nn.Module):
         super().__init__()
         self.far, self.power = 1.0, 1.0  # numbers: as tensors they would cost a query a tenth of its time
 
-    def set(self, level: float, power: float) -> None:
+    def set_error_law(self, level: float, power: float) -> None:
         """Take what left-out rows said."""
         self.far, self.power = level * (1 + LEAST_UNKNOWN) ** power, power
 

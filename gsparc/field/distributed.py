@@ -39,7 +39,7 @@ class SummedGradients(DDPStrategy):
         self._accumulating = False
 
     @classmethod
-    def named(cls, strategy: object) -> SummedGradients | None:
+    def from_strategy(cls, strategy: object) -> SummedGradients | None:
         """Return the one that `trainer.strategy` means: of `ddp*`; None of others."""
         if not (isinstance(strategy, str) and strategy.startswith("ddp")):
             return None
@@ -107,20 +107,20 @@ def first_process_value(value: float, trainer: L.Trainer) -> float:
     if not distributed.is_initialized():
         return value
     shared = torch.tensor(value, dtype=torch.float64, device=trainer.strategy.root_device)
-    with _patient():
+    with _raise_after_grace():
         distributed.broadcast(shared, 0)
     return float(shared)
 
 
 def _reduced(values: Tensor, operation: ReduceOp.RedOpType) -> Tensor:
     if distributed.is_initialized():
-        with _patient():
+        with _raise_after_grace():
             distributed.all_reduce(values, operation)
     return values
 
 
 @contextmanager
-def _patient() -> Iterator[None]:
+def _raise_after_grace() -> Iterator[None]:
     try:
         yield
     except RuntimeError:

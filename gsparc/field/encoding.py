@@ -124,4 +124,4 @@ def _whitening(prior: Prior) -> Tensor:
     anchors = prior.anchors.double()
     gram = correlation(anchors, anchors, prior.length, prior.kernel)
     gram.diagonal().add_(JITTER)  # repeated positions stay invertible
-    return Factor.of(gram).root.T.float().contiguous()
+    return Factor.from_gram(gram).root.T.float().contiguous()

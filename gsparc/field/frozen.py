@@ -149,7 +149,7 @@ def gaussian_vectors(model: GaussianModel, rx: Pose) -> Tensor:
     # Queries may come in inference mode, in which nothing is differentiated.
     with torch.inference_mode(False), torch.enable_grad():
         field = torch.zeros(1, 2, model.site.grid.height, model.site.grid.width, requires_grad=True)
-        parts = torch.view_as_real(response.measured(field)).flatten()
+        parts = torch.view_as_real(response.array_vectors(field)).flatten()
         by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
         means, quats, scales, opacities = (part.detach() for part in model.gaussians.geometry())
         emitted = torch.zeros(count, len(parts), requires_grad=True)

@@ -214,7 +214,7 @@ def make_trainer(
     # Without validation rows nothing is looked at, however often that was asked for.
     unwatched = (f"trainer.{name}" for name in make.keywords if name != "val_check_interval")
     heeded.count_reads("callbacks", *(["trainer"] if len(fold.val) else unwatched))
-    processes = SummedGradients.named(make.keywords.get("strategy"))
+    processes = SummedGradients.from_strategy(make.keywords.get("strategy"))
     if module.count is None:  # networks of published methods make tensors of their own, on the CPU
         if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
             log.warning("published methods train in one process on the CPU, whatever trainer= says")

@@ -203,7 +203,7 @@ class GaussianModel(nn.Module):
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         features = self.features(tx, rx)
         if self.site.kind == "spectrum":
-            raster = self.raster(features, rx)
+            raster = self.rasterize(features, rx)
             image, unknown = raster.image, self.unknown(tx, rx)
             mean = self.response(image, unknown) if self.response else image.squeeze(1)
             return Rendered(mean, raster, unknown)
@@ -213,7 +213,7 @@ class GaussianModel(nn.Module):
         gains = torch.view_as_complex(features.contiguous())
         return Rendered(self.response(weights * gains), None)
 
-    def raster(self, features: Tensor, rx: Pose) -> Raster:
+    def rasterize(self, features: Tensor, rx: Pose) -> Raster:
         """Return images of features (B, N, C) from one pose, or each from its own of B."""
         return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._optics())
 

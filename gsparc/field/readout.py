@@ -58,7 +58,7 @@ def solve_readout(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solv
     gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
     ridge = RIDGE * gram.diagonal().real.mean() * torch.eye(len(gram), device=gram.device)
     missing = (rendered - _lines(trial) @ view) @ view.mH
-    lines = Factor.of(gram + ridge).solve(missing.to(gram.dtype).mH).mH.to(view.dtype)
+    lines = Factor.from_gram(gram + ridge).solve(missing.to(gram.dtype).mH).mH.to(view.dtype)
     correction = torch.view_as_real(lines) if lines.is_complex() else lines.unsqueeze(-1)
     trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
     trial.emission.bias2.add_(correction[-1])

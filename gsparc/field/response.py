@@ -111,7 +111,7 @@ class ArrayResponse(nn.Module):
         no_background = torch.zeros(self.grid.height, self.grid.width)
         self.renderer = SpectrumRenderer(self.array, self.grid, self.wavelength, no_background)
 
-    def measured(self, image: Tensor) -> Tensor:
+    def array_vectors(self, image: Tensor) -> Tensor:
         """Return array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
         waves = torch.complex(image[:, 0], image[:, 1])
         return array_output(waves, self.matrix, self.grid, self.pattern)
@@ -146,4 +146,4 @@ class ArrayResponse(nn.Module):
 
     def forward(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:
         """Return spectra (B, H, W) of composited fields (B, 2, H, W) and unknown shares (B,)."""
-        return self.spectra(self.measured(image), unknown)
+        return self.spectra(self.array_vectors(image), unknown)

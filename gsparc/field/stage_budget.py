@@ -30,7 +30,7 @@ class StageBudget(L.Callback):
     def _learned(self) -> Spent:
         return self.budget.counted - self._begin
 
-    def _look(self, trainer: L.Trainer) -> None:
+    def _stop_if_spent(self, trainer: L.Trainer) -> None:
         if first_process_value(float(self.budget.is_spent()), trainer):
             trainer.should_stop = True
 
@@ -42,11 +42,11 @@ class StageBudget(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Leave out what making the Trainer took, which is no part of the stage; look at the clock."""
         self._begin = self._begin + (self._learned - self._resumed)
-        self._look(trainer)
+        self._stop_if_spent(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """End when the seconds are over."""
-        self._look(trainer)
+        self._stop_if_spent(trainer)
 
     def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
         """Bring home what was spent; only metrics leave the process where there are several devices."""

@@ -129,8 +129,8 @@ def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
     numbers = np.zeros(len(known), np.int64) if data.station is None else data.station[known]
     stations = np.unique(numbers)
     if len(known) >= SHARED * len(stations) * (number_moments(data, known).max() + 1):
-        return [Snapshots.of(data, known)]
-    return [Snapshots.of(data, known[numbers == one]) for one in stations]
+        return [Snapshots.from_rows(data, known)]
+    return [Snapshots.from_rows(data, known[numbers == one]) for one in stations]
 
 
 def _rms(values: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ class ClosedForm(Method):
     @property
     def count(self) -> int:
         """Number of Gaussians; 0 where a process is all there is."""
-        return self.size()
+        return self.count_components()
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -75,7 +75,7 @@ class ClosedForm(Method):
         """None; see `Method.gradient_problem`."""
         return None
 
-    def parts(self) -> Iterator[tuple[float, ClosedForm]]:
+    def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """Yield methods that are no mixtures, with their weights in the mean."""
         yield 1.0, self
 

@@ -93,7 +93,7 @@ def run_marks(report: FitReport, data: Measurements, fold: Fold, context: FitCon
     """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
     report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
-    return {**report_fields, **Origin.of(data, fold, context).marks()}
+    return {**report_fields, **Origin.from_fit(data, fold, context).marks()}
 
 
 def run_folder(path: Path, parts: str) -> Path:
@@ -108,7 +108,7 @@ def _restored(
     factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext, file: Path
 ) -> tuple[Method, FitReport]:
     stored = checkpoint.read(file)
-    Origin.of(data, fold, context).require_same(stored)
+    Origin.from_fit(data, fold, context).require_same(stored)
     method, extra = factory.create_as(stored.target), stored.extra
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
@@ -145,7 +145,7 @@ class Origin:
     config: str = ""
 
     @classmethod
-    def of(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
+    def from_fit(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
         """Return the origin of a fit that begins."""
         directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
         auxiliary = content_hash({**directions, "uplink": data.uplink})

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -59,13 +59,13 @@ class Prediction:
         if len(parts) == 1 and order is None:
             return parts[0]
 
-        def of(name: str) -> Any:
+        def join_field(name: str) -> Any:
             values = [getattr(part, name) for part in parts]
             if any(value is None for value in values):
                 return None
             return torch.cat(values) if order is None else torch.cat(values)[order]
 
-        return Prediction(*(of(field.name) for field in fields(Prediction)))
+        return Prediction(*(join_field(field.name) for field in fields(Prediction)))
 
 
 class MethodFactory(ABC):
@@ -102,7 +102,7 @@ class MethodFactory(ABC):
         """Say what ends a fit at a site before all that is counted; "" where nothing does."""
         return "" if budget_s is None else f"within {budget_s:g} s"
 
-    def shares(self, site: Site) -> bool:
+    def learns_jointly(self, site: Site) -> bool:
         """Whether it learns several stations of this site at once, told which by `Query.station`."""
         return False
 
@@ -123,7 +123,7 @@ class Method(MethodFactory):
 
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
-    has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
+    has_gaussians = False  # whether what it learns are Gaussians, which `count_components` then counts
     threads_pay: bool = (
         False  # whether several threads answer a single place sooner than one: where it renders
     )
@@ -185,7 +185,7 @@ class Method(MethodFactory):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the method whose `state()` this was."""
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of Gaussians, sources or stored training samples."""
         return 0
 
@@ -208,12 +208,12 @@ class Method(MethodFactory):
 
     def objects(self) -> SiteObjects:
         """Return what it found to stand in the site."""
-        return SiteObjects.of()
+        return SiteObjects.from_arrays()
 
     def facts(self) -> dict[str, float | int | str | None]:
         """Return what `summary.json` says of a fitted model, None where it means nothing here."""
         return {
-            "model/num_gaussians": self.size() if self.has_gaussians else None,
+            "model/num_gaussians": self.count_components() if self.has_gaussians else None,
             "model/class": type(self).__name__,
             "model/made": self.made,
             "model/choices": None,
@@ -245,7 +245,7 @@ def predict_in_batches(
         yield from asked()
         return
     told = list(asked())
-    moments, back = Snapshots.of(data, rows), np.argsort(order)
+    moments, back = Snapshots.from_rows(data, rows), np.argsort(order)
     means = moments.arrange(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
     turns = align_factors(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
     factors = torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
@@ -322,16 +322,30 @@ class HasProcess(Protocol):
         """Return the process; None where what was fitted has none."""
 
 
+class JointLevels(NamedTuple):
+    """Levels of k places or stations and their errors; tensors, or a `Predictor`'s arrays.
+
+    Attributes:
+        mean: (G, k) of measurements [dB].
+        covariance: (G, k, k) [dB^2].
+        noise: (k,) variance of a measurement's noise [dB^2].
+    """
+
+    mean: Any
+    covariance: Any
+    noise: Any
+
+
 @runtime_checkable
 class HasJoint(Protocol):
     """Levels of several stations, or at several places, with their covariance."""
 
-    def predict_joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def predict_joint(self, moving: Tensor, stations: Tensor) -> JointLevels:
         """See `gsparc.models.powers.together.field.JointPowerField.predict_joint`."""
         ...
 
-    def with_station(self, place: np.ndarray, sectors: Tensor) -> HasJoint:
-        """See `gsparc.models.powers.together.field.JointPowerField.with_station`."""
+    def add_station(self, place: np.ndarray, sectors: Tensor) -> HasJoint:
+        """See `gsparc.models.powers.together.field.JointPowerField.add_station`."""
         ...
 
 

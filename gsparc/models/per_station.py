@@ -28,6 +28,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
+from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
@@ -40,7 +41,6 @@ from gsparc.training.time_budget import Spent, less_repeatable
 
 log = logging.getLogger(__name__)
 
-SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
@@ -195,7 +195,7 @@ class PerStation(Method):
             with heeded.set_apart():
                 how, why = self.factory.choose_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
-        together, joint = how == "together", self.factory.shares(data.site)
+        together, joint = how == "together", self.factory.learns_jointly(data.site)
         self._shared = together and joint
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
@@ -280,7 +280,7 @@ class PerStation(Method):
 
     def _site_of(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
-        return site if number == UNHEARD and self.factory.shares(site) else station_site(site, number)
+        return site if number == UNHEARD and self.factory.learns_jointly(site) else station_site(site, number)
 
     def _stations(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
@@ -317,12 +317,12 @@ class PerStation(Method):
     def objects(self) -> SiteObjects:
         """Return those of all copies: what stands in a site stands there for all its stations."""
         return reduce(
-            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.of()
+            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.from_arrays()
         )
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return that of all copies."""
-        return sum(copy.size() for copy in self._copies.values())
+        return sum(copy.count_components() for copy in self._copies.values())
 
     def facts(self) -> dict[str, float | int | str | None]:
         """Sum over copies what counts or costs, and average shares; initialisers of all are named."""
@@ -344,7 +344,7 @@ class OneStationView(View):
 
     def joint_method(self) -> HasJoint | None:
         """Return what knows how levels of stations go together; None where nothing does."""
-        method = getattr(self.inner, "only", None)
+        method = getattr(self.inner, "single", None)
         return method if isinstance(method, HasJoint) else None
 
     def gradient_problem(self) -> str | None:

@@ -79,9 +79,9 @@ class View(Method):
         """See `Method.gradient_problem`."""
         return "what answers faster does so in float32; load the whole model"
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the inner method's."""
-        return self.inner.size()
+        return self.inner.count_components()
 
     def objects(self) -> SiteObjects:
         """Return the inner method's."""
@@ -150,9 +150,9 @@ class Interpolated(View):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; images (B, H, W) of the full grid."""
         result = self.inner.predict(query)
-        return Prediction(self.fill(result.mean), result.variance, result.unknown)
+        return Prediction(self.upsample(result.mean), result.variance, result.unknown)
 
-    def fill(self, image: Tensor) -> Tensor:
+    def upsample(self, image: Tensor) -> Tensor:
         """Fill images (B, h, w) up to (B, H, W)."""
         beside = image.index_select(2, self._next)
         # (B, h, w, stride): flattened, the pixels filled in stand between their two columns.

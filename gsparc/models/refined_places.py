@@ -65,7 +65,7 @@ def errors_of(data: Measurements, known: np.ndarray, asked: float | None, heeds:
     return None
 
 
-def displacements(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor, float]:
+def estimate_place_errors(seen: Linearised, place: Tensor, std: Tensor) -> tuple[Tensor, float]:
     """Return posterior means of errors (P, 3) [m], and what errors of this size gain [nats].
 
     Args:
@@ -111,7 +111,7 @@ def refine_places(
         return none, data.moving[none], f"position_std is not used: {error}"
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
-    moved, gain = displacements(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
+    moved, gain = estimate_place_errors(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
     note = f"errors of places explain the rows left out {gain:+.0f} nats better: positions "
     if gain <= 0:
         return rows, np.zeros_like(data.moving[rows]), f"{note}stay as measured"
@@ -130,16 +130,16 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
         raise ValueError(f"{field.name}: of several tones or antennas one is kept of rows left out")
     turned = batch.rx.rotation.double()
 
-    def at(places: Tensor) -> Batch:
+    def batch_at(places: Tensor) -> Batch:
         if site.moving_end == "tx":
             return replace(batch, tx=places, rx=Pose(batch.rx.position.double(), turned))
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
     def mean(places: Tensor) -> Tensor:
-        return to_real_entries(in_error_unit(field.predict(at(places)).mean, site))
+        return to_real_entries(in_error_unit(field.predict(batch_at(places)).mean, site))
 
     with torch.no_grad():
-        result = field.predict(at(moving))  # what is computed once and kept must not be so inside `jvp`
+        result = field.predict(batch_at(moving))  # what is computed once and kept must not be so inside `jvp`
     assert result.variance is not None
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":

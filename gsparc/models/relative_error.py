@@ -56,7 +56,7 @@ class RelativeErrorRegression(Stored):
         return self.smearing * logarithm.clamp(self.least, self.largest).exp()
 
     @classmethod
-    def of(cls, columns: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
+    def from_rows(cls, columns: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
         """Fit to columns (n, S) float32, and |e|^2 / |h|^2 (n,) of rows that a fit did not see; n > 1."""
         centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(LEAST_SCALE)
         terms = _quadratic((columns - centre) / scale).double().numpy()

@@ -34,40 +34,40 @@ class RunFactors(Stored):
     factors: Tensor
 
     @staticmethod
-    def none() -> RunFactors:
+    def identity() -> RunFactors:
         """Return the factors of channels that are all in phase."""
         return RunFactors(np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128))
 
     @staticmethod
-    def several(data: Measurements, rows: np.ndarray) -> bool:
+    def has_several_runs(data: Measurements, rows: np.ndarray) -> bool:
         """Whether rows (n,) are channels of more than one run."""
         return data.site.kind == "csi" and data.run is not None and len(np.unique(data.run[rows])) > 1
 
     def __len__(self) -> int:
         return len(self.runs)
 
-    def of(self, run: Tensor | None) -> Tensor:
+    def look_up(self, run: Tensor | None) -> Tensor:
         """Return factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
         if run is None or len(self) == 1:
             return torch.ones(1, dtype=torch.complex128)
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
         return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
 
-    def restored(self, answer: Prediction, run: Tensor | None) -> Prediction:
+    def restore_run(self, answer: Prediction, run: Tensor | None) -> Prediction:
         """Return a prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
             return answer
-        of = self.of(run).to(answer.mean.device)
+        of = self.look_up(run).to(answer.mean.device)
         factor, level = of[:, None, None].to(answer.mean.dtype), of.abs().square().float()
         variance = None if answer.variance is None else answer.variance * level
         explained = None if answer.explained is None else answer.explained * factor
         return replace(answer, mean=answer.mean * factor, variance=variance, explained=explained)
 
-    def aligned(self, data: Measurements) -> Measurements:
+    def align_channels(self, data: Measurements) -> Measurements:
         """Return the channels in the phase and level of the largest run, as of one run."""
         if data.run is None or len(self) == 1:
             return data
-        factor = self.of(torch.from_numpy(data.run)).numpy()
+        factor = self.look_up(torch.from_numpy(data.run)).numpy()
         target = (data.target / factor[:, None, None]).astype(data.target.dtype)
         noise = None if data.noise_variance is None else data.noise_variance / np.abs(factor) ** 2
         return replace(data, target=target, noise_variance=noise, run=None)

@@ -127,12 +127,12 @@ def _refuse_scene(
         raise ValueError(f"init=scene is not possible: {why}")
 
 
-def array_obstacle(site: Site, static_end: str, otherwise: str) -> str | None:
+def array_obstacle(site: Site, static_end: str, wrong_end_message: str) -> str | None:
     """Say why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
     if site.kind != "spectrum":
         return f"the target is {site.kind}, not a spectrum"
     if site.static_end != static_end:
-        return otherwise
+        return wrong_end_message
     # One antenna tells no directions, nor does any array without a wavelength.
     if site.array is None or len(site.array) < 2 or site.wavelength is None:
         return "the dataset declares no array or no carrier"

@@ -46,7 +46,7 @@ class SpectrumLags:
         waves[1:] *= 2
         basis = waves.reshape(self.count, grid.height, grid.width)
         self.pixels = fit_separable(basis.split(BLOCK), LOST)  # in float64
-        self._basis = self.pixels.of(basis.float())
+        self._basis = self.pixels.project(basis.float())
         exact = self._basis.double()  # in float32, rounding would be most of the weakest lags
         gram = exact @ exact.T
         gram.diagonal().add_(RIDGE * gram.diagonal().mean())
@@ -62,9 +62,9 @@ class SpectrumLags:
         angle = directions @ self._differences
         return torch.cat([self._share * angle.cos(), self._share[1:] * angle[..., 1:].sin()], dim=-1)
 
-    def of(self, power: Tensor) -> Tensor:
+    def to_lags(self, power: Tensor) -> Tensor:
         """Return lags (n, count) of spectra (n, H, W) in power, by least squares."""
-        return (self.pixels.of(power).double() @ self._inverse).float()
+        return (self.pixels.project(power).double() @ self._inverse).float()
 
     def spectrum(self, lags: Tensor, pixels: Separable | None = None) -> Tensor:
         """Return power (n, H, W), at least 0, of lags (n, count); on `pixels`, thinned ones, if given."""

@@ -67,7 +67,7 @@ class Columns:
     tones: Tensor
 
     @staticmethod
-    def of(direction: Tensor, delay: Tensor, aperture: Aperture) -> Columns:
+    def from_sources(direction: Tensor, delay: Tensor, aperture: Aperture) -> Columns:
         """Return columns of sources with direction cosines (B, N, 2) and delays (B, N)."""
         over_antennas = antenna_responses(direction, aperture)[:, None]
         over_tones = tone_responses(delay, aperture)[:, None]

@@ -19,8 +19,8 @@ class Separable:
     """A basis of images.
 
     Attributes:
-        rows: (H, R) float32; orthonormal columns unless `thinned`.
-        columns: (C, W) float32; orthonormal rows unless `thinned`.
+        rows: (H, R) float32; orthonormal columns unless of fewer pixels.
+        columns: (C, W) float32; orthonormal rows unless of fewer pixels.
     """
 
     rows: Tensor
@@ -31,7 +31,7 @@ class Separable:
         """Height and width [pixels]."""
         return len(self.rows), self.columns.shape[1]
 
-    def of(self, images: Tensor) -> Tensor:
+    def project(self, images: Tensor) -> Tensor:
         """Return coefficients (n, R * C) of images (n, H, W), by least squares."""
         return ((self.rows.T @ images) @ self.columns.T).flatten(1)
 
@@ -39,8 +39,8 @@ class Separable:
         """Return images (n, H, W) of coefficients (n, R * C)."""
         return self.rows @ (coefficients.unflatten(1, (-1, len(self.columns))) @ self.columns)
 
-    def thinned(self, stride: int) -> Separable:
-        """Return the basis of every `stride`-th pixel; coefficients stay, `of` means nothing then."""
+    def subsample_pixels(self, stride: int) -> Separable:
+        """Return the basis of every `stride`-th pixel; coefficients stay, `project` means nothing then."""
         return Separable(self.rows[::stride].contiguous(), self.columns[:, ::stride].contiguous())
 
 

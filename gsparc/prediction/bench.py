@@ -116,17 +116,17 @@ def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
     yield from _around(count, draw)
 
 
-def _around(count: int, draw: torch.Generator) -> Iterator[Case]:
+def _around(count: int, generator: torch.Generator) -> Iterator[Case]:
     """What stands beside the rasterizer: networks of emission and the sum of a channel."""
     emission = random_model(count, "tangent").emission
     layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
-    encoded = emission.encoding(torch.randn(BATCH, 3, generator=draw))
+    encoded = emission.encoding(torch.randn(BATCH, 3, generator=generator))
     of = f"{count} x {BATCH}"
     yield Case("emission", of, lambda: networks(encoded, *layers), lambda: plain_networks(encoded, *layers))
-    steering = torch.randn(count, ANTENNAS, 2, generator=draw)
+    steering = torch.randn(count, ANTENNAS, 2, generator=generator)
     # Up to 100 ns, as in a room, and in float64: at 2.4 GHz these are 240 turns.
-    delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
-    gains = torch.randn(1, count, 2, generator=draw)
+    delays = 1e-7 * torch.rand(count, generator=generator, dtype=torch.float64)
+    gains = torch.randn(1, count, 2, generator=generator)
     yield Case(
         "channel", f"{count} to {ANTENNAS} x {SUBCARRIERS}",
         lambda: channels(gains, steering, delays, *TONES, SUBCARRIERS),
@@ -165,7 +165,7 @@ def _learning(model: GaussianModel) -> Callable[[], Tensor]:
 
     def call() -> Tensor:
         optimizer.zero_grad(set_to_none=True)
-        image = model.raster(model.features(tx, Pose.identity(tx)), Pose.identity(torch.zeros(3))).image
+        image = model.rasterize(model.features(tx, Pose.identity(tx)), Pose.identity(torch.zeros(3))).image
         result = spectrum_loss(image.squeeze(1), target).mean()
         result.backward()
         optimizer.step()

@@ -111,7 +111,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
     rows = torch.from_numpy(known)
-    white = Factor.of(kernel.gram(rows)).whiten(kernel.between(rows, torch.from_numpy(places)))
+    white = Factor.from_gram(kernel.gram(rows)).whiten(kernel.between(rows, torch.from_numpy(places)))
     # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
     return (1 + kernel.noise - white.square().sum(0)).numpy()
 

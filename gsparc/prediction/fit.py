@@ -95,7 +95,7 @@ def fit(
 def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
     """Arrays of the schema with powers in a unit: watts, or decibels as they are."""
     unknown = unit in ("dB", LINEAR)  # what they refer to
-    given = PowerUnit.of(str(unit), "dB" if unknown else "dBW")
+    given = PowerUnit.from_name(str(unit), "dB" if unknown else "dBW")
     if given.decibels:
         return Raw({**arrays, "rssi_db": powers}, {"level_unit": given.name})
     if "noise_variance" in arrays:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from gsparc.data.schema import Site
-from gsparc.models.method import HasJoint, HasProcess, Method
+from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
 from gsparc.models.per_station import OneStationView, PerStation
 from gsparc.prediction.query import Queries
 
@@ -20,8 +20,8 @@ class JointMixin:
     method: Method
     queries: Queries
 
-    def predict_joint(self, places: Any, stations: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return levels (G, k) of measurements, covariances (G, k, k) and noise (k,), float64.
+    def predict_joint(self, places: Any, stations: Any) -> JointLevels | None:
+        """Return levels with the covariances of their errors, float64.
 
         Levels are in decibels of `site.level_unit`, the rest [dB^2]. None: nothing is known of how levels of
         stations go together.
@@ -45,7 +45,7 @@ class JointMixin:
         if (known := self._known()) is None:
             return None
         still = np.asarray(station, np.float64) - self.site.origin
-        more = known.with_station(still, torch.as_tensor(sectors, dtype=torch.float64))
+        more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64))
         count = 0 if self.site.stations is None else len(self.site.stations)
         level, covariance, _ = self._together(more, places, count + torch.arange(len(sectors)))
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -54,19 +54,17 @@ class JointMixin:
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None
         return None if every is None else every.joint_method()
 
-    def _together(
-        self, known: HasJoint, places: Any, stations: torch.Tensor
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _together(self, known: HasJoint, places: Any, stations: torch.Tensor) -> JointLevels:
         moving = torch.from_numpy(np.asarray(places, np.float64) - self.site.origin)
         if moving.dim() == 2:
             moving = moving[:, None].expand(-1, len(stations), 3)
         level, covariance, noise = (part.numpy() for part in known.predict_joint(moving, stations))
-        return level + 10 * np.log10(self.site.target_scale), covariance, noise
+        return JointLevels(level + 10 * np.log10(self.site.target_scale), covariance, noise)
 
     def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float]:
         """Return the covariance (B, B) of the power's errors at B places, and a measurement's noise [dB^2].
 
-        Of several stations of one of them, see `Predictor.at`.
+        Of several stations of one of them, see `Predictor.select_station`.
 
         >>> covariance, noise = predictor.covariance(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
         >>> covariance.shape, bool(covariance[0, 1] < covariance[0, 0]), noise > 0

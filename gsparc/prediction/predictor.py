@@ -95,10 +95,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         free = self.site.freedom
         return "all" if free == "none" else f"up to {freedom_words(free)} of each row"
 
-    def at(self, station: str | int) -> Predictor:
+    def select_station(self, station: str | int) -> Predictor:
         """Return the same model asked about one station alone, by name or number.
 
-        >>> gsparc.load("city.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
+        >>> gsparc.load("city.ckpt").select_station("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
         (1,)
 
         Raises:
@@ -106,10 +106,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         """
         stations = self.site.stations
         if stations is None:
-            raise ValueError(f"at: {self.site.name} has one static end, and no stations")
+            raise ValueError(f"select_station: {self.site.name} has one static end, and no stations")
         number = find_station(station, stations)
         if number is None:
-            raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
+            raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
         method, whole = (
             one.copy_for(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
@@ -218,7 +218,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         for name in () if self.site.stations is None else self.site.stations.name:
             stations.append(None)
             with suppress(ValueError):
-                stations[-1] = self.at(name)
+                stations[-1] = self.select_station(name)
         return stations
 
     def cycle_places(self, places: np.ndarray) -> Call:

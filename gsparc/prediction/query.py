@@ -76,7 +76,7 @@ class Queries:
             if place is not None:
                 return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
-                raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
+                raise ValueError(f"use select_station(name): one of {', '.join(self.site.stations.name)}")
             if self.site.kind in ("rssi", "csi"):  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
@@ -152,7 +152,7 @@ class DegreesMixin:
         """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
 
         >>> city = gsparc.load("city.ckpt")
-        >>> city.at("roof-3").rssi(rx=city.metres(40.7652, -111.8348)).shape
+        >>> city.select_station("roof-3").rssi(rx=city.metres(40.7652, -111.8348)).shape
         (1,)
 
         Args:

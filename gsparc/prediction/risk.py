@@ -133,7 +133,7 @@ def threshold_levels(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
 
 
 def choose_threshold(
-    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Guarantee,
+    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, guarantee: Guarantee,
     group: np.ndarray | None = None,
 ) -> Threshold:  # fmt: skip
     """Choose the laxest threshold that the calibration set (n,) supports.
@@ -153,11 +153,11 @@ def choose_threshold(
     for level in (*levels, -np.inf):
         rows = score >= level
         accepted, wrong = int(rows.sum()), int(bad[rows].sum())
-        if accepted < promise.least or (level == -np.inf and threshold.accepted):
+        if accepted < guarantee.least or (level == -np.inf and threshold.accepted):
             continue
         effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
         # A fixed sequence: as the first test that fails ends it, delta need not be divided among the tests.
-        if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:
+        if _tail(wrong / effect, accepted / effect, guarantee.alpha) > guarantee.delta:
             break
         threshold = Threshold(float(level), accepted, wrong)
     return threshold
@@ -289,7 +289,7 @@ def split_evidence(
     return choose_on, calibrate, test
 
 
-def explain_too_few(count: int, promise: Guarantee, bad: float = 0.0) -> str | None:
+def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0) -> str | None:
     """Say how many test positions a promise needs of which a share `bad` is bad; None: not more than `count`.
 
     >>> explain_too_few(32, Guarantee(alpha=0.2))  # enough
@@ -297,23 +297,23 @@ def explain_too_few(count: int, promise: Guarantee, bad: float = 0.0) -> str | N
     '32 test positions are too few: alpha=0.2, delta=0.1 with 10% bad need 35 to calibrate on, 88 in all'
     """
     # A share of alpha or more passes with no number: what none bad would need is the least.
-    bad = bad if bad < promise.alpha else 0.0
-    least = np.arange(promise.least, MOST_CALIBRATED)
-    passed = least[_tail(bad * least, least, promise.alpha) <= promise.delta]
+    bad = bad if bad < guarantee.alpha else 0.0
+    least = np.arange(guarantee.least, MOST_CALIBRATED)
+    passed = least[_tail(bad * least, least, guarantee.alpha) <= guarantee.delta]
     if not len(passed) or count >= (needed := int(np.ceil(passed[0] / SHARES[1]))):
         return None
     return (
-        f"{count} test positions are too few: alpha={promise.alpha:g}, delta={promise.delta:g} with "
+        f"{count} test positions are too few: alpha={guarantee.alpha:g}, delta={guarantee.delta:g} with "
         f"{bad:.0%} bad need {passed[0]} to calibrate on, {needed} in all; measure more, or promise less"
     )
 
 
 def relax_guarantee(
-    evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int
+    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int
 ) -> Guarantee | None:
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
-    for limit in range(int(np.floor(promise.limit_db)) + 1, MOST_LAX_DB + 1):
-        other = replace(promise, limit_db=float(limit))
+    for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
+        other = replace(guarantee, limit_db=float(limit))
         if calibrate_threshold(evidence, other, kind, spatial, seed)[1].accepted:
             return other
     return None
@@ -358,7 +358,7 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 
 
 def calibrate_threshold(
-    evidence: Evidence, promise: Guarantee, kind: str, spatial: bool, seed: int | list[int],
+    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int | list[int],
     apart_m: float = 0,
 ) -> tuple[str, Threshold, np.ndarray, np.ndarray]:  # fmt: skip
     """Return confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
@@ -371,19 +371,19 @@ def calibrate_threshold(
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
-    score, bad = evidence.scores[used], promise.is_bad(evidence.error)
+    score, bad = evidence.scores[used], guarantee.is_bad(evidence.error)
     if apart_m > 0:  # neighbours err together and count as one
         calibrate = thin_rows(evidence.position, calibrate, apart_m, rng)
     # Divided at random, accepted positions are independent draws, and their counts are binomial.
     patch = number_patches(evidence.position)[calibrate] if spatial else None
     threshold = choose_threshold(
-        score[calibrate], bad[calibrate], threshold_levels(score[choose_on]), promise, patch
+        score[calibrate], bad[calibrate], threshold_levels(score[choose_on]), guarantee, patch
     )
     return used, threshold, test, choose_on
 
 
 def run_trials(
-    evidence: Evidence, promise: Guarantee, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
+    evidence: Evidence, guarantee: Guarantee, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
     seed: int = 0,
 ) -> Trial:  # fmt: skip
     """Resample `draws` calibration sets.
@@ -398,20 +398,20 @@ def run_trials(
         seed: of the draws.
     """
     realised, coverage, kinds = [], [], []
-    bad = promise.is_bad(evidence.error)
+    bad = guarantee.is_bad(evidence.error)
     for draw in range(draws):
         used, threshold, test, _ = calibrate_threshold(
-            evidence, promise, kind, how == "spatial", [seed, draw], apart_m
+            evidence, guarantee, kind, how == "spatial", [seed, draw], apart_m
         )
         accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
         realised.append(bad[accepted].mean() if len(accepted) else np.nan)
         coverage.append(len(accepted) / max(len(test), 1))
     most = max(set(kinds), key=kinds.count)
-    return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha)
+    return Trial(most, how, np.array(realised), np.array(coverage), guarantee.alpha)
 
 
-def calibration_facts(evidence: Evidence, trials: Sequence[Trial], promise: Guarantee) -> dict[str, Any]:
+def calibration_facts(evidence: Evidence, trials: Sequence[Trial], guarantee: Guarantee) -> dict[str, Any]:
     """Return flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
     loss = bounded_loss(evidence.error)
     perfect = risk_coverage(-loss, loss).mean()
@@ -426,7 +426,7 @@ def calibration_facts(evidence: Evidence, trials: Sequence[Trial], promise: Guar
             "area_below_distance": 1 - area / bar if bar > 0 else None,  # nothing to save
         }  # fmt: skip
         facts |= {f"confidence/{kind}/{name}": value for name, value in own.items()}
-    facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
+    facts |= {f"promise/{name}": value for name, value in vars(guarantee).items()}
     for trial in trials:
         facts |= {f"trial/{trial.how}/{name}": value for name, value in trial.summarise().items()}
     return facts

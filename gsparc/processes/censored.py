@@ -74,7 +74,7 @@ def fit_by_ep(
     value, variance = (start.value, start.variance) if start else _sites(mean, total, level, side)
     settled, before = False, mean
     for _ in range(MOST_SWEEPS):
-        factor = Factor.of(covariance + torch.diag(variance), "raise")
+        factor = Factor.from_gram(covariance + torch.diag(variance), "raise")
         precision = factor.precision
         weights = factor.solve((value - mean)[:, None])[:, 0]
         # The cavity: what all others say of an entry, its own stand-in taken out.
@@ -118,7 +118,7 @@ class ConditionalGaussian:
     log_evidence: float
 
     @classmethod
-    def of(cls, gram: Tensor, values: Tensor, unknown: Tensor) -> ConditionalGaussian:
+    def from_gram(cls, gram: Tensor, values: Tensor, unknown: Tensor) -> ConditionalGaussian:
         """Condition a vector of mean zero on its known entries.
 
         Args:
@@ -127,7 +127,7 @@ class ConditionalGaussian:
             unknown: (n,) bool.
         """
         known = ~unknown
-        factor = Factor.of(gram[known][:, known], "raise")
+        factor = Factor.from_gram(gram[known][:, known], "raise")
         # Cross covariances and values in one solve.
         white = factor.whiten(torch.cat([gram[known][:, unknown], values[known][:, None]], 1))
         cross, white = white[:, :-1], white[:, -1]
@@ -138,7 +138,7 @@ class ConditionalGaussian:
         """Return deviations (m,) that entries lie below `level` (m,) by: beyond `CERTAIN` nothing is told."""
         return (level - self.mean) / self.covariance.diagonal().sqrt()
 
-    def at(self, rows: Tensor) -> ConditionalGaussian:
+    def marginal(self, rows: Tensor) -> ConditionalGaussian:
         """Return the entries `rows` alone."""
         return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
 
@@ -166,17 +166,17 @@ def log_evidence(
     """
     unknown = side != 0
     if not unknown.any():
-        factor = Factor.of(gram, "raise")
+        factor = Factor.from_gram(gram, "raise")
         weights = factor.solve(values[:, None])[:, 0]
         value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
-    known = ConditionalGaussian.of(gram, values, unknown)
+    known = ConditionalGaussian.from_gram(gram, values, unknown)
     begin, within = (last[0] if last else None), SETTLED if last is None else NEARLY
     sites = fit_by_ep(known, values[unknown], side[unknown], begin, within)
     if last is not None:
         last[:] = [sites]
     # A stand-in is a measurement whose noise is its own variance.
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
-    inverse = Factor.of(gram + torch.diag(extra), "raise").inverse
+    inverse = Factor.from_gram(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)
     return known.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse), weights

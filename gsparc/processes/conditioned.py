@@ -21,7 +21,7 @@ from gsparc.processes.left_out import left_out_residuals, left_out_signal
 class Conditioned:
     """n rows of R outputs that share their covariance.
 
-    >>> rows = Conditioned.of(torch.tensor([[2.0, 1.0], [1.0, 2.0]]), torch.tensor([[3.0], [3.0]]))
+    >>> rows = Conditioned.from_gram(torch.tensor([[2.0, 1.0], [1.0, 2.0]]), torch.tensor([[3.0], [3.0]]))
     >>> rows.mean(torch.tensor([[1.0, 1.0]])), rows.explained_variance(torch.tensor([[1.0, 1.0]]))
     (tensor([[2.]]), tensor([0.6667]))
     >>> rows.left_out()[0].T  # 3 less the 1.5 that the other row says
@@ -38,11 +38,11 @@ class Conditioned:
     weights: Tensor
 
     @classmethod
-    def of(
+    def from_gram(
         cls, covariance: Tensor, values: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend"
     ) -> Conditioned:
-        """Condition values (n, R) with a covariance (n, n), noise included; see `Factor.of`."""
-        factor = Factor.of(covariance, failing)
+        """Condition values (n, R) with a covariance (n, n), noise included; see `Factor.from_gram`."""
+        factor = Factor.from_gram(covariance, failing)
         return cls(factor, values, factor.solve(values))
 
     @cached_property

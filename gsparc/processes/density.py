@@ -50,7 +50,7 @@ class LeftOutDensity(torch.autograd.Function):
         Returns:
             The density [nats per output], and the amplitude.
         """
-        count, inverse = len(values), Factor.of(gram.detach(), "raise").inverse
+        count, inverse = len(values), Factor.from_gram(gram.detach(), "raise").inverse
         ratio, share = inverse @ values, inverse.diagonal()
         squared = ratio.square().sum(1)
         # Where the slope by the amplitude is 0: the mean of squared errors over their relative variances.
@@ -102,7 +102,7 @@ class Profiled(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gram: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Score values (n, P) with a covariance (n, n) relative to the amplitude [nats per number]."""
-        factor = Factor.of(gram.detach(), "raise")
+        factor = Factor.from_gram(gram.detach(), "raise")
         weights, (count, outputs) = factor.solve(values), values.shape
         amplitude = (values * weights).mean().clamp_min(TINY)
         ctx.save_for_backward(
@@ -120,7 +120,7 @@ class Profiled(torch.autograd.Function):
 def covariance_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> Tensor:
     """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
 
-    >>> covariance_of(Kernel.of_one(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
+    >>> covariance_of(Kernel.from_length(length=2.0, noise=0.5), torch.zeros(1, 1, dtype=torch.float64))
     tensor([[1.5000]], dtype=torch.float64)
 
     Args:
@@ -188,9 +188,9 @@ def fit_kernel(
         bounds, looks, tolerance: see `minimise`.
     """
     first, points = starts[0], [one.parameters().numpy() for one in starts]
-    best, _ = minimise(lambda at: objective(first.at(at))[0], points, bounds, looks, tolerance)
+    best, _ = minimise(lambda at: objective(first.with_values(at))[0], points, bounds, looks, tolerance)
     with torch.no_grad():
-        kernel = first.at(torch.from_numpy(best))
+        kernel = first.with_values(torch.from_numpy(best))
         value, amplitude = objective(kernel)
     return float(value), replace(kernel, amplitude=float(amplitude))
 

@@ -40,10 +40,10 @@ class NotDefiniteError(ValueError):
 class Factor:
     """`K = L L^H`.
 
-    >>> factor = Factor.of(torch.tensor([[4.0, 2.0], [2.0, 3.0]]))
+    >>> factor = Factor.from_gram(torch.tensor([[4.0, 2.0], [2.0, 3.0]]))
     >>> factor.solve(torch.tensor([[8.0], [7.0]])).T
     tensor([[1.2500, 1.5000]])
-    >>> Factor.of(torch.tensor([[1.0, 2.0], [2.0, 1.0]]), failing="raise")
+    >>> Factor.from_gram(torch.tensor([[1.0, 2.0], [2.0, 1.0]]), failing="raise")
     Traceback (most recent call last):
         ...
     gsparc.processes.factor.NotDefiniteError: a covariance is not positive definite
@@ -55,7 +55,7 @@ class Factor:
     lower: Tensor
 
     @classmethod
-    def of(cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend") -> Factor:
+    def from_gram(cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend") -> Factor:
         """Factor a Hermitian covariance (..., n, n); in float64 and with a ridge where there is none without.
 
         Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is

@@ -79,7 +79,7 @@ def whitened_features(rows: Tensor, length: float, noise: float, name: Correlati
     if len(rows) <= most:
         gram = correlation(rows, rows, length, name)
         gram.diagonal().add_(noise)
-        root = Factor.of(gram).root
+        root = Factor.from_gram(gram).root
         # C = L^-T, as C C^T is to be the inverse of the covariance.
         return Features(rows, root.T.contiguous(), root)
     return place_features(
@@ -91,7 +91,7 @@ def place_features(places: Tensor, rows: Tensor, length: float, noise: float, na
     """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened_features`."""
     own = correlation(places, places, length, name)
     own.diagonal().add_(JITTER)
-    factor = Factor.of(own)
+    factor = Factor.from_gram(own)
     seen = factor.whiten(correlation(places, rows, length, name))
     size, turn = torch.linalg.eigh(seen @ seen.T)
     size = size.clamp_min(LEAST)

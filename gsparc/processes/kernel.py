@@ -101,7 +101,7 @@ class Stationary(Term[Tensor]):
         """See `Term`."""
         return [(math.log(scale * LENGTH_SPAN[0]), math.log(scale * LENGTH_SPAN[1]))]
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """See `Term`."""
         return replace(self, length=to_number(parameters[0].exp()))
 
@@ -196,7 +196,7 @@ class WhiteNoise(Term[Tensor]):
         """See `Term`."""
         return [(math.log(NOISE_SPAN[0]), math.log(NOISE_SPAN[1]))]
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """See `Term`."""
         return replace(self, share=to_number(parameters[0].exp()))
 
@@ -205,10 +205,10 @@ class WhiteNoise(Term[Tensor]):
 class Kernel(Stored):
     """`amplitude (sum of terms)`, white noise the last of them.
 
-    >>> kernel = Kernel.matern(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
+    >>> kernel = Kernel.from_lengths(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
     >>> kernel.gram(torch.zeros(1, 2, dtype=torch.float64))  # one place: its variance and that of the noise
     tensor([[1.1000]], dtype=torch.float64)
-    >>> torch.allclose(kernel.at(kernel.parameters()).parameters(), kernel.parameters())
+    >>> torch.allclose(kernel.with_values(kernel.parameters()).parameters(), kernel.parameters())
     True
 
     Attributes:
@@ -220,14 +220,14 @@ class Kernel(Stored):
     amplitude: float = 1.0
 
     @classmethod
-    def of_one(
+    def from_length(
         cls, length: float, noise: float, amplitude: float = 1.0, term: type[Stationary] = Shadowing
     ) -> Self:
         """Return a kernel of one term of a length [m] and of noise."""
         return cls((term(length), WhiteNoise(noise)), amplitude)
 
     @classmethod
-    def matern(
+    def from_lengths(
         cls, lengths: Sequence[float], shares: Sequence[float], noise: float, amplitude: float = 1.0
     ) -> Self:
         """Return a kernel of several `Shadowing` and of noise."""
@@ -262,7 +262,7 @@ class Kernel(Stored):
     def description(self) -> str:
         """One line of lengths and noise.
 
-        >>> Kernel.matern((0.5, 2.0), (0.25, 0.75), noise=0.1).description
+        >>> Kernel.from_lengths((0.5, 2.0), (0.25, 0.75), noise=0.1).description
         "lengths 0.5 m (25%) and 2 m (75%), noise 0.1 of the signal's variance"
         """
         parts = [f"{length:.4g} m" for length in self.lengths]
@@ -309,7 +309,7 @@ class Kernel(Stored):
     def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
         """Return bounds of the parameters, for rows at distances (...) [m].
 
-        >>> [round(low, 2) for low, _ in Kernel.of_one(1.0, 1.0).bounds(torch.tensor([10.0]))]
+        >>> [round(low, 2) for low, _ in Kernel.from_length(1.0, 1.0).bounds(torch.tensor([10.0]))]
         [-4.61, -13.82]
         """
         # All rows may stand at one place, whose distances are 0.
@@ -318,16 +318,16 @@ class Kernel(Stored):
         shares = [(-SHARES, SHARES)] * (len(lengths) - 1)
         return [*chain(*lengths), *shares, *noise]
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """Return the kernel of other parameters; numbers are tensors where gradients flow."""
         sizes, count = [len(term.parameters()) for term in self.terms], len(self.terms) - 1
         *numbers, logits, noise = parameters.split([*sizes[:-1], count - 1, sizes[-1]])
-        signals = tuple(term.at(own) for term, own in zip(self.signals, numbers, strict=True))
+        signals = tuple(term.with_values(own) for term, own in zip(self.signals, numbers, strict=True))
         if count > 1:
             # Of logits all shares lie between 0 and 1, whatever a step does.
             shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
             signals = tuple(replace(one, share=to_number(s)) for one, s in zip(signals, shares, strict=True))
-        return replace(self, terms=(*signals, self.terms[-1].at(noise)))
+        return replace(self, terms=(*signals, self.terms[-1].with_values(noise)))
 
 
 def to_number(value: Tensor) -> Tensor | float:

@@ -44,7 +44,7 @@ def left_out_residuals(
 
 def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
     """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s)."""
-    block = Factor.of(inverse[rows[:, None], rows])
+    block = Factor.from_gram(inverse[rows[:, None], rows])
     return block.solve(weights[rows]), block.inverse
 
 
@@ -66,7 +66,7 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
         block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])
         block.diagonal(dim1=1, dim2=2).add_((~valid).to(block.dtype))
         unit = ((index == rows[part, None]) & valid).to(block.dtype)
-        share = Factor.of(block, "raise").solve(unit[..., None])[..., 0] * valid
+        share = Factor.from_gram(block, "raise").solve(unit[..., None])[..., 0] * valid
         residual[part] = torch.einsum("cm,cmr->cr", share.to(weights.dtype), weights[index])
         variance[part] = (share * unit).sum(1).real
     return residual, variance

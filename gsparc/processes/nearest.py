@@ -54,7 +54,7 @@ def kriging_weights(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
         gram: (B, k, k) covariances of the near values, with their noise.
         cross: (B, k) of the places with them.
     """
-    weights = Factor.of(gram, "raise").solve(cross[..., None])[..., 0]
+    weights = Factor.from_gram(gram, "raise").solve(cross[..., None])[..., 0]
     return weights, (weights * cross).sum(-1)
 
 
@@ -69,7 +69,7 @@ def neighbour_weights(kernel: Kernel, places: Tensor, near: Tensor, noise: Tenso
 class PlaceValues:
     """Places, each once, and what was measured there.
 
-    >>> values = PlaceValues.of(np.zeros((2, 3)), torch.tensor([[1.0], [3.0]], dtype=torch.float64))
+    >>> values = PlaceValues.from_rows(np.zeros((2, 3)), torch.tensor([[1.0], [3.0]], dtype=torch.float64))
     >>> values.values, values.count  # two rows of one place
     (tensor([[2.]], dtype=torch.float64), tensor([2.], dtype=torch.float64))
 
@@ -84,7 +84,7 @@ class PlaceValues:
     count: Tensor
 
     @classmethod
-    def of(cls, places: np.ndarray, values: Tensor) -> PlaceValues:
+    def from_rows(cls, places: np.ndarray, values: Tensor) -> PlaceValues:
         """Average rows at (n, D) with values (n, P) over each place."""
         first, mean, count = mean_at_places(places, values.numpy())
         return cls(places[first], torch.from_numpy(mean), torch.from_numpy(count).double())
@@ -125,23 +125,23 @@ class Nearest(Posterior):
         """See `Posterior`."""
         return torch.from_numpy(self.near.places)
 
-    def answer(self, queries: Tensor, exact: bool = False) -> Answer:
+    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
         """See `Posterior`."""
-        return self._answers(queries, None, exact)
+        return self._answers(queries, None, float64)
 
-    def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
+    def mean_at(self, queries: Tensor, float64: bool = False) -> Tensor:
         """See `Posterior`."""
-        return torch.cat([self._answer(part, None, exact).mean for part in queries.split(self._block)])
+        return torch.cat([self._answer(part, None, float64).mean for part in queries.split(self._block)])
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
         result = self._answers(self.places, np.arange(len(self.places)))
-        return result.mean, result.left
+        return result.mean, result.variance
 
-    def _answers(self, queries: Tensor, without: np.ndarray | None, exact: bool = False) -> Answer:
+    def _answers(self, queries: Tensor, without: np.ndarray | None, float64: bool = False) -> Answer:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
-        parts = (self._answer(queries[b], None if without is None else without[b], exact) for b in blocks)
+        parts = (self._answer(queries[b], None if without is None else without[b], float64) for b in blocks)
         if len(blocks) < 2 or not has_query_kernel(queries):
             return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
         first = next(parts)
@@ -150,14 +150,14 @@ class Nearest(Posterior):
         )
         # Parts kept in a list would lie between freed systems in memory, which then is not used again.
         for block, part in zip(blocks, chain([first], parts), strict=True):
-            result.mean[block], result.left[block] = part.mean, part.left
+            result.mean[block], result.variance[block] = part.mean, part.variance
         return result
 
-    def _answer(self, queries: Tensor, without: np.ndarray | None, exact: bool) -> Answer:
+    def _answer(self, queries: Tensor, without: np.ndarray | None, float64: bool) -> Answer:
         index = torch.from_numpy(self.near.nearest(to_numpy(queries), without, self.most))
         weights, known = self._weights(queries, index)
         rest = self.rest[index]
-        if exact:
+        if float64:
             rest = rest.to(torch.complex128 if rest.is_complex() else torch.float64)
         mean = torch.bmm(weights[:, None].to(rest.dtype), rest)[:, 0]
         left = 1 + self.prior.kernel.noise - known
@@ -191,21 +191,21 @@ class Nearest(Posterior):
         """See `Posterior`."""
         return nearest_distance(self.near.tree, queries)
 
-    def at(self, chosen: np.ndarray, seed: int) -> Self:
+    def subset(self, chosen: np.ndarray, seed: int) -> Self:
         """Return the same given the places `chosen` alone; the mean law's weights stay as all places say."""
-        near = Neighbourhood.of(self.near.places[chosen], seed)
+        near = Neighbourhood.from_places(self.near.places[chosen], seed)
         return replace(self, near=near, rest=self.rest[chosen], noise=self.noise[chosen])
 
 
 def condition_on_nearest(
-    prior: Prior, values: PlaceValues, seed: int, more: PlaceValues | None = None,
-    extra: Tensor | None = None, most: int = NEIGHBOURS,
+    prior: Prior, values: PlaceValues, seed: int, pseudo_values: PlaceValues | None = None,
+    pseudo_variance: Tensor | None = None, neighbours: int = NEIGHBOURS,
 ) -> Nearest:  # fmt: skip
     """Return the process given places, with settings as they are.
 
     >>> line = np.linspace(0.0, 9.0, 10)[:, None]
-    >>> values = PlaceValues.of(line, torch.from_numpy(np.sin(line)))
-    >>> posterior = condition_on_nearest(Prior(Kernel.of_one(3.0, 1e-4)), values, seed=0, most=4)
+    >>> values = PlaceValues.from_rows(line, torch.from_numpy(np.sin(line)))
+    >>> posterior = condition_on_nearest(Prior(Kernel.from_length(3.0, 1e-4)), values, seed=0, neighbours=4)
     >>> posterior.approximation, posterior.answer(torch.tensor([[4.5]], dtype=torch.float64)).mean.shape
     ('Vecchia 4', torch.Size([1, 1]))
 
@@ -219,22 +219,22 @@ def condition_on_nearest(
     """
     # The mean of n measurements has an n-th of their noise.
     noise, every = prior.kernel.noise / values.count, values
-    if more is not None and extra is not None:
-        noise = torch.cat([noise, prior.kernel.noise + extra])
+    if pseudo_values is not None and pseudo_variance is not None:
+        noise = torch.cat([noise, prior.kernel.noise + pseudo_variance])
         every = PlaceValues(
-            np.concatenate([values.places, more.places]),
-            torch.cat([values.values, more.values]),
-            torch.cat([values.count, more.count]),
+            np.concatenate([values.places, pseudo_values.places]),
+            torch.cat([values.values, pseudo_values.values]),
+            torch.cat([values.count, pseudo_values.count]),
         )
-    near = Neighbourhood.of(every.places, seed)
+    near = Neighbourhood.from_places(every.places, seed)
     if prior.trend is None:
         none = torch.zeros(0, every.values.shape[1], dtype=torch.float64)
-        return Nearest(prior, near, every.values, noise, none, none[:, :0], most)
+        return Nearest(prior, near, every.values, noise, none, none[:, :0], neighbours)
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
     chosen = covering_rows(every.places, COVER, seed)
     terms, spread = fit_trend_weights(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
-    return Nearest(prior, near, rest, noise, terms, spread, most)
+    return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
 @torch.no_grad()
@@ -259,7 +259,7 @@ def fit_trend_weights(
     first = min(FIRST, len(places))
     gram = kernel.between(at[:first], at[:first])
     gram.diagonal().add_(noise[:first])
-    white = [Factor.of(gram, "raise").whiten(both[:first])]
+    white = [Factor.from_gram(gram, "raise").whiten(both[:first])]
     start = first
     while start < len(places):
         # The tree of the rows so far serves as many again: few trees for any number of rows.
@@ -274,7 +274,7 @@ def fit_trend_weights(
     flat, outputs = torch.cat(white), rest.shape[1]
     terms, values = flat[:, outputs:], flat[:, :outputs]
     # Linear regression on white rows, whose weights have unit variance before.
-    precision = Factor.of(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
+    precision = Factor.from_gram(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
     return precision.solve(terms.T @ values), precision.inverse
 
 
@@ -297,7 +297,7 @@ class NeighbourSample:
     counts: Tensor
 
     @classmethod
-    def of(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
+    def from_rows(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
         """Split (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
         between = distances(places, places)
         return cls(
@@ -351,17 +351,17 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     noise = start.noise / values.count[chosen]
     about, _ = fit_trend_weights(prior, values.places[chosen], rest[chosen], noise, seed)
     rest = rest - prior.columns(every) @ about
-    level = Neighbourhood.of(values.places, seed).level
+    level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
     for own in sets:
         row = covering_rows(values.places[own], LOOKED_AT // len(sets), seed)
         parts.append(own[rows_with_nearest(values.places[own], row, LOOKED_BY)])
     rows = np.concatenate(parts)
-    sample = NeighbourSample.of(every[rows], rest[rows], values.count[rows])
+    sample = NeighbourSample.from_rows(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
-    starts = [Kernel.matern((long * share, long), shares, start.noise) for share in SHORTER]
+    starts = [Kernel.from_lengths((long * share, long), shares, start.noise) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"

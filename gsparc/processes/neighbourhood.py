@@ -64,7 +64,7 @@ class Neighbourhood(Stored):
     A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
 
     >>> line = np.linspace(0, 100, 11)[:, None]  # every 10 m
-    >>> Neighbourhood.of(line, seed=0).nearest(np.array([[41.0]]), most=2).tolist()
+    >>> Neighbourhood.from_places(line, seed=0).nearest(np.array([[41.0]]), most=2).tolist()
     [[4, 5]]
 
     Attributes:
@@ -76,7 +76,7 @@ class Neighbourhood(Stored):
     level: np.ndarray
 
     @classmethod
-    def of(cls, places: np.ndarray, seed: int) -> Neighbourhood:
+    def from_places(cls, places: np.ndarray, seed: int) -> Neighbourhood:
         """Draw sets of an eighth of the places, of an eighth of these, and so on."""
         rows, sets = np.arange(len(places)), []
         while len(rows) / SPARSER >= FEWEST:

@@ -29,11 +29,11 @@ class Exact(Posterior):
     """Given n rows with one factor.
 
     >>> from gsparc.processes.kernel import Kernel
-    >>> prior = Prior(Kernel.of_one(length=2.0, noise=0.01))
+    >>> prior = Prior(Kernel.from_length(length=2.0, noise=0.01))
     >>> places = torch.tensor([[0.0], [1.0], [2.0]], dtype=torch.float64)  # on a line [m]
-    >>> posterior = Exact.of(prior, places, places.sin())
+    >>> posterior = Exact.from_values(prior, places, places.sin())
     >>> answer = posterior.answer(torch.tensor([[1.0], [90.0]], dtype=torch.float64))
-    >>> answer.mean[:, 0].round(decimals=1), answer.left.round(decimals=1)  # at a row, and far away
+    >>> answer.mean[:, 0].round(decimals=1), answer.variance.round(decimals=1)  # at a row, far away
     (tensor([0.8000, 0.0000], dtype=torch.float64), tensor([0., 1.], dtype=torch.float64))
 
     Attributes:
@@ -49,7 +49,7 @@ class Exact(Posterior):
     extra: Tensor
 
     @classmethod
-    def of(
+    def from_values(
         cls, prior: Prior, places: Tensor, values: Tensor, extra: Tensor | None = None,
         factor: Factor | None = None,
     ) -> Exact:  # fmt: skip
@@ -70,12 +70,12 @@ class Exact(Posterior):
         """Factor of the rows' covariance."""
         return _factor(self.prior, self.rows, self.extra)
 
-    def answer(self, queries: Tensor, exact: bool = False) -> Answer:
+    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
         """See `Posterior`."""
         own = self.prior.columns(queries)
-        cross, prior = self.cross(queries, own), self.prior.variance(own)
+        cross, prior = self.cross_covariance(queries, own), self.prior.variance(own)
         if self._near is not None:
-            return Answer(self._mean(queries, cross), self._near.answer(queries).left.minimum(prior))
+            return Answer(self._mean(queries, cross), self._near.answer(queries).variance.minimum(prior))
         known = self.factor.whiten(cross.T).square().sum(0)
         # Rounding may leave a variance below 0 at a row's place.
         return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
@@ -89,12 +89,12 @@ class Exact(Posterior):
         # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.
         spread = torch.eye(terms.shape[1], dtype=terms.dtype) - terms.T @ terms
         none, noise = self.rows.new_zeros(len(self.rows), 1), self.prior.kernel.noise + self.extra
-        near = Neighbourhood.of(self.rows.numpy(), 0)
+        near = Neighbourhood.from_places(self.rows.numpy(), 0)
         return Nearest(self.prior, near, none, noise, none[: len(spread)], spread, NEAR)
 
-    def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
+    def mean_at(self, queries: Tensor, float64: bool = False) -> Tensor:
         """See `Posterior`."""
-        return self._mean(queries, self.cross(queries, self.prior.columns(queries)))
+        return self._mean(queries, self.cross_covariance(queries, self.prior.columns(queries)))
 
     def distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
@@ -104,7 +104,7 @@ class Exact(Posterior):
         result = weighted_sum(cross, self.weights)
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
-    def cross(self, queries: Tensor, own: Tensor) -> Tensor:
+    def cross_covariance(self, queries: Tensor, own: Tensor) -> Tensor:
         """Return covariances (B, n) of places (B, D), whose terms are `own` (B, Q), with the rows."""
         result = self.prior.kernel.between(queries, self.rows)
         return result if self.prior.trend is None else result.addmm(own, self._columns.T)
@@ -120,17 +120,17 @@ class Exact(Posterior):
 
     def left_out(self) -> tuple[Tensor, Tensor]:
         """See `Posterior`."""
-        residual, variance = self.residual()
+        residual, variance = self.left_out_residual()
         return self.values() - residual, variance
 
-    def residual(self) -> tuple[Tensor, Tensor]:
+    def left_out_residual(self) -> tuple[Tensor, Tensor]:
         """Return what all other rows miss of each (n, P), and its variance (n,)."""
         return left_out_residuals(self.factor.precision, self.weights)
 
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:
         """Return the covariance (B, B) of the signal at places (B, D), in the kernel's units."""
-        cross = self.cross(queries, self.prior.columns(queries))
+        cross = self.cross_covariance(queries, self.prior.columns(queries))
         white = self.factor.whiten(cross.T)
         return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
 
@@ -142,7 +142,7 @@ def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
         # One triangle, all that a factor reads, in blocks that stay in the processor's caches.
         gram[part, : start + BLOCK] = prior.between(places[part], places[: start + BLOCK])
     gram.diagonal().add_(prior.kernel.noise + extra)
-    return Factor.of(gram, "raise")
+    return Factor.from_gram(gram, "raise")
 
 
 def approximation_label(name: str, posterior: Posterior | None) -> str:

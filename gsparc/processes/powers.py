@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -51,14 +51,14 @@ class PowerRows:
         """Rows (n,) bool of which a level is known, not a power."""
         return self.side != 0
 
-    def at(self, chosen: np.ndarray) -> Self:
+    def subset(self, chosen: np.ndarray) -> Self:
         """Return the rows `chosen`."""
         return type(self)(*(part[chosen] for part in vars(self).values()))
 
     @property
     def measured(self) -> Self:
         """Those that were measured."""
-        return self.at(np.flatnonzero(~self.silent))
+        return self.subset(np.flatnonzero(~self.silent))
 
     @property
     def heard(self) -> Self:
@@ -67,7 +67,7 @@ class PowerRows:
 
     def means_at_places(self) -> PlaceValues:
         """Return means (m, 1) [dB] over the rows of each place."""
-        return PlaceValues.of(self.places, torch.from_numpy(self.decibels)[:, None])
+        return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
     def regression_about(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
         """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
@@ -75,9 +75,9 @@ class PowerRows:
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
         return distances(places, places), trend.columns(places), rest[:, None]
 
-    def draw(self, most: int, seed: int) -> Self:
+    def draw_subset(self, most: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
-        return self.at(draw_rows(self.silent, most, seed))
+        return self.subset(draw_rows(self.silent, most, seed))
 
 
 def draw_rows(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
@@ -98,8 +98,22 @@ def draw_rows(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
 def trend_about_rows(rows: PowerRows, law: Law | None) -> Trend:
     """Return a trend about a law; about the mean of what was heard where that is None."""
     if law is not None:
-        return Trend.about(law, torch.from_numpy(rows.places))
+        return Trend.from_law(law, torch.from_numpy(rows.places))
     return Trend(float(rows.heard.decibels.mean()))
+
+
+class PowerAnswer(NamedTuple):
+    """What is said of B places.
+
+    Attributes:
+        mean: (B,) [dB].
+        variance: (B,) of a measurement [dB^2].
+        unknown: (B,) in [0, 1].
+    """
+
+    mean: Tensor
+    variance: Tensor
+    unknown: Tensor
 
 
 @dataclass(frozen=True)
@@ -137,8 +151,8 @@ class PowerProcess(Stored):
         """Places of the rows (n, 3) or (n, 6) [m]."""
         return self.posterior.places.numpy()
 
-    def answer(self, queries: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the mean [dB], variance of a measurement [dB^2], and what is unknown, in [0, 1], each (B,).
+    def answer(self, queries: Tensor) -> PowerAnswer:
+        """Predict powers at places (B, 3) or (B, 6) [m].
 
         Unknown is the variance as a share of that of the known rows. What the mean law explains of them
         counts as known near them only: its slope says nothing of places far from all data.
@@ -146,15 +160,15 @@ class PowerProcess(Stored):
         if self.others:
             parts = [(share, *one.answer(queries)) for share, one in self.members]
             mean, variance = mixture_moments([part[:3] for part in parts])
-            return mean, variance, sum((part[0] * part[3] for part in parts), torch.zeros_like(mean))
+            return PowerAnswer(mean, variance, sum((p[0] * p[3] for p in parts), torch.zeros_like(mean)))
         result = self.posterior.answer(queries)
         own = 1 + self.kernel.noise
         whole = max(self.heard, own)
         by_law = 1 - own / whole  # share of that variance
         far = self.posterior.distance(queries) / self._reach
         # What the law explains counts as unknown where no row is near.
-        unknown = result.left / whole + by_law * (1 - (-far.square()).exp())
-        return result.mean[:, 0], self.kernel.amplitude * result.left, unknown.clamp_max(1.0)
+        unknown = result.variance / whole + by_law * (1 - (-far.square()).exp())
+        return PowerAnswer(result.mean[:, 0], self.kernel.amplitude * result.variance, unknown.clamp_max(1.0))
 
     @cached_property
     def _reach(self) -> float:
@@ -181,7 +195,7 @@ class PowerProcess(Stored):
             parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
         return mixture_moments(parts)
 
-    def exact(self) -> PowerProcess:
+    def with_exact_posterior(self) -> PowerProcess:
         """Return the first alone, with covariances between places; of many rows, given some of them."""
         nearest = self.posterior
         if not isinstance(nearest, Nearest):
@@ -190,7 +204,7 @@ class PowerProcess(Stored):
         places, prior = torch.from_numpy(self.places[few]), nearest.prior
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
-        return replace(self, posterior=Exact.of(prior, places, values, extra), others=())
+        return replace(self, posterior=Exact.from_values(prior, places, values, extra), others=())
 
 
 def condition_on_powers(
@@ -205,7 +219,7 @@ def condition_on_powers(
         least: silent rows that are used where fewer were heard.
     """
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
-        return _exact(rows.draw(MOST_ROWS, seed), prior, least)
+        return _exact_process(rows.draw_subset(MOST_ROWS, seed), prior, least)
     loud = rows.measured
     values = loud.means_at_places()
     share = values.count / values.count.sum()
@@ -214,8 +228,8 @@ def condition_on_powers(
     note = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
     if not rows.silent.any():
         return PowerProcess(condition_on_nearest(prior, values, seed), heard), (note,)
-    part = rows.draw(MOST_ROWS, seed)
-    few, notes = _exact(part, prior, least)
+    part = rows.draw_subset(MOST_ROWS, seed)
+    few, notes = _exact_process(part, prior, least)
     posterior = few.posterior
     assert isinstance(posterior, Exact)
     quiet = posterior.extra > 0
@@ -229,11 +243,11 @@ def condition_on_powers(
     return PowerProcess(nearest, heard), (note, of, *notes)
 
 
-def _exact(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
+def _exact_process(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
     counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
     notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
     places, decibels, extra, factor = _with_pseudo_values(rows, prior, least, notes)
-    posterior = Exact.of(prior, places, decibels[:, None], extra, factor)
+    posterior = Exact.from_values(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
     heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
     return PowerProcess(posterior, heard), tuple(notes)
@@ -252,7 +266,7 @@ def _with_pseudo_values(
     gram.diagonal().add_(prior.kernel.noise)
     # In deviations of the process, as its covariance has amplitude 1.
     unit = (decibels - mean) / deviation
-    known, level = ConditionalGaussian.of(gram, unit, silent), unit[silent]
+    known, level = ConditionalGaussian.from_gram(gram, unit, silent), unit[silent]
     side = torch.from_numpy(rows.side)[silent]
     doubt = side * known.z_score(level)
     near = (doubt < CERTAIN).nonzero()[:, 0]
@@ -263,7 +277,7 @@ def _with_pseudo_values(
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
-        sites = fit_by_ep(known.at(near), level[near], side[near])
+        sites = fit_by_ep(known.marginal(near), level[near], side[near])
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:
@@ -271,4 +285,4 @@ def _with_pseudo_values(
     used = torch.cat([(~silent).nonzero()[:, 0], at]).sort().values
     gram = gram[used[:, None], used]
     gram.diagonal().add_(extra[used])
-    return places[used], decibels[used], extra[used], Factor.of(gram, "raise")
+    return places[used], decibels[used], extra[used], Factor.from_gram(gram, "raise")

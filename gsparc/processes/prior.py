@@ -41,11 +41,11 @@ class Prior(Stored):
         """Return terms (n, Q) at places (n, D) [m]."""
         return places.new_zeros(len(places), 0) if self.trend is None else self.trend.columns(places)
 
-    def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return `mean` and `columns` at once, which may have much in common."""
         if self.trend is None:
             return self.mean(places), self.columns(places)
-        mean, columns = self.trend.parts(places)
+        mean, columns = self.trend.mean_and_columns(places)
         return mean[:, None], columns
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ class Answer:
     """
 
     mean: Tensor
-    left: Tensor
+    variance: Tensor
 
 
 class Posterior(Stored, ABC):
@@ -84,14 +84,14 @@ class Posterior(Stored, ABC):
         """Places of the rows (n, D) float64 [m]."""
 
     @abstractmethod
-    def answer(self, queries: Tensor, exact: bool = False) -> Answer:
+    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
         """Answer at places (B, D) float64 [m], with autograd; which rows are nearest has no gradient.
 
-        Values of very many rows may be float32, and means with them; `exact`: they are made float64.
+        Values of very many rows may be float32, and means with them; `float64`: they are made so.
         """
 
     @abstractmethod
-    def mean_at(self, queries: Tensor, exact: bool = False) -> Tensor:
+    def mean_at(self, queries: Tensor, float64: bool = False) -> Tensor:
         """Return the mean alone (B, P), as `answer` has it."""
 
     @abstractmethod

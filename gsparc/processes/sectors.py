@@ -80,9 +80,9 @@ class Sectors(Trend):
 
     def mean(self, places: Tensor) -> Tensor:
         """See `Trend`."""
-        return self.at(places, self.shared, self.levels)
+        return self.powers_at(places, self.shared, self.levels)
 
-    def at(  # type: ignore[override]
+    def powers_at(  # type: ignore[override]
         self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None
     ) -> Tensor:
         """Return powers (..., n) [dB] for shared parameters (..., 6), levels; a sector's own (..., 4)."""
@@ -91,10 +91,10 @@ class Sectors(Trend):
         decades = self.law.decades(places) - self.middle
         exponent, bend = shared.unsqueeze(-1).unbind(-2)[:2]
         level = levels[self.band[number]] + self.table[number, 4] - 10 * exponent * decades
-        return level - bend * decades.square() - self.loss(places, shared, own)
+        return level - bend * decades.square() - self.pattern_loss(places, shared, own)
 
-    def loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
-        """Return what patterns take off (..., n) [dB]; see `at`."""
+    def pattern_loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
+        """Return what patterns take off (..., n) [dB]; see `powers_at`."""
         azimuth, tilt, width, height, _ = self.table[sector_of(places).long()].T
         shared = self.shared if shared is None else shared
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
@@ -118,7 +118,7 @@ class Sectors(Trend):
         The latter (n, 10) [dB] are central differences, half a spread to either side.
         """
         shared, own = STEPS.split((len(SHARED), len(OWN_SPREAD) - 1), 1)
-        ends = self.at(places, self.shared + shared, self.levels, own)
+        ends = self.powers_at(places, self.shared + shared, self.levels, own)
         return ends[-1], ((ends[: len(STEPS) // 2] - ends[len(STEPS) // 2 : -1]) / (2 * STEP)).T
 
     def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
@@ -129,9 +129,9 @@ class Sectors(Trend):
 
     def columns(self, places: Tensor) -> Tensor:
         """See `Trend`: each sector's azimuth, tilt, width, floor and slope; what all share."""
-        return self.parts(places)[1]
+        return self.mean_and_columns(places)[1]
 
-    def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """See `Trend`."""
         assert self.law is not None
         (mean, slopes), decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
@@ -177,7 +177,7 @@ class SectorShadowing(Term[Tensor]):
         lengths = ExponentialShadowing(scale).bounds(scale) * len(self.lengths)
         return lengths + [(math.log(SHARE_SPAN[0]), math.log(SHARE_SPAN[1]))] * len(self.shares)
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """See `Term`."""
         lengths, shares = parameters.exp().split((len(self.lengths), len(self.shares)))
         return replace(self, lengths=tuple(map(to_number, lengths)), shares=tuple(map(to_number, shares)))

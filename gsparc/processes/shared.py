@@ -38,7 +38,7 @@ class Block:
     values: Tensor
 
     @classmethod
-    def of(cls, process: Exact, columns: Tensor) -> Block:
+    def from_process(cls, process: Exact, columns: Tensor) -> Block:
         """Whiten a process with shared columns (n, P), in units of the values, at its rows."""
         deviation = process_deviation(process.prior)
         # L^T K^-1 y = L^-1 y, for covariances in units of the amplitude.
@@ -73,21 +73,21 @@ class SharedTermsPosterior:
         """Return the block of one process, factored when it is asked for."""
         if number not in self._blocks:
             process = self.processes[number]
-            self._blocks[number] = Block.of(process, self.columns(process.rows))
+            self._blocks[number] = Block.from_process(process, self.columns(process.rows))
         return self._blocks[number]
 
-    def answer(self, queries: Tensor, number: Tensor, exact: bool = False) -> tuple[Tensor, Tensor]:
+    def answer(self, queries: Tensor, number: Tensor, float64: bool = False) -> tuple[Tensor, Tensor]:
         """Return the mean and variance of a measurement, each (B,).
 
         Args:
             queries: (B, D) float64.
             number: (B,) int64, of the process; one that is not there has no rows.
-            exact: whether few queries are answered in double precision too, as slopes need it.
+            float64: whether few queries are answered in double precision too, as slopes need it.
         """
-        (mean, own), columns = self.never.parts(queries), self.columns(queries)
+        (mean, own), columns = self.never.mean_and_columns(queries), self.columns(queries)
         mean, left = mean[:, 0], torch.zeros(len(queries), dtype=torch.float64)
-        for asked, at in self._asked(number):
-            prior, more, white, shared = self._said(queries[at], asked, own[at], columns[at], not exact)
+        for who, at in self._group_queries(number):
+            prior, more, white, shared = self._condition(queries[at], who, own[at], columns[at], not float64)
             # -1 stands where a process is asked less often than another of the batch.
             there = at >= 0
             at = at[there]
@@ -104,7 +104,7 @@ class SharedTermsPosterior:
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
         own = self.never.columns(flat)
         asked = flat[None], (number,), own[None], self.columns(flat)[None]
-        prior, more, white, shared = self._said(*asked, rounded=False)
+        prior, more, white, shared = self._condition(*asked, rounded=False)
         terms, kernel = own.unflatten(0, groups), prior.kernel
         left = kernel.between(queries, queries) + terms @ terms.mT
         left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
@@ -115,7 +115,7 @@ class SharedTermsPosterior:
         mean = self.never.mean(flat)[:, 0] + more[0]
         return mean.unflatten(0, groups), left
 
-    def _asked(self, number: Tensor) -> Iterator[tuple[tuple[int, ...], Tensor]]:
+    def _group_queries(self, number: Tensor) -> Iterator[tuple[tuple[int, ...], Tensor]]:
         """Processes and their queries (S, k), -1 in place of none: all at once where each is asked little."""
         order = number.argsort(stable=True)
         which, count = number[order].unique_consecutive(return_counts=True)
@@ -126,7 +126,7 @@ class SharedTermsPosterior:
         for one, own in zip(numbers, at, strict=True):
             yield from (((one,), part[None]) for part in own.split(QUERIES))
 
-    def _said(
+    def _condition(
         self, queries: Tensor, asked: tuple[int, ...], own: Tensor, columns: Tensor, rounded: bool
     ) -> tuple[Prior, Tensor, list[Tensor], Tensor]:
         """What S processes of one prior say at (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P).
@@ -194,7 +194,7 @@ def shared_weights(blocks: list[Block]) -> tuple[Factor, Tensor]:
     # From the identity, the precision of unit normal weights before any row.
     grams = (block.columns.T @ block.columns for block in blocks)
     precision = sum(grams, torch.eye(size, dtype=torch.float64))
-    factor = Factor.of(precision, "raise")
+    factor = Factor.from_gram(precision, "raise")
     right = torch.stack([block.columns.T @ block.values for block in blocks]).sum(0)
     return factor, factor.solve(right[:, None])[:, 0]
 
@@ -209,7 +209,7 @@ def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
     for block in blocks:
         known = factor.whiten(block.columns.T)
         lower = block.process.factor.lower * process_deviation(block.process.prior)
-        inner = Factor.of(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
+        inner = Factor.from_gram(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
         error = inner.solve((block.values - block.columns @ mean)[:, None])[:, 0]
         result.append((lower @ error, inner.whiten(lower.T).square().sum(0)))
     return result

@@ -121,7 +121,7 @@ class Trend(Columns):
     more: tuple[Columns, ...] = ()
 
     @classmethod
-    def about(cls, law: Law, places: Tensor) -> Trend:
+    def from_law(cls, law: Law, places: Tensor) -> Trend:
         """Return a trend about a law that was fitted to rows at places (n, 3) or (n, 6) float64 [m]."""
         decades = law.decades(places)
         return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), LEAST_SPREAD))
@@ -131,7 +131,7 @@ class Trend(Columns):
         mean = places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
         return sum((term.mean(places) for term in self.more), mean)
 
-    def parts(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean (n,) and `columns` (n, Q)."""
         return self.mean(places), self.columns(places)
 

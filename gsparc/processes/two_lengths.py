@@ -33,7 +33,7 @@ def initial_kernel(length: float, spacing: float = 0.0) -> Kernel:
     [0.037, 0.28]
     """
     lengths = START[0] * length, max(START[1] * length, SPANS * spacing)
-    return Kernel.matern(lengths, (0.5, 0.5), 0.01)
+    return Kernel.from_lengths(lengths, (0.5, 0.5), 0.01)
 
 
 def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:

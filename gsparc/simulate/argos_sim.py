@@ -56,7 +56,7 @@ def build_streets(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
     base = np.array([-50.0, 37, 9])
     streets = Streets(buildings, -rng.uniform(0.7, 0.9, 9), np.zeros((0, 3)), none, none, base)
     places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (max(400, 6 * scatterers), 2))
-    places = places[streets.open(places)][:scatterers]
+    places = places[streets.are_outdoors(places)][:scatterers]
     return replace(
         streets,
         scatterers=np.column_stack([places, rng.uniform(1, 6, len(places))]),
@@ -96,7 +96,7 @@ class World:
         rows = np.arange(len(self.users)) if rows is None else rows
         parts = []
         for some in np.array_split(rows, max(1, len(rows) // CHUNK)):
-            response = self.rays.at(some).response(antenna_array(), CARRIER_HZ, frequency_hz)
+            response = self.rays.select_users(some).response(antenna_array(), CARRIER_HZ, frequency_hz)
             parts.append(response.astype(np.complex64))
         return np.concatenate(parts)
 
@@ -110,7 +110,7 @@ def draw_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World
     streets, rng = build_streets(seed, scatterers), np.random.default_rng([seed, 2])
     # Many more than wanted: some are in buildings, some too weak to be decoded.
     across = rng.uniform(LOWER, UPPER, (8 * count, 2))
-    across = across[streets.open(across)][: 2 * count]
+    across = across[streets.are_outdoors(across)][: 2 * count]
     users = np.column_stack([across, rng.uniform(*HEIGHT_M, len(across))])
     rays = trace_streets(streets, users, LIGHT / CARRIER_HZ)
     power = (np.abs(rays.gain) ** 2).sum(axis=1)
@@ -119,7 +119,7 @@ def draw_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World
     decoded = np.flatnonzero(power > noise * 10 ** (DECODED_DB / 10))[:count]
     if len(decoded) < count:
         raise ValueError(f"argos-sim: only {len(decoded)} of {count} users are decoded")
-    return World(users[decoded], rays.at(decoded), noise)
+    return World(users[decoded], rays.select_users(decoded), noise)
 
 
 def draw_snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:

@@ -18,7 +18,7 @@ from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import ARRAYS, Paths, group_offsets
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
-from gsparc.simulate.spectrum import spectra
+from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Engine, Survey
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
@@ -47,24 +47,24 @@ class Assembled:
 def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
     """Return what a shard keeps of some receivers."""
     frequency = campaign.scene.frequency_hz
-    images, peak = spectra(paths, campaign.spectrum, frequency, wavelength)
+    images, peak = render_spectra(paths, campaign.spectrum, frequency, wavelength)
     strongest = np.zeros(len(paths))
     # Unbuffered, as a receiver owns many paths.
-    np.maximum.at(strongest, paths.owner, paths.power)
-    stored = paths.select(paths.power >= strongest[paths.owner] * WEAKEST)
+    np.maximum.at(strongest, paths.receiver_index, paths.power)
+    stored = paths.select_paths(paths.power >= strongest[paths.receiver_index] * WEAKEST)
     return {
         "spectrum": np.round(images * 255).astype(np.uint8),
         "spectrum_peak": peak,
         "csi": paths.responses(frequency, campaign.csi.elements(wavelength), wavelength),
         "received_power": paths.received_power(),
         "delay_spread": paths.delay_spread(),
-        "power_below": paths.per_receiver(paths.power * (paths.direction[:, 2] < 0)),
+        "power_below": paths.receiver_sums(paths.power * (paths.direction[:, 2] < 0)),
         "offsets": stored.offsets,
         **{name: getattr(stored, name) for name in ARRAYS},
     }
 
 
-def assemble(
+def assemble_dataset(
     campaign: Campaign,
     survey: Survey,
     effects: Effects,
@@ -82,7 +82,7 @@ def assemble(
     Raises:
         ValueError: nothing reaches any receiver.
     """
-    seconds += sum(float(shards.get(n, SECONDS)[SECONDS]) for n in shards.numbers())
+    seconds += sum(float(shards.read(n, SECONDS)[SECONDS]) for n in shards.list_shards())
     whole, paths, engine = rows.arrays, rows.paths, survey.engine
     power = whole["received_power"]
     reached = power > 0
@@ -123,13 +123,13 @@ def join_shards(shards: Shards, rows: int) -> Rows:
     One shard is in memory at a time; what is large is put together on disk.
     """
     counts = np.zeros(rows, dtype=np.int64)
-    for number in shards.numbers():
-        part = shards.get(number, ROWS, "offsets")
+    for number in shards.list_shards():
+        part = shards.read(number, ROWS, "offsets")
         counts[part[ROWS]] = np.diff(part["offsets"])
     offsets = group_offsets(counts)
     whole: dict[str, np.ndarray] = {}
-    for number in shards.numbers():
-        part = shards.get(number)
+    for number in shards.list_shards():
+        part = shards.read(number)
         own, mine, _ = part.pop(ROWS), part.pop("offsets"), part.pop(SECONDS)
         place = np.repeat(offsets[own] - mine[:-1], np.diff(mine)) + np.arange(mine[-1])  # of its paths
         for name, values in part.items():
@@ -155,7 +155,7 @@ def _arrays(
         **{name: whole[name] for name in ("spectrum", "spectrum_peak", "received_power", "delay_spread")},
         **{f"path_{name}": getattr(paths, name) for name in STORED},
         "path_gain": paths.gain[:, 0] if paths.gain.shape[1] == 1 else paths.gain,
-        "line_of_sight": paths.per_receiver((paths.order == 0).astype(float)) > 0,
+        "line_of_sight": paths.receiver_sums((paths.order == 0).astype(float)) > 0,
         "split_train": np.sort((order[tests:] + each).ravel()),
         "split_test": np.sort((order[:tests] + each).ravel()),
     }
@@ -200,7 +200,7 @@ def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[st
         "name": campaign.scene.name,
         "measurement": campaign.measurement,
         "simulator": engine.name,
-        "simulator_versions": json.dumps(engine.versions()),
+        "simulator_versions": json.dumps(engine.package_versions()),
         "scene": json.dumps(asdict(campaign.scene)),
         "materials": json.dumps(engine.materials()),
         "effects": str(effects),

@@ -15,7 +15,7 @@ import numpy as np
 
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
-from gsparc.simulate.spectrum import SpectrumSettings, spectra
+from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
 
 SILENCE_DB = 99.0  # error of a receiver that loses everything
 REQUIREMENT = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
@@ -107,7 +107,7 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def shares(self, remaining: Effects | Paths) -> np.ndarray:
+    def lost_power_shares(self, remaining: Effects | Paths) -> np.ndarray:
         """Return the share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
@@ -130,7 +130,7 @@ class Probe:
         # Losing everything is infinite in decibels, and would spoil every quantile.
         least = 10 ** (-SILENCE_DB / 10)
         if deliverable.kind == "coverage":
-            return np.abs(10 * np.log10(np.maximum(1 - self.shares(remaining), least)))
+            return np.abs(10 * np.log10(np.maximum(1 - self.lost_power_shares(remaining), least)))
         if deliverable.kind == "csi":
             return 10 * np.log10(np.maximum(self.nmse(remaining), least))
         full, near = self._images
@@ -147,27 +147,27 @@ class Probe:
         return paths.responses(self.frequency_hz, self.elements, self.wavelength)
 
     def _render(self, paths: Paths) -> np.ndarray:
-        return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
+        return render_spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
 
 
 def list_removals(full: Effects) -> dict[str, Effects]:
     """Return what can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation.
 
-    >>> full = Effects(depth=2).without("refraction", "diffraction", "diffuse")
+    >>> full = Effects(depth=2).switch_off("refraction", "diffraction", "diffuse")
     >>> list(list_removals(full))
     ['line_of_sight', 'specular', 'depth > 1', 'polarisation']
     """
-    names = [*full.on, *(f"depth > {depth}" for depth in range(full.depth - 1, 0, -1))]
+    names = [*full.enabled, *(f"depth > {depth}" for depth in range(full.depth - 1, 0, -1))]
     names += ["polarisation"] if full.polarisation else []
     return {name: less for name in names if (less := _without(full, name)) is not None}
 
 
-def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
+def list_effect_sets(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
     """List every set of switches without some of `removable` (named as in `list_removals`); `full` first."""
     sets = {full}
     for name in removable:
         sets |= {less for less in (_without(one, name) for one in sets) if less is not None}
-    return sorted(sets, key=lambda s: (len(full.on) - len(s.on), full.depth - s.depth, not s.polarisation))
+    return sorted(sets, key=lambda s: (-len(s.enabled), -s.depth, not s.polarisation))
 
 
 def _without(effects: Effects, name: str) -> Effects | None:
@@ -175,6 +175,6 @@ def _without(effects: Effects, name: str) -> Effects | None:
     if name.startswith("depth > "):
         return replace(effects, depth=min(effects.depth, int(name[8:])))
     try:
-        return effects.without(name)
+        return effects.switch_off(name)
     except ValueError:
         return None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from gsparc.simulate.attribution import Deliverable, Probe, combinations, list_removals
+from gsparc.simulate.attribution import Deliverable, Probe, list_effect_sets, list_removals
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
 
@@ -117,7 +117,7 @@ class Choice:
         probes: receivers that it took.
         samples: rays that are enough, of a call; None for those of the settings.
         refuted: effects that probes allowed and held-back receivers did not, so that everything is needed.
-        verdict: filled by `verify`.
+        verdict: filled by `verify_choice`.
     """
 
     effects: Effects
@@ -142,7 +142,7 @@ class Choice:
         return Choice(**{**stored, "effects": effects, "table": table, "verdict": verdict})
 
 
-def decide(probe: Probe, settings: AutoSettings) -> Choice:
+def choose_effects(probe: Probe, settings: AutoSettings) -> Choice:
     """Return the cheapest effects that meet the requirement, by receivers traced with everything.
 
     Raises:
@@ -162,7 +162,7 @@ def decide(probe: Probe, settings: AutoSettings) -> Choice:
 
     removable = tuple(row.effect for row in rows if row.failures <= most)
     # The cheapest first: the search ends soon after the first set that holds.
-    sets = sorted(combinations(full, removable), key=lambda effects: relative_cost(effects, full))
+    sets = sorted(list_effect_sets(full, removable), key=lambda effects: relative_cost(effects, full))
     chosen, table = _cheapest(sets, holds, full), []
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
@@ -172,7 +172,7 @@ def decide(probe: Probe, settings: AutoSettings) -> Choice:
     return Choice(chosen, str(required), tuple(table), len(probe.reached))
 
 
-def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:
+def verify_choice(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:
     """Return the choice with its verification, by errors (n,) of the deliverable at held-back receivers."""
     if not len(errors):
         return choice
@@ -181,11 +181,11 @@ def verify(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice
     return replace(choice, verdict=verdict)
 
 
-def fewer_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int) -> Choice:
+def choose_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int) -> Choice:
     """Return the choice with so many `samples` where those are enough, or without; a row says which.
 
     Args:
-        choice, settings, probe: as of `decide`.
+        choice, settings, probe: as of `choose_effects`.
         traced: the probe's receivers with the choice's effects and these samples.
     """
     row = _row(f"rays > {samples}", probe, traced, settings.required)
@@ -194,7 +194,7 @@ def fewer_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Pat
     return replace(choice, table=table, samples=samples if enough else None)
 
 
-def keep_everything(choice: Choice, full: Effects) -> Choice:
+def keep_all_effects(choice: Choice, full: Effects) -> Choice:
     """Return all effects where held-back receivers refute a choice; the verdict is on the latter."""
     table = tuple(replace(row, kept=True) for row in choice.table)
     return replace(choice, effects=full, refuted=str(choice.effects), table=table)
@@ -224,10 +224,10 @@ def relative_cost(effects: Effects, full: Effects, rays: float = 1.0) -> float:
     """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
 
     >>> full = Effects(depth=5)
-    >>> relative_cost(full, full), relative_cost(full.without("diffuse"), full) < 1
+    >>> relative_cost(full, full), relative_cost(full.switch_off("diffuse"), full) < 1
     (1.0, True)
     """
-    off = [name for name in full.on if name not in effects.on]
+    off = [name for name in full.enabled if name not in effects.enabled]
     off += ["polarisation"] if full.polarisation and not effects.polarisation else []
     bounces = 1 - BOUNCES + BOUNCES * effects.depth / max(full.depth, 1)
     return bounces * math.prod(1 - PRICE[name] for name in off) * (1 - RAYS + RAYS * rays)
@@ -241,13 +241,13 @@ def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effec
             break
         if holds(effects):
             enough.append(effects)
-    return min(enough, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
+    return min(enough, key=lambda s: (len(s.enabled), s.polarisation, s.depth), default=full)
 
 
 def _row(name: str, probe: Probe, less: Effects | Paths, required: Deliverable) -> EffectRow:
     """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
     share, error = (
-        part[probe.reached] for part in (np.abs(probe.shares(less)), probe.errors(less, required))
+        part[probe.reached] for part in (np.abs(probe.lost_power_shares(less)), probe.errors(less, required))
     )
     return EffectRow(
         name, float(share.mean()), _p95(share), float(np.median(error)), _p95(error),

@@ -34,7 +34,7 @@ ROUNDS = 100  # of expectation maximisation
 class Material:
     """Of a surface.
 
-    >>> again = Material.of(Material(5.0, 0.05).logarithms())
+    >>> again = Material.from_logarithms(Material(5.0, 0.05).logarithms())
     >>> round(again.permittivity, 6), round(again.conductivity, 6)
     (5.0, 0.05)
 
@@ -52,7 +52,7 @@ class Material:
         return np.log([max(self.permittivity - 1, 1e-3), max(self.conductivity, 1e-6)])
 
     @staticmethod
-    def of(logarithms: np.ndarray) -> Material:
+    def from_logarithms(logarithms: np.ndarray) -> Material:
         """Return the material of these logarithms (2,)."""
         return Material(1 + math.exp(logarithms[0]), math.exp(logarithms[1]))
 
@@ -108,15 +108,15 @@ class Replay:
         self.tracer, self._count = tracer, len(receivers)
         self._parts: list[tuple[dict[str, Any], Any]] = []
         first = 0
-        for solution, count in tracer.solutions(receivers, effects):
+        for solution, count in tracer.trace_in_batches(receivers, effects):
             self._parts.append(_field_arguments(tracer, solution, effects, first))
             first += count
 
-    def powers(self) -> np.ndarray:
+    def received_powers(self) -> np.ndarray:
         """Sum path powers (R,) under the scene's present materials; 0 where no path arrives."""
         return self._powers().numpy().astype(np.float64)
 
-    def decibels(
+    def cost_and_gradient(
         self, materials: Mapping[str, np.ndarray], slopes: Callable[[np.ndarray], tuple[float, np.ndarray]]
     ) -> tuple[float, np.ndarray]:
         """Evaluate a function of the powers in decibels, and its gradient by the materials.
@@ -145,7 +145,7 @@ class Replay:
         dr.backward(dr.sum(level * mi.Float(by_level.astype(np.float32))))
         gradient = np.array([dr.grad(one).numpy()[0] for one in free], dtype=np.float64)
         apply_materials(
-            self.tracer, {name: Material.of(pair) for name, pair in materials.items()}
+            self.tracer, {name: Material.from_logarithms(pair) for name, pair in materials.items()}
         )  # without gradients
         lost = ~np.isfinite(gradient)
         if lost.any():
@@ -237,7 +237,7 @@ def calibrate(
             value, by_level[reached] = student_loss(gain - missed, scale)
             return value, by_level
 
-        value, by_material = replay.decibels(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
+        value, by_material = replay.cost_and_gradient(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
         away = (x - centre) / deviation
         # Of a row: the search begins with a step as long as the gradient.
         value = (value + 0.5 * float(away @ away)) / len(traced)
@@ -250,7 +250,7 @@ def calibrate(
     options = {"maxfun": steps, "maxiter": steps}
     minimize(objective, centre, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     _, x, gain, scale = best
-    materials = {name: Material.of(pair) for name, pair in zip(start, x.reshape(-1, 2), strict=True)}
+    materials = {name: Material.from_logarithms(x) for name, x in zip(start, x.reshape(-1, 2), strict=True)}
     apply_materials(replay.tracer, materials)
     return Calibration(materials, gain, scale, spent)
 

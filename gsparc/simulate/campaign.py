@@ -12,7 +12,7 @@ import numpy as np
 
 from gsparc.data.executor import run_each
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import SECONDS, Assembled, assemble, join_shards, shard_arrays
+from gsparc.simulate.assembly import SECONDS, Assembled, assemble_dataset, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.convergence import Convergence, measure_convergence
 from gsparc.simulate.deciding import Changed, Decision
@@ -68,9 +68,9 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
         effects, choice, changed = decision.effects, decision.choice, decision.changed
         if decision.samples is not None:
             campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
-            survey = survey.thinned(decision.samples)
+            survey = survey.with_samples(decision.samples)
             left_out = _decided_on(shards)  # these rows have more rays than the others
-    effects = survey.engine.supported(effects)
+    effects = survey.engine.supported_effects(effects)
     laps.append(time.perf_counter())
     _trace_all(campaign, survey, effects, shards)
     laps.append(time.perf_counter())
@@ -79,7 +79,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     laps.append(time.perf_counter())
     # Seconds of all but the shards, which keep their own over interruptions.
     other_s = laps[1] - laps[0] + laps[4] - laps[3]
-    dataset = assemble(campaign, survey, effects, choice, error, other_s, shards, rows)
+    dataset = assemble_dataset(campaign, survey, effects, choice, error, other_s, shards, rows)
     laps.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
     return Outcome(dataset, survey, effects, choice, changed, error, seconds)
@@ -89,14 +89,14 @@ def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards:
     """The decision of `auto`, taken once; what it traced is the first shard."""
     stored = shards.read_note()
     if stored is not None:
-        return Decision.of(stored)
+        return Decision.from_dict(stored)
     begin = time.perf_counter()
     decision = deciding.Decider(campaign, settings, survey).decide()
     assert decision.rows is not None and decision.paths is not None
     arrays = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
     seconds = np.array(time.perf_counter() - begin)
-    shards.put(0, {**arrays, ROWS: decision.rows, SECONDS: seconds})
-    shards.write_note(decision.note())
+    shards.write(0, {**arrays, ROWS: decision.rows, SECONDS: seconds})
+    shards.write_note(decision.to_dict())
     return decision
 
 
@@ -120,7 +120,7 @@ class _Tracing:
             self.survey = build_survey(self.campaign.scene, self.campaign.sampling)
         paths = self.survey.trace(rows, self.effects)
         arrays = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
-        self.shards.put(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
+        self.shards.write(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
 
 
 def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> None:
@@ -137,4 +137,4 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
 
 def _decided_on(shards: Shards) -> np.ndarray:
     """Rows (n,) that `auto` decided on, which have all rays."""
-    return shards.get(0, ROWS)[ROWS] if shards.path(0).exists() else deciding.NONE
+    return shards.read(0, ROWS)[ROWS] if shards.path(0).exists() else deciding.NONE

@@ -10,7 +10,7 @@ from skimage.metrics import structural_similarity
 
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.settings import Campaign
-from gsparc.simulate.spectrum import spectra
+from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey
 
 CHECKED = 0.25  # largest share of the rows that is traced again
@@ -57,14 +57,14 @@ def measure_convergence(
     if count == 0 or not survey.engine.random:
         return None
     # So many that enough remain when those traced otherwise are taken out.
-    rows = survey.spread_rows(count + len(left_out), campaign.scene.seed + 1)
+    rows = survey.choose_distant_rows(count + len(left_out), campaign.scene.seed + 1)
     rows = np.sort(rows[~np.isin(rows, left_out)][:count])
     again = survey.trace(rows, effects, campaign.sampling.seed + 1)
     csi, spectrum, power = (traced[name][rows] for name in ("csi", "spectrum", "received_power"))
     frequency, wavelength = campaign.scene.frequency_hz, survey.engine.wavelength
     other = again.responses(frequency, campaign.csi.elements(wavelength), wavelength)
     energy = max(float((np.abs(csi) ** 2).sum()), np.finfo(float).tiny)
-    images = [spectrum / 255, spectra(again, campaign.spectrum, frequency, wavelength)[0]]
+    images = [spectrum / 255, render_spectra(again, campaign.spectrum, frequency, wavelength)[0]]
     squared = ((images[0] - images[1]) ** 2).mean((1, 2))
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
     twice = np.stack([power, again.received_power()])

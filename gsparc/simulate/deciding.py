@@ -61,15 +61,15 @@ class Decision:
     rows: np.ndarray | None = None
     paths: Paths | None = None
 
-    def note(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Return what a resumed run reads; without paths, which are in a shard."""
         changed = None if self.changed is None else [v.tolist() for v in vars(self.changed).values()]
         about = {"choice": asdict(self.choice), "effects": asdict(self.effects)}
         return {**about, "samples": self.samples, "changed": changed}
 
     @staticmethod
-    def of(note: Mapping[str, Any]) -> Decision:
-        """Invert `note`."""
+    def from_dict(note: Mapping[str, Any]) -> Decision:
+        """Invert `to_dict`."""
         rows, errors = note["changed"] or ([], [])
         changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
         effects = Effects(**note["effects"])
@@ -81,7 +81,7 @@ class Decider:
 
     def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
         self.campaign, self.settings, self.survey = campaign, settings, survey
-        self.full = survey.engine.supported(settings.full)
+        self.full = survey.engine.supported_effects(settings.full)
         self.nearest = settings.required.kind == "spectrum"  # whether errors are shares of their error
         self.probes, self.held_back = self._groups()
         self.both = np.concatenate([self.probes, self.held_back])
@@ -93,12 +93,12 @@ class Decider:
 
     def decide(self) -> Decision:
         """Decide by the probes, verify on held-back rows."""
-        choice, changed = auto.decide(self._probe(self.probes), self.settings), None
+        choice, changed = auto.choose_effects(self._probe(self.probes), self.settings), None
         if choice.effects != self.full:
             choice, changed = self._verified(choice, choice.effects)
             if choice.refused:
                 log.info("auto: verification on held-back receivers failed; everything is simulated")
-                choice = auto.keep_everything(choice, self.full)
+                choice = auto.keep_all_effects(choice, self.full)
         # After the effects, as fewer rays are tried with those that were chosen.
         whole, thin = (
             auto.relative_cost(choice.effects, self.full, rays) for rays in (1.0, self.settings.rays)
@@ -116,7 +116,7 @@ class Decider:
     def _groups(self) -> tuple[np.ndarray, np.ndarray]:
         """Probes and held-back rows, both spread out."""
         wanted = self.settings.probes + self.settings.held_back
-        chosen = self.survey.spread_rows(wanted, self.campaign.scene.seed)
+        chosen = self.survey.choose_distant_rows(wanted, self.campaign.scene.seed)
         share = self.settings.probes / wanted
         # Farthest-point order: taking every so many leaves both groups spread out.
         turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
@@ -127,19 +127,19 @@ class Decider:
         owner, place = np.divmod(rows, len(self.survey.places))
         return np.asarray(owner * len(self.survey.places) + nearest_rows(self.survey.places, place))
 
-    def _of(self, rows: np.ndarray) -> Paths:
-        return self.paths.take(np.searchsorted(self.rows, rows))
+    def _paths_of_rows(self, rows: np.ndarray) -> Paths:
+        return self.paths.select_receivers(np.searchsorted(self.rows, rows))
 
     def _probe(self, rows: np.ndarray) -> Probe:
-        near = self._of(self._nearest(rows)) if self.nearest else None
+        near = self._paths_of_rows(self._nearest(rows)) if self.nearest else None
         campaign, wavelength = self.campaign, self.survey.engine.wavelength
         array, tones = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
-        return Probe(self._of(rows), self.full, tones, wavelength, array, campaign.spectrum, near)
+        return Probe(self._paths_of_rows(rows), self.full, tones, wavelength, array, campaign.spectrum, near)
 
     def _verified(self, choice: Choice, less: Effects | Paths) -> tuple[Choice, Changed]:
         held = self._probe(self.held_back)
         errors = held.errors(less, self.settings.required)
-        verified = auto.verify(choice, self.settings, errors[held.reached])
+        verified = auto.verify_choice(choice, self.settings, errors[held.reached])
         return verified, Changed(self.held_back, errors)
 
     def _with_fewer_rays(self, choice: Choice, changed: Changed | None) -> tuple[Choice, Changed | None]:
@@ -150,13 +150,13 @@ class Decider:
         """
         samples = max(round(self.settings.rays * self.campaign.sampling.samples), 1)
         log.info("auto: the same receivers with %d rays", samples)
-        fewer = self.survey.thinned(samples).trace(self.both, choice.effects)
+        fewer = self.survey.with_samples(samples).trace(self.both, choice.effects)
         tried, held = np.split(np.arange(len(self.both)), [len(self.probes)])
         probe = self._probe(self.probes)
-        thinned = auto.fewer_rays(choice, self.settings, probe, fewer.take(tried), samples)
+        thinned = auto.choose_rays(choice, self.settings, probe, fewer.select_receivers(tried), samples)
         if thinned.samples is None:
             return thinned, changed
-        verified, errors = self._verified(thinned, fewer.take(held))
+        verified, errors = self._verified(thinned, fewer.select_receivers(held))
         if verified.refused:
             return replace(auto.keep_all_rays(thinned), verdict=choice.verdict), changed
         return verified, errors

@@ -62,25 +62,25 @@ class Effects:
             raise ValueError("effects: every mechanism is off; nothing would arrive")
 
     @property
-    def on(self) -> tuple[str, ...]:
+    def enabled(self) -> tuple[str, ...]:
         """Names of the mechanisms that are computed."""
         return tuple(name for name in MECHANISMS if getattr(self, name))
 
-    def without(self, *names: str) -> Effects:
+    def switch_off(self, *names: str) -> Effects:
         """Return the same with some switched off, and with what needs them.
 
-        >>> Effects().without("diffraction").on  # edges need it
+        >>> Effects().switch_off("diffraction").enabled  # edges need it
         ('line_of_sight', 'specular', 'refraction', 'diffuse')
         """
         needs = {"specular": "diffuse", "diffraction": "edge_diffraction"}
         off = {*names, *(needs[name] for name in names if name in needs)}
         return replace(self, **dict.fromkeys(off, False))
 
-    def allows(self, mechanisms: np.ndarray, order: np.ndarray) -> np.ndarray:
+    def allows_paths(self, mechanisms: np.ndarray, order: np.ndarray) -> np.ndarray:
         """Tell which paths exist under these switches: (P,) bool.
 
-        >>> effects = Effects(refraction=False, depth=2)
-        >>> effects.allows(np.array([0, SPECULAR, REFRACTION, SPECULAR], np.uint8), np.array([0, 1, 1, 3]))
+        >>> kept = Effects(refraction=False, depth=2)
+        >>> kept.allows_paths(np.array([0, SPECULAR, REFRACTION, SPECULAR], np.uint8), np.array([0, 1, 1, 3]))
         array([ True,  True, False, False])
 
         Args:
@@ -94,7 +94,7 @@ class Effects:
 
     def __str__(self) -> str:
         extra = [f"depth {self.depth}"] + (["both polarisations"] if self.polarisation else [])
-        return ", ".join([name.replace("_", " ") for name in self.on] + extra)
+        return ", ".join([name.replace("_", " ") for name in self.enabled] + extra)
 
 
 def from_config(config: Mapping[str, Any]) -> Effects:

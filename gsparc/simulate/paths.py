@@ -14,8 +14,9 @@ from gsparc.simulate.effects import Effects
 class Paths:
     """Paths of R receivers, sorted by receiver and then by delay; those of r are `offsets[r]:offsets[r+1]`.
 
-    >>> owner, delay, count = np.array([1, 0, 1]), np.array([2e-8, 1e-8, 1e-8]), np.zeros(3, np.uint8)
-    >>> paths = Paths.of(2, owner, np.ones((3, 1), np.complex64), delay, np.ones((3, 3)), count, count)
+    >>> receiver, delay, count = np.array([1, 0, 1]), np.array([2e-8, 1e-8, 1e-8]), np.zeros(3, np.uint8)
+    >>> gain, direction = np.ones((3, 1), np.complex64), np.ones((3, 3))
+    >>> paths = Paths.from_unsorted(2, receiver, gain, delay, direction, count, count)
     >>> paths.offsets, paths.received_power()  # one path of the first receiver, two of the second
     (array([0, 1, 3]), array([1., 2.]))
 
@@ -36,21 +37,21 @@ class Paths:
     order: np.ndarray
 
     @staticmethod
-    def of(
-        receivers: int, owner: np.ndarray, gain: np.ndarray, delay: np.ndarray, direction: np.ndarray,
-        mechanisms: np.ndarray, order: np.ndarray,
+    def from_unsorted(
+        receivers: int, receiver_index: np.ndarray, gain: np.ndarray, delay: np.ndarray,
+        direction: np.ndarray, mechanisms: np.ndarray, order: np.ndarray,
     ) -> Paths:  # fmt: skip
-        """Sort paths in any order; `owner` (P,) is the receiver of each, the rest as of this class."""
+        """Sort paths in any order; `receiver_index` (P,) says whose each is, the rest as of this class."""
         # The last key counts most: by receiver, then by delay.
-        rank = np.lexsort((delay, owner))
-        offsets = group_offsets(np.bincount(owner, minlength=receivers))
+        rank = np.lexsort((delay, receiver_index))
+        offsets = group_offsets(np.bincount(receiver_index, minlength=receivers))
         return Paths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
     @property
-    def owner(self) -> np.ndarray:
+    def receiver_index(self) -> np.ndarray:
         """Receiver of each path (P,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
@@ -59,12 +60,12 @@ class Paths:
         """|gain|^2 summed over the ports (P,)."""
         return (np.abs(self.gain.astype(np.complex128)) ** 2).sum(1)
 
-    def select(self, selected: np.ndarray) -> Paths:
+    def select_paths(self, selected: np.ndarray) -> Paths:
         """Return only the paths where `selected` (P,) bool is true; receivers stay."""
-        counts = np.bincount(self.owner[selected], minlength=len(self))
+        counts = np.bincount(self.receiver_index[selected], minlength=len(self))
         return Paths(group_offsets(counts), *(getattr(self, name)[selected] for name in ARRAYS))
 
-    def take(self, receivers: np.ndarray) -> Paths:
+    def select_receivers(self, receivers: np.ndarray) -> Paths:
         """Return receivers (n,) alone, in this order."""
         counts = np.diff(self.offsets)[receivers]
         # Rows of all paths without a loop: where a group begins here, less where it will begin.
@@ -74,23 +75,23 @@ class Paths:
 
     def keep_effects(self, effects: Effects) -> Paths:
         """Return what remains of a full simulation under these switches."""
-        selected = self.select(effects.allows(self.mechanisms, self.order))
+        selected = self.select_paths(effects.allows_paths(self.mechanisms, self.order))
         return selected if effects.polarisation else replace(selected, gain=selected.gain[:, :1])
 
-    def per_receiver(self, values: np.ndarray) -> np.ndarray:
+    def receiver_sums(self, values: np.ndarray) -> np.ndarray:
         """Return sums of `values` (P,) over the paths of each receiver (R,)."""
-        return np.bincount(self.owner, weights=values, minlength=len(self))
+        return np.bincount(self.receiver_index, weights=values, minlength=len(self))
 
     def received_power(self) -> np.ndarray:
         """Return the mean power over a small area: the sum of path powers (R,)."""
-        return self.per_receiver(self.power)
+        return self.receiver_sums(self.power)
 
     def delay_spread(self) -> np.ndarray:
         """Return the root-mean-square delay spread (R,) [s]; 0 where nothing arrives."""
         # Where nothing arrives 0 is divided by the least float64.
         total = np.maximum(self.received_power(), np.finfo(float).tiny)
-        mean = self.per_receiver(self.power * self.delay) / total
-        return np.sqrt(self.per_receiver(self.power * (self.delay - mean[self.owner]) ** 2) / total)
+        mean = self.receiver_sums(self.power * self.delay) / total
+        return np.sqrt(self.receiver_sums(self.power * (self.delay - mean[self.receiver_index]) ** 2) / total)
 
     def responses(self, frequency_hz: np.ndarray, elements: np.ndarray, wavelength: float) -> np.ndarray:
         """Return channels (R, ports x M, K) complex128: `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.

@@ -102,23 +102,23 @@ class RayTracer(Engine):
         self.wavelength = LIGHT / carrier_hz
         self.scene = _load(source, carrier_hz, scattering)
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
-        self._arrays: list[tuple[int, str]] = []  # what the scene's antennas are, shared by `at`
+        self._arrays: list[tuple[int, str]] = []  # antennas of the scene, shared by `with_transmitter`
         self.retried = 0  # batches traced again because candidates were cut off
         self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
 
-    def at(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
+    def with_transmitter(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
         """Return the same scene with the transmitter elsewhere."""
         other = copy(self)
         other.transmitter, other.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         return other
 
-    def thinned(self, samples: int) -> RayTracer:
+    def with_samples(self, samples: int) -> RayTracer:
         """Return the same scene with so many rays of a call."""
         other = copy(self)
         other.sampling = replace(self.sampling, samples=samples)
         return other
 
-    def versions(self) -> dict[str, str]:
+    def package_versions(self) -> dict[str, str]:
         """Return versions of the solver's packages."""
         from importlib.metadata import version
 
@@ -152,14 +152,14 @@ class RayTracer(Engine):
         parts, first = [], 0
         for count, size in divide_into_calls(len(receivers), self.sampling.batch):
             filled = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
-            solved = self.solutions(filled, effects, seed)
+            solved = self.trace_in_batches(filled, effects, seed)
             ports = 2 if effects.polarisation else 1
             part = join_receivers([_collect(solution, number, ports) for solution, number in solved])
-            parts.append(part.take(np.arange(count)))
+            parts.append(part.select_receivers(np.arange(count)))
             first += count
         return join_receivers(parts)
 
-    def solutions(
+    def trace_in_batches(
         self, receivers: np.ndarray, effects: Effects, seed: int | None = None
     ) -> Iterator[tuple[Any, int]]:
         """Yield Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
@@ -275,14 +275,14 @@ class RayTracer(Engine):
         """Return triangles (n, 3, 3) [m] of all objects."""
         return np.concatenate([*self._objects().values()])
 
-    def box(self) -> np.ndarray:
+    def bounding_box(self) -> np.ndarray:
         """Return lower and upper corner (2, 3) [m] of everything."""
         corners = self.triangles().reshape(-1, 3)
         return np.stack([corners.min(0), corners.max(0)])
 
     @cached_property
     def _lowest(self) -> float:
-        return float(self.box()[0, 2])
+        return float(self.bounding_box()[0, 2])
 
     def _objects(self) -> dict[str, np.ndarray]:
         """Triangles (n, 3, 3) of each object."""
@@ -292,7 +292,7 @@ class RayTracer(Engine):
             triangles[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
         return triangles
 
-    def surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def highest_surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the highest surface (n,) [m] at (n, 2) [m], -inf without one, and whether it is ground.
 
         The ground is the widest object whose area is mostly level; without one all is.
@@ -300,7 +300,7 @@ class RayTracer(Engine):
         import mitsuba as mi
 
         # From a metre above everything, so that rays start outside of all objects.
-        top = self.box()[1, 2] + 1.0
+        top = self.bounding_box()[1, 2] + 1.0
         above = np.column_stack([across, np.full(len(across), top)])
         hit = self._hit(above, np.array([0.0, 0.0, -1.0]))
         ground, height = self._ground(), top - hit.t.numpy().astype(np.float64)
@@ -310,9 +310,9 @@ class RayTracer(Engine):
         shape = mi.ShapePtr(self.scene.objects[ground].mi_mesh)
         return height, (hit.shape == shape).numpy()
 
-    def height(self, across: np.ndarray) -> np.ndarray:
+    def surface_height(self, across: np.ndarray) -> np.ndarray:
         """Return the highest surface (n,) [m] at places (n, 2) [m], -inf where there is none."""
-        return self.surface(across)[0]
+        return self.highest_surface(across)[0]
 
     def _ground(self) -> str | None:
         level = {}  # area of each object that is mostly level
@@ -330,8 +330,8 @@ class RayTracer(Engine):
         Raises:
             ValueError: nothing of the scene is in the area.
         """
-        low, top = self.box()[:, 2]
-        height = self.height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
+        low, top = self.bounding_box()[:, 2]
+        height = self.surface_height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
         known = height[np.isfinite(height)]
         if not len(known):
             raise ValueError(f"scene.area_m={area.tolist()}: nothing of the scene is there; say another")
@@ -374,7 +374,7 @@ def _collect(solution: Any, receivers: int, ports: int) -> Paths:
     owner = buffer.target_indices.numpy().astype(np.int64)
     if not len(owner):  # nothing is heard anywhere: the solver has made no gains either
         nothing = np.zeros((0, ports), np.complex64), np.zeros(0), np.zeros((0, 3), np.float32)
-        return Paths.of(receivers, owner, *nothing, *np.zeros((2, 0), np.uint8))
+        return Paths.from_unsorted(receivers, owner, *nothing, *np.zeros((2, 0), np.uint8))
     gain = np.stack([one[0].numpy() for one in buffer.a], axis=1).astype(np.complex64)
     delay = buffer.tau.numpy().astype(np.float64)
     kinds = buffer.interaction_types.numpy().astype(np.uint8).reshape(len(owner), -1)
@@ -392,7 +392,7 @@ def _collect(solution: Any, receivers: int, ports: int) -> Paths:
     if len(sight) and sight.max() > 1:
         row = int(sight.argmax())
         raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
-    return Paths.of(receivers, owner, gain, delay, direction, mechanisms, order)
+    return Paths.from_unsorted(receivers, owner, gain, delay, direction, mechanisms, order)
 
 
 def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:

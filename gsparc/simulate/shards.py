@@ -64,16 +64,16 @@ class Shards:
         """Return the file of a shard; it is there once the shard is finished."""
         return self.folder / f"shard_{number:04d}.npz"
 
-    def put(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
+    def write(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a shard, whole or not at all."""
         with whole_file(self.path(number)) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
 
-    def numbers(self) -> list[int]:
+    def list_shards(self) -> list[int]:
         """Return numbers of the shards that are there."""
         return sorted(int(path.stem.removeprefix("shard_")) for path in self.folder.glob("shard_*.npz"))
 
-    def get(self, number: int, *names: str) -> dict[str, np.ndarray]:
+    def read(self, number: int, *names: str) -> dict[str, np.ndarray]:
         """Return the arrays of a finished shard; `names` alone where given."""
         with np.load(self.path(number), allow_pickle=False) as file:
             return {name: file[name] for name in names or file.files}

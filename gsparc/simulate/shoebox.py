@@ -47,14 +47,14 @@ class Room:
             raise ValueError(f"room.occluders: expected (n, 2, 3), got {np.shape(self.occluders)}")
 
     @staticmethod
-    def uniform(size: ArrayLike, reflection: complex | np.ndarray = -0.7, **kwargs) -> Room:
+    def from_size(size: ArrayLike, reflection: complex | np.ndarray = -0.7, **kwargs) -> Room:
         """Return a room from the origin to `size` (3,) [m]; `reflection` of all six walls, or (6,)."""
         return Room(np.zeros(3), np.array(size, dtype=float), np.full(6, reflection), **kwargs)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell whether points (..., 3) [m] are inside the room and outside every occluder: (...) bool.
 
-        >>> Room.uniform((6.0, 4.0, 3.0)).contains(np.array([[1.0, 1.0, 1.0], [7.0, 1.0, 1.0]]))
+        >>> Room.from_size((6.0, 4.0, 3.0)).contains(np.array([[1.0, 1.0, 1.0], [7.0, 1.0, 1.0]]))
         array([ True, False])
         """
         # The room is open and its boxes are closed: places on a surface are refused.
@@ -85,7 +85,7 @@ class Images:
         """Number of reflections (I,)."""
         return np.abs(self.cell).sum(axis=1)
 
-    def of(self, points: np.ndarray) -> np.ndarray:
+    def mirror_points(self, points: np.ndarray) -> np.ndarray:
         """Return images (..., I, 3) [m] of points (..., 3) [m]."""
         return points[..., None, :] * self.signs + self.offsets
 
@@ -93,7 +93,7 @@ class Images:
 def mirror_images(room: Room, max_order: int) -> Images:
     """Return all images of order <= `max_order`, sorted by order; the first is the point itself.
 
-    >>> mirror_images(Room.uniform((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # itself, one in each wall
+    >>> mirror_images(Room.from_size((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # itself, one in each wall
     [0, 1, 1, 1, 1, 1, 1]
     """
     reach = range(-max_order, max_order + 1)
@@ -128,7 +128,7 @@ def visible_images(room: Room, images: Images, source: np.ndarray, observer: np.
     seen = np.ones((len(observer), len(images.cell)), dtype=bool)
     if len(room.occluders) == 0:
         return seen
-    places = images.of(source)
+    places = images.mirror_points(source)
     for i, cell in enumerate(images.cell):
         # The cells between the room and the image: a straight line to it stays within them.
         crossed = product(*(range(min(0, c), max(0, c) + 1) for c in cell))
@@ -163,7 +163,7 @@ class Trace:
         tx, rx: (S, 3) [m].
         frequency_hz: (K,) [Hz].
         array: (A, 3) [m], receive elements relative to `rx`, world axes.
-        images: the mirror images; sources of a static transmitter are `images.of(tx[0])`.
+        images: the mirror images; sources of a static transmitter are `images.mirror_points(tx[0])`.
         visible: (S, I) bool, seen from the array's centre.
         noise_variance: per entry of `csi`; 0 without noise.
     """
@@ -191,7 +191,7 @@ def trace_room(
 ) -> Trace:
     """Compute channels of all rows: `sum_i v_i g_i exp(-j 2 pi f d_i / c) wavelength / (4 pi d_i)`.
 
-    >>> room, tones = Room.uniform((6.0, 4.0, 3.0)), np.array([2.40e9, 2.41e9])
+    >>> room, tones = Room.from_size((6.0, 4.0, 3.0)), np.array([2.40e9, 2.41e9])
     >>> places = np.array([[5.0, 3.0, 1.0], [2.0, 1.0, 1.0]])
     >>> trace_room(room, np.array([1.0, 1.0, 1.0]), places, tones).csi.shape
     (2, 1, 2)
@@ -218,7 +218,7 @@ def trace_room(
     seen = visible_images(room, mirrored, tx, rx)
     amplitude = mirrored.gain * seen
     csi = np.empty((len(tx), len(elements), len(frequency)), dtype=np.complex128)
-    sources = mirrored.of(tx)
+    sources = mirrored.mirror_points(tx)
     for a, element in enumerate(elements):
         distance = np.linalg.norm(sources - (rx + element)[:, None], axis=-1)
         for k, f in enumerate(frequency):
@@ -248,10 +248,10 @@ class ShoeboxEngine(Engine):
         if not room.contains(self.transmitter):
             raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
 
-    def supported(self, effects: Effects) -> Effects:
+    def supported_effects(self, effects: Effects) -> Effects:
         """Keep line of sight and specular reflection; walls do not transmit, edges do not diffract."""
         return replace(
-            effects.without("diffuse", "diffraction", "refraction"),
+            effects.switch_off("diffuse", "diffraction", "refraction"),
             polarisation=False,
             # Without reflections only the line of sight is left, which has no bounce.
             depth=effects.depth if effects.specular else 0,
@@ -264,12 +264,12 @@ class ShoeboxEngine(Engine):
         if not effects.line_of_sight:
             seen[:, mirrored.order == 0] = False
         owner, image = np.nonzero(seen)
-        way = mirrored.of(self.transmitter)[image] - receivers[owner]
+        way = mirrored.mirror_points(self.transmitter)[image] - receivers[owner]
         distance = np.linalg.norm(way, axis=-1)
         # Friis' amplitude between isotropic antennas, without the carrier's phase.
         gain = mirrored.gain[image] * self.wavelength / (4 * np.pi * distance)
         order = mirrored.order[image].astype(np.uint8)
-        return Paths.of(
+        return Paths.from_unsorted(
             len(receivers), owner, gain[:, None].astype(np.complex64), distance / LIGHT,
             (way / distance[:, None]).astype(np.float32), np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,

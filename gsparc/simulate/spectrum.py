@@ -80,7 +80,7 @@ class SpectrumSettings(ArraySettings):
         return {"normalisation": "max", "spectrum_scale": "amplitude", **own}
 
 
-def spectra(
+def render_spectra(
     paths: Paths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return spectra (R, H, W) float32, and the largest amplitude of each (R,), which it was divided by.
@@ -88,13 +88,13 @@ def spectra(
     Only paths from above the horizon are received; world axes are the receivers'. A receiver without any is
     black, divided by 1. The subcarriers (K,) [Hz] are the snapshots of the Bartlett spectrum.
     """
-    above = paths.select(paths.direction[:, 2] >= 0)
+    above = paths.select_paths(paths.direction[:, 2] >= 0)
     images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)
     elements = settings.elements(wavelength)
     bartlett = _Bartlett(settings) if settings.kind == "bartlett" else None
     for start in range(0, len(paths), BLOCK):
         rows = slice(start, start + BLOCK)
-        some = above.take(np.arange(len(paths))[rows])
+        some = above.select_receivers(np.arange(len(paths))[rows])
         if bartlett is None:
             images[rows] = _beams(some, settings)
         else:

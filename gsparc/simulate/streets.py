@@ -28,7 +28,7 @@ class Streets:
 
     >>> block, none = np.array([[[10.0, -5.0], [20.0, 5.0]]]), np.zeros(0)
     >>> streets = Streets(block, np.array([-0.8]), np.zeros((0, 3)), none, none, base=np.zeros(3))
-    >>> streets.blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))  # behind the block, beside it
+    >>> streets.are_blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))  # behind it, beside it
     array([ True, False])
 
     Attributes:
@@ -49,14 +49,14 @@ class Streets:
     base: np.ndarray
     ground: float = -0.5
 
-    def blocked(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def are_blocked(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Tell whether a building stands between points a and b (S, 2) [m]: (S,) bool."""
         hit = np.zeros(len(a), dtype=bool)
         for low, high in self.buildings:
             hit |= segments_meet_box(a, b, low + SHRINK, high - SHRINK)
         return hit
 
-    def open(self, points: np.ndarray) -> np.ndarray:
+    def are_outdoors(self, points: np.ndarray) -> np.ndarray:
         """Tell whether points (S, 2) [m] lie outside every building: (S,) bool."""
         low, high = self.buildings[:, 0], self.buildings[:, 1]
         inside = (points[:, None] >= low) & (points[:, None] <= high)
@@ -77,7 +77,7 @@ class Rays:
     delay: np.ndarray
     direction: np.ndarray
 
-    def at(self, users: np.ndarray) -> Rays:
+    def select_users(self, users: np.ndarray) -> Rays:
         """Return the paths of some users (n,)."""
         return Rays(self.gain[users], self.delay[users], self.direction[users])
 
@@ -122,7 +122,7 @@ def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> Ray
 def _routes(streets: Streets, users: np.ndarray, wavelength: float) -> Iterator[_Route]:
     base, flat = streets.base[:2], users[:, :2]
     spread = wavelength / (4 * np.pi)
-    shadow = streets.blocked(np.broadcast_to(base, flat.shape), flat)
+    shadow = streets.are_blocked(np.broadcast_to(base, flat.shape), flat)
     lit = np.flatnonzero(~shadow)
     if len(lit):
         length = np.linalg.norm(flat[lit] - base, axis=1)
@@ -176,7 +176,7 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
         stops = [flat[users], *points, np.broadcast_to(base, (len(users), 2))]
         clear = np.ones(len(users), bool)
         for a, b in pairwise(stops):
-            clear[clear] = ~streets.blocked(a[clear], b[clear])
+            clear[clear] = ~streets.are_blocked(a[clear], b[clear])
         users, towards = users[clear], points[-1][clear] - base
         if len(users):
             length = np.linalg.norm(flat[users] - images[-1], axis=1)
@@ -188,9 +188,9 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
 def _bounce(streets: Streets, flat: np.ndarray, place: np.ndarray, law) -> Iterator[_Route]:
     """Base to `place` to the users in its line of sight; amplitude `law(first leg, second leg)` [m]."""
     base = streets.base[:2]
-    if streets.blocked(base[None], place[None])[0]:
+    if streets.are_blocked(base[None], place[None])[0]:
         return
-    users = np.flatnonzero(~streets.blocked(np.broadcast_to(place, flat.shape), flat))
+    users = np.flatnonzero(~streets.are_blocked(np.broadcast_to(place, flat.shape), flat))
     if len(users):
         near, far = np.linalg.norm(place - base), np.linalg.norm(flat[users] - place, axis=1)
         # The far field of a scatterer: at the scatterer itself a user would hear infinite power.

@@ -55,11 +55,11 @@ class Survey:
         """Return the receiver's place (S, 3) [m] of each row."""
         return np.tile(self.places, (len(self.engines), 1))
 
-    def thinned(self, samples: int) -> Survey:
+    def with_samples(self, samples: int) -> Survey:
         """Return the same with so many rays of a call."""
-        return replace(self, engines=[engine.thinned(samples) for engine in self.engines])
+        return replace(self, engines=[engine.with_samples(samples) for engine in self.engines])
 
-    def spread_rows(self, count: int, seed: int) -> np.ndarray:
+    def choose_distant_rows(self, count: int, seed: int) -> np.ndarray:
         """Choose at most `count` rows far apart, transmitters by turns."""
         order, turns = farthest_points(self.places, min(count, len(self.places)), seed), len(self.engines)
         # Place i with transmitter i, then every place with the next one: all have their turn.
@@ -76,7 +76,7 @@ class Survey:
         parts = [
             self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
         ]
-        return join_receivers(parts).take(np.argsort(order, kind="stable"))
+        return join_receivers(parts).select_receivers(np.argsort(order, kind="stable"))
 
 
 class Engine(Protocol):
@@ -100,15 +100,15 @@ class Engine(Protocol):
     def materials(self) -> dict[str, dict[str, Any]]:
         """Return material properties of the scene, for provenance and physical expectations."""
 
-    def supported(self, effects: Effects) -> Effects:
+    def supported_effects(self, effects: Effects) -> Effects:
         """Return these switches without what the engine cannot compute."""
         return effects
 
-    def thinned(self, samples: int) -> Self:
+    def with_samples(self, samples: int) -> Self:
         """Return the same with so many rays of a call, where there are any."""
         return self
 
-    def versions(self) -> dict[str, str]:
+    def package_versions(self) -> dict[str, str]:
         """Return versions of the solver's packages."""
         return {}
 

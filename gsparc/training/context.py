@@ -133,10 +133,10 @@ class FitContext:
         """Add a point to the learning curve, in the folder and the loggers; see `curve.curve_row`."""
         row = curve.curve_row(seconds, what, error, step, **figures)
         # All rows again: a file that appears by renaming cannot be appended to.
-        curve.write(self.run_dir, [*curve.read(self.run_dir), row])
-        curve.log(self.loggers, row)
+        curve.write_curve(self.run_dir, [*curve.read_curve(self.run_dir), row])
+        curve.log_row(self.loggers, row)
 
     def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
         """Return what a fit counts, and the seconds that may end it, some spent before."""
         seconds = math.inf if self.budget_s is None else self.budget_s
-        return TimeBudget(seconds, self.budget_clock, before, Effort().times(self.effort))
+        return TimeBudget(seconds, self.budget_clock, before, Effort().scale_by(self.effort))

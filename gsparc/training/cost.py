@@ -48,8 +48,10 @@ class Cost:
             unused = f" ({self.unused[name]:.1f} s unused)" if name in self.unused else ""
             parts += [f"{name} {spent:.1f} s{unused}"] if spent >= LEAST_S else []
         ended = "" if limited_by is None else "; the time limit ended it"
+        total = f"{self.seconds:.1f} s"
         share = self.unused_s / max(self.seconds, LEAST_S)
-        return f"{', '.join(parts)}; {share:.0%} of {self.seconds:.1f} s unused{ended}"
+        total = f"{share:.0%} of {total} unused" if self.unused else f"{total} in all"
+        return f"{', '.join(parts)}; {total}{ended}"
 
 
 NO_COST = Cost()

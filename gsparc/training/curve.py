@@ -33,7 +33,7 @@ def curve_row(
     return {name: "" if (row | figures).get(name) is None else (row | figures)[name] for name in COLUMNS}
 
 
-def write(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write all rows of the curve of a run's folder at once; nowhere where there is no folder."""
     if folder == Path():
         return
@@ -44,7 +44,7 @@ def write(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def read(folder: Path) -> list[dict[str, Any]]:
+def read_curve(folder: Path) -> list[dict[str, Any]]:
     """Return the rows in a run's folder as text; [] where there are none."""
     path = folder / FILE
     if folder == Path() or not path.exists():
@@ -53,7 +53,7 @@ def read(folder: Path) -> list[dict[str, Any]]:
         return list(csv.DictReader(file))
 
 
-def log(loggers: Iterable[Any], row: Mapping[str, Any]) -> None:
+def log_row(loggers: Iterable[Any], row: Mapping[str, Any]) -> None:
     """Give the point to dashboards, which draw it over the steps."""
     figures = {f"curve/{name}": float(row[name]) for name in ("seconds", "error") if row[name] != ""}
     for logger in loggers:

@@ -40,11 +40,11 @@ class Race:
     error: float
     note: Callable[[str, float], None]
 
-    @classmethod
-    def of(cls, rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None]) -> Race:
+    @staticmethod
+    def from_mean(rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None]) -> Race:
         """Return a candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
         missed = (mean - target).detach()
-        return cls(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
+        return Race(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
     def log_candidate(self, what: str, rows: np.ndarray, missed: Tensor, before: float = 0.0) -> float:
         """Return the mean squared error of another candidate, where both left rows out.

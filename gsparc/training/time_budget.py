@@ -41,7 +41,7 @@ class Effort:
     steps: int = 400
     steps_after_solving: int = 60
 
-    def times(self, factor: float) -> Effort:
+    def scale_by(self, factor: float) -> Effort:
         """Return all of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
         counts = {one.name: factor * getattr(self, one.name) for one in fields(self)}
         rows = {name: max(factor ** (1 / 3) * getattr(self, name), LEAST_ROWS) for name in ROWS}
@@ -63,7 +63,7 @@ class Spent:
     wall: float = 0.0
     processor: float = 0.0
 
-    def by(self, clock: Clock) -> float:
+    def seconds_on(self, clock: Clock) -> float:
         """Return seconds of the clock [s]."""
         return self.wall if clock == "wall" else self.processor
 
@@ -119,7 +119,7 @@ class TimeBudget:
     @property
     def spent(self) -> float:
         """[s]"""
-        return self.counted.by(self.clock)
+        return self.counted.seconds_on(self.clock)
 
     @property
     def left_s(self) -> float | None:

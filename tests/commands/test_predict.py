@@ -114,7 +114,7 @@ def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path
     assert answered(town, tmp_path, ["x", "y", "z"], place, station="B-1") == [own]
     listed = answered(town, tmp_path, ["x", "y", "z", "station"], [[*place[0], "B-1"]])
     assert [row["rssi_db"] for row in listed] == [own["rssi_db"]]
-    assert town.at("B-1").site.static_position is not None
+    assert town.select_station("B-1").site.static_position is not None
 
 
 def test_every_station_of_every_place(town, tmp_path):
@@ -126,7 +126,7 @@ def test_every_station_of_every_place(town, tmp_path):
     level = column(found, "rssi_db").reshape(-1, 3)
     assert np.abs(level - powers(place)).max() < 6
     for number, name in enumerate(NAMES):
-        expected = town.at(str(name)).rssi(rx=place)[:, 0]
+        expected = town.select_station(str(name)).rssi(rx=place)[:, 0]
         assert np.allclose(level[:, number], expected, atol=1e-4)
     assert facts["predict/predictions"] == 21 and facts["predict/far_outside"] == 0
 
@@ -164,7 +164,7 @@ def test_a_number_that_names_no_station_was_an_index(tmp_path, names, asked):
         answered(model, tmp_path, ["x", "y", "z", "cell"], rows)
     if "mast" not in names:  # names that are numbers leave none for counting, from Python and in settings too
         with pytest.raises(ValueError, match="no station 1; there are 212, 33, 7"):
-            model.at(1)
+            model.select_station(1)
 
 
 def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):
@@ -224,7 +224,7 @@ def test_degrees_metres_and_arrays_are_one_place(valley, tmp_path):
     assert np.allclose(column(found[1], "x"), metres[:, 0]) and "latitude" not in found[3][0]
     for other in found[1:]:
         assert np.allclose(column(other, "rssi_db"), column(found[0], "rssi_db"), atol=1e-3)
-    expected = valley.at(0).rssi(rx=metres)
+    expected = valley.select_station(0).rssi(rx=metres)
     assert np.allclose(column(found[0], "rssi_db"), expected[:, 0], atol=1e-3)
 
 

@@ -71,7 +71,7 @@ def test_a_run_goes_on_with_the_same_grid_or_not_at_all(spectra_file, halfway, t
 def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, what, change):
     data = load_data({"name": "own", "file": str(spectra_file)})
     fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
-    before, now = (Origin.of(d, fold, FitContext()) for d in (data, change(data)))
+    before, now = (Origin.from_fit(d, fold, FitContext()) for d in (data, change(data)))
     stored = checkpoint.read(halfway.checkpoints[0].with_name("last.ckpt"))
     stored = replace(stored, config="", extra=before.marks())
     before.require_same(stored)

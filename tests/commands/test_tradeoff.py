@@ -131,7 +131,7 @@ def test_a_model_never_swept_says_what_to_do(field):
 
 def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
     whole = gsparc.load(town_model())
-    method, single = whole.method, whole.at("west").method
+    method, single = whole.method, whole.select_station("west").method
     assert "of several stations is asked as it was trained" in why_irreducible(method)[0]
     assert "no Gaussians, sources" in why_irreducible(DistanceLaw())[0] and not why_irreducible(single)
 

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 
 def steps(folder: Path) -> list[int]:
     """Those that a learning curve has rows of, after the start."""
-    return [int(row["step"]) for row in curve.read(folder) if row["what"].startswith("step ")]
+    return [int(row["step"]) for row in curve.read_curve(folder) if row["what"].startswith("step ")]
 
 
 def test_a_run_leaves_facts_and_files(spectra_file, tmp_path):

@@ -23,7 +23,7 @@ FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-x", "c+
 def fingerprint(*also: str) -> str:
     """Hash of the kernels' sources, the shim and `also`."""
     texts = (SHIM.read_text(), SHIM.with_suffix(".h").read_text())
-    return cuda_library.fingerprint(*FLAGS, *texts, *also)
+    return cuda_library.hash_sources(*FLAGS, *texts, *also)
 
 
 def library() -> cuda_library.Library:

@@ -13,6 +13,6 @@ def test_what_was_not_measured_counts_nowhere(csi_arrays):
     mask[3, 0] = False
     data = from_arrays({**csi_arrays, "mask": mask})
     junk = replace(data, target=np.where(mask, data.target, np.complex64(7)))
-    found = Snapshots.of(junk, np.arange(12)).values
+    found = Snapshots.from_rows(junk, np.arange(12)).values
     assert (found[3, 0] == 0).all() and found[3, 1].all()
-    assert np.array_equal(found, Snapshots.of(data, np.arange(12)).values)
+    assert np.array_equal(found, Snapshots.from_rows(data, np.arange(12)).values)

@@ -19,7 +19,7 @@ VALUES = {
 
 @pytest.mark.parametrize(("level", "unit"), VALUES)
 def test_values_deviations_and_back(level, unit):
-    wanted = PowerUnit.of(unit, level, 3.0)
+    wanted = PowerUnit.from_name(unit, level, 3.0)
     power = torch.tensor([[2.0], [2.0 * 1.0001]])
     value = wanted.values(power)
     assert value[0].item() == pytest.approx(VALUES[level, unit], rel=1e-6)
@@ -36,11 +36,11 @@ def test_values_deviations_and_back(level, unit):
 ])  # fmt: skip
 def test_what_is_no_unit_of_these_powers_is_refused(level, unit, levels, said):
     with pytest.raises(ValueError, match=said):
-        PowerUnit.of(unit, level, levels=levels)
+        PowerUnit.from_name(unit, level, levels=levels)
 
 
 def test_silence_has_no_level():
-    values = PowerUnit.of("dBm", "dBm").values(torch.tensor([[0.0], [-1.0]]))
+    values = PowerUnit.from_name("dBm", "dBm").values(torch.tensor([[0.0], [-1.0]]))
     assert values[0] == -np.inf and torch.isnan(values[1])
 
 

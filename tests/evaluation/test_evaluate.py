@@ -129,8 +129,8 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, na
     data, split = campaign("csi", 40), folds(40)
     for subset in ("test", "val"):
         assert fit_baseline(name, data, split, subset).scores.figures()["nmse"] > 0.001
-    assert fit_baseline(name, data, split, "test").methods[0].size() == 30
-    assert fit_baseline(name, data, split, "val").methods[0].size() == 27
+    assert fit_baseline(name, data, split, "test").methods[0].count_components() == 30
+    assert fit_baseline(name, data, split, "val").methods[0].count_components() == 27
 
 
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):

@@ -35,7 +35,7 @@ def drawn(monkeypatch, data, objects, known=None) -> Figure:
 def test_walls_and_boxes_are_drawn_where_they_are(room, monkeypatch):
     corners = np.array([[100.0, 200, 0], [108, 200, 0], [108, 200, 3], [100, 200, 3]])
     known = SceneWalls((corners,), BOX + room.site.origin)
-    figure = drawn(monkeypatch, room, SiteObjects.of(PLANES, BOX), known)
+    figure = drawn(monkeypatch, room, SiteObjects.from_arrays(PLANES, BOX), known)
     lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
     np.testing.assert_allclose(lines["mirror planes found"][:, 0], 5.0 + room.site.origin[0])
     np.testing.assert_allclose(lines["known walls"], [[108, 200], [100, 200]])
@@ -49,5 +49,5 @@ def test_walls_and_boxes_are_drawn_where_they_are(room, monkeypatch):
 
 def test_a_wall_apart_from_all_places_was_beside_the_map(room, monkeypatch):
     apart = np.array([[1.0, 0, 0, 25.0], [1.0, 0, 0, 900.0]])
-    axis = drawn(monkeypatch, room, SiteObjects.of(apart)).axes[0]
+    axis = drawn(monkeypatch, room, SiteObjects.from_arrays(apart)).axes[0]
     assert 25 < axis.get_xlim()[1] - room.site.origin[0] < 60

@@ -13,12 +13,12 @@ from gsparc.field.distributed import SummedGradients, first_process_value, proce
 
 
 def test_strategies_that_share_batches_are_known_by_name():
-    assert SummedGradients.named("ddp")._start_method == "spawn"
-    assert SummedGradients.named("ddp_fork_find_unused_parameters_true")._start_method == "fork"
+    assert SummedGradients.from_strategy("ddp")._start_method == "spawn"
+    assert SummedGradients.from_strategy("ddp_fork_find_unused_parameters_true")._start_method == "fork"
     assert (
-        SummedGradients.named("auto")
-        is SummedGradients.named("fsdp")
-        is SummedGradients.named(object())
+        SummedGradients.from_strategy("auto")
+        is SummedGradients.from_strategy("fsdp")
+        is SummedGradients.from_strategy(object())
         is None
     )
 

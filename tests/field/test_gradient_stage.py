@@ -67,12 +67,12 @@ def test_a_look_that_was_due_where_a_run_was_cut_off_was_left_out(tmp_path):
     """Of the learning curve, and of what is kept; a checkpoint of step 10 was written before the look."""
     torch.set_num_threads(1)
     whole, folder = run(tmp_path, CostLedger(), validate_every=5), tmp_path / "run"
-    rows = [row | {"seconds": ""} for row in curve.read(folder)]
+    rows = [row | {"seconds": ""} for row in curve.read_curve(folder)]
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, CostLedger(), Interrupt(10, times=2), validate_every=5)
     assert checkpoint.read(folder / "last.ckpt").extra["trainer"]["global_step"] == 10
     resumed = run(tmp_path, CostLedger(), resume=folder / "last.ckpt", validate_every=5)
-    assert [row | {"seconds": ""} for row in curve.read(folder)] == rows and len(rows) == 6
+    assert [row | {"seconds": ""} for row in curve.read_curve(folder)] == rows and len(rows) == 6
     assert all(torch.equal(whole[key], resumed[key]) for key in whole)
 
 

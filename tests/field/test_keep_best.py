@@ -101,7 +101,7 @@ def test_a_look_is_kept_where_its_rows_are_better_by_two_standard_errors(errors,
 
 def test_the_start_is_the_first_point_of_the_curve_and_the_result_the_last(measured, tmp_path):
     fitted(measured, tmp_path, "init=images", steps=20, callbacks=lambda: [CostLedger()])
-    rows = curve.read(tmp_path)
+    rows = curve.read_curve(tmp_path)
     assert [row["step"] for row in rows] == ["0", "5", "10", "15", "20", "20"]
     assert rows[0]["what"] == "init=images, closed form" and rows[-1]["what"].startswith("final, ")
     errors = [float(row["val/psnr_db"]) for row in rows[:-1]]

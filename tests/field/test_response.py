@@ -105,7 +105,7 @@ def test_what_the_array_sees_of_each_gaussian_is_what_it_measures_of_its_image()
     model = _splatted()
     plan, seen = model.freeze(_pose()), gaussian_vectors(model, _pose())
     images = plan.render(torch.eye(30), int(model.gaussians.version))
-    alone = model.response.measured(torch.stack([images, torch.zeros_like(images)], 1))
+    alone = model.response.array_vectors(torch.stack([images, torch.zeros_like(images)], 1))
     torch.testing.assert_close(seen, alone, atol=1e-6 * float(alone.abs().max()), rtol=1e-4)
     with torch.inference_mode():  # as Trainer.test asks
         torch.testing.assert_close(gaussian_vectors(model, _pose()), seen)

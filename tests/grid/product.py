@@ -43,7 +43,7 @@ def predicted(world: World, folder: Path, objects: TrainedRun) -> None:
     data, rows = objects.data, objects.split.folds[0].train[:8]
     predictor = gsparc.load(folder / "run" / "model.ckpt")
     if data.site.stations is not None and len(data.site.stations) > 1:
-        predictor = predictor.at(data.site.stations.name[0])
+        predictor = predictor.select_station(data.site.stations.name[0])
     near, far = _places(data, rows, 0.0), _places(data, rows, FAR_M)
     for places in (near, far):
         found = np.asarray(getattr(predictor, data.site.kind)(**places))

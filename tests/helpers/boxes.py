@@ -7,7 +7,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
-from gsparc.simulate.spectrum import SpectrumSettings, spectra
+from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
 
 ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))
 TRANSMITTER = np.array([1.0, 1.5, 2.6])
@@ -19,8 +19,8 @@ def room_of_spectra(count: int = 160, power: bool = False) -> Measurements:
     """`count` receivers over the floor; of powers in place of amplitudes."""
     engine = ShoeboxEngine(ROOM, TRANSMITTER, 2.4e9)
     receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
-    paths = engine.trace(receivers, engine.supported(Effects(depth=2)))
-    pictures, _ = spectra(paths, SETTINGS, TONES, engine.wavelength)
+    paths = engine.trace(receivers, engine.supported_effects(Effects(depth=2)))
+    pictures, _ = render_spectra(paths, SETTINGS, TONES, engine.wavelength)
     pictures = pictures**2 if power else pictures
     return from_arrays(
         {

@@ -34,7 +34,7 @@ def spectra(path: Path, rows: int = 40, moving: str = "tx", origin: float = 0.0)
 
 def channels(path: Path, rows: int = 80, moving: str = "rx", shape: str = "SAK") -> Path:
     """Image sources in a 4 x 3 x 2.5 m room; `shape` is S, SK or SAK (2 antennas, 2 subcarriers)."""
-    room = Room.uniform((4.0, 3.0, 2.5), -0.5)
+    room = Room.from_size((4.0, 3.0, 2.5), -0.5)
     array = np.array([[0.0, 0, 0], [0.3, 0, 0]])
     where = scatter(room, rows, seed=0, margin=0.4)
     ends = (STILL, where) if moving == "rx" else (where, STILL)

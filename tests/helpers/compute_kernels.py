@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsparc.field.losses import _Kernel, _written_out
+from gsparc.field.losses import _Kernel, _ssim_by_convolution
 from gsparc.ops import _native, backends
 from gsparc.ops.channels import channels, plain_channels
 from gsparc.ops.networks import networks, plain_networks
@@ -85,7 +85,7 @@ KINDS = {
         {torch.float64: (1e-9, 1e-9), torch.float32: (1e-5, 1e-5)},
     ),
     "similarity": Kind(
-        lambda shape, *pair: _Kernel.apply(*pair), lambda shape, *pair: _written_out(*pair), images,
+        lambda shape, *pair: _Kernel.apply(*pair), lambda shape, *pair: _ssim_by_convolution(*pair), images,
         slice(0, 1),
         ((1, 11, 11), (3, 90, 360), (2, 23, 37), (1, 40, 12), (2, 12, 70), (0, 20, 20)),
         {torch.float32: (1e-5, 1e-4)},

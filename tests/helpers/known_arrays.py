@@ -59,6 +59,6 @@ def walk(rows: int, seed: int = 0, step: float = 0.012) -> np.ndarray:
 
 def room_vectors(tx: np.ndarray, order: int, array: np.ndarray):
     """Array vectors (S, M) of a traced room and the trace."""
-    room = Room.uniform((7.0, 5.0, 3.0), -0.6)
+    room = Room.from_size((7.0, 5.0, 3.0), -0.6)
     traced = trace_room(room, tx, RECEIVER, LIGHT / WAVELENGTH, max_order=order, array=array @ TURN.T)
     return traced.csi[:, :, 0], traced

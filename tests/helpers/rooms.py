@@ -27,7 +27,7 @@ def shoebox(
     seed: int = 0,
 ) -> tuple[Trace, Measurements, Fold]:
     """A transmitter near a corner, `count` receivers all over the room; its trace, data and random fold."""
-    room = Room.uniform(size, reflection, occluders=PILLAR if pillar else np.zeros((0, 2, 3)))
+    room = Room.from_size(size, reflection, occluders=PILLAR if pillar else np.zeros((0, 2, 3)))
     tx = np.array(size) * [0.15, 0.27, 0.75]
     rx = scatter(room, count, seed + 1, margin=0.1)
     told = trace_room(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
@@ -43,7 +43,7 @@ def directed(
     trace, data, fold = shoebox(
         count, pillar=pillar, frequency_hz=comb if tones > 1 else 2.4e9, max_order=1, seed=seed
     )
-    sources = trace.images.of(trace.tx[0])
+    sources = trace.images.mirror_points(trace.tx[0])
     rays = sources[None] - trace.rx[:, None]
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     seen = [rays[i][trace.visible[i]].astype(np.float32) for i in range(count)]

@@ -42,13 +42,13 @@ def room(
     rows: int = 120, frequency_hz: float = 3e8, max_order: int = 1, directions: bool = False
 ) -> tuple[Measurements, Fold, np.ndarray]:
     """Channels in a 4 x 3 x 2.5 m box of mirrors, with its sources (I, 3); a wavelength of 1 m at 300 MHz."""
-    box = Room.uniform((4.0, 3.0, 2.5), -0.6)
+    box = Room.from_size((4.0, 3.0, 2.5), -0.6)
     told = trace_room(
         box, np.array([0.7, 0.8, 1.9]), scatter(box, rows, seed=1, margin=0.3), frequency_hz,
         max_order=max_order, snr_db=40,
     )  # fmt: skip
     arrays = as_arrays(told)
-    sources = told.images.of(told.tx[0])
+    sources = told.images.mirror_points(told.tx[0])
     if directions:
         paths = (sources[None] - told.rx[:, None]).reshape(-1, 3)
         arrays["path_direction"] = paths / np.linalg.norm(paths, axis=1, keepdims=True)

@@ -13,7 +13,7 @@ def as_arrays(trace: Trace) -> dict[str, np.ndarray]:
     still = trace.tx if (trace.tx == trace.tx[0]).all() else trace.rx
     arrays = {
         "rx_position": _compact(trace.rx), "tx_position": _compact(trace.tx), "csi": trace.csi,
-        "frequency_hz": trace.frequency_hz, "source_position": trace.images.of(still[0]),
+        "frequency_hz": trace.frequency_hz, "source_position": trace.images.mirror_points(still[0]),
         "source_gain": trace.images.gain, "source_order": trace.images.order, "source_visible": trace.visible,
     }  # fmt: skip
     if len(trace.array) > 1:

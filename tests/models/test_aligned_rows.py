@@ -82,10 +82,10 @@ def test_a_free_gain_is_a_unit_row(logged):
 
 def test_rows_in_parts_are_turned_as_all_at_once(logged, monkeypatch):
     """Ten thousand rows of 64 tones before four antennas took 8 GB."""
-    whole = align_rows(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
+    whole = align_rows(Snapshots.from_rows(logged, np.arange(300)), "phase", logged.site)
     monkeypatch.setattr(aligned_rows, "AT_ONCE", 64)
     monkeypatch.setattr(row_factors, "AT_ONCE", 64)
-    again = align_rows(Snapshots.of(logged, np.arange(300)), "phase", logged.site)
+    again = align_rows(Snapshots.from_rows(logged, np.arange(300)), "phase", logged.site)
     assert np.allclose(again.factors, whole.factors)
 
 
@@ -132,7 +132,7 @@ def test_packets_of_one_place_are_averaged(logged):
 
 def test_one_row_of_a_station_has_nothing_to_be_turned_to(logged):
     """The nearest others of a row alone were an IndexError."""
-    found = align_rows(Snapshots.of(logged, np.arange(1)), "phase+delay", logged.site)
+    found = align_rows(Snapshots.from_rows(logged, np.arange(1)), "phase+delay", logged.site)
     assert found.factors.shape == (1, logged.target.shape[2]) and (found.factors == 1).all()
 
 

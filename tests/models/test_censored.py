@@ -117,7 +117,7 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
     found = build({"_target_": model})
     notes = found.fit(data, Fold(rows, rows[:0], asked), FitContext()).notes
     assert notes == (f"{silent.sum()} rows where nothing was heard are not learned from",)
-    assert found.size() == (~silent).sum()
+    assert found.count_components() == (~silent).sum()
     again = build({"_target_": model})
     assert not again.fit(data, Fold(heard_rows(data, rows), rows[:0], asked), FitContext()).notes
     batch = data.batch(asked)

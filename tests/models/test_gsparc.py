@@ -128,7 +128,10 @@ def test_a_checkpoint_says_the_same(name, tmp_path):
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert again.size() == fitted.method.size() and again.effects == fitted.method.effects
+    assert (
+        again.count_components() == fitted.method.count_components()
+        and again.effects == fitted.method.effects
+    )
 
 
 NAMED = {
@@ -178,7 +181,7 @@ def test_facts_say_where_it_started_and_what_that_cost(name):
         "model/made", "model/class", "model/choices", "model/steps_taken",
     }  # fmt: skip
     assert facts["model/init"] and facts["model/init"] != "auto"
-    assert facts["model/num_gaussians"] == fitted.method.size()
+    assert facts["model/num_gaussians"] == fitted.method.count_components()
     assert facts["model/steps"] >= 0 and 0 < facts["time/init_s"] <= fitted.report.seconds
     share = facts["model/variance_explained"]
     assert share is None or share <= 1
@@ -245,7 +248,7 @@ def test_a_search_that_could_gain_too_little_ends(monkeypatch, caplog):
 )  # fmt: skip
 def test_without_gaussians_it_is_the_plain_process(name, plain):
     fitted = fit(name, "model.field.count=0", "model.steps=0")
-    assert fitted.method.size() == 0 and "phase" not in fitted.method.effects
+    assert fitted.method.count_components() == 0 and "phase" not in fitted.method.effects
     assert fitted.method.facts()["model/variance_explained"] is None
     if plain is not None:
         process, known = method_class(plain)(), np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
@@ -260,7 +263,7 @@ def test_without_gaussians_it_is_the_plain_process(name, plain):
 def test_without_the_residual_gaussians_are_alone(name):
     fitted = fit(name, "model.effects.residual=false")
     method = fitted.method
-    assert "residual" not in method.effects and method.size() > 0
+    assert "residual" not in method.effects and method.count_components() > 0
     if isinstance(method, ImageProcess):
         assert method.state()["beside"] is None
         return

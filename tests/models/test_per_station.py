@@ -74,15 +74,15 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
     predictor = gsparc.load(tmp_path / "m.ckpt")
     place = town.tx[fold.test[0]] + town.site.origin
     number = int(town.station[fold.test[0]])
-    one = predictor.at(number).rssi(tx=place, unit="linear")
+    one = predictor.select_station(number).rssi(tx=place, unit="linear")
     assert one == pytest.approx(
         float(method.predict(town.batch(fold.test[:1])).mean) * town.site.target_scale
     )
     assert predictor.rssi(tx=place, unit="linear")[number] == one
-    with pytest.raises(ValueError, match=r"say which station: \.at\(name\)"):
+    with pytest.raises(ValueError, match=r"use select_station\(name\)"):
         predictor.confidence(tx=place)
     with pytest.raises(ValueError, match="no station 'roof'; there are 0, 1"):
-        predictor.at("roof")
+        predictor.select_station("roof")
 
 
 def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_taken_away(town, tmp_path):
@@ -97,7 +97,7 @@ def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_t
     assert found["test/rmse_db"] > max(10, 2 * found["test/rmse_db_after_constant"])
     gsparc_like = type("OneEnd", (method_class("mean"),), {"both_ends": False})
     with pytest.raises(ValueError, match="cannot predict stations that it never heard"):
-        fit_folds(gsparc_like(), town, split, contexts).with_scores(town, split)
+        fit_folds(gsparc_like(), town, split, contexts).score_on(town, split)
 
 
 def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):

@@ -129,7 +129,7 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     told = again.predict(query)
     for part in ("mean", "confidence", "variance"):
         torch.testing.assert_close(getattr(told, part), getattr(said, part))
-    assert again.size() == method.size()
+    assert again.count_components() == method.count_components()
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,9 @@ def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
     for number in range(len(kinds.POSTS)):
         rows = fold.test[data.station[fold.test] == number]
         scored = method.predict(data.batch(rows)).mean
-        torch.testing.assert_close(served(predictor.at(number), data, rows), scored, rtol=1e-4, atol=0)
+        torch.testing.assert_close(
+            served(predictor.select_station(number), data, rows), scored, rtol=1e-4, atol=0
+        )
 
 
 @pytest.mark.parametrize("words", ["model=complex_gp", "model=gsparc model.effects.phase=false"])
@@ -207,7 +209,7 @@ def test_places_are_served_in_the_phase_of_the_largest_run(words):
     fold, method = fold_of(data), build(compose(*words.split()).model).create_for(data)
     method.fit(data, fold, FitContext())
     batch = data.batch(fold.test)
-    factor = method.runs.of(batch.run)[:, None, None]
+    factor = method.runs.look_up(batch.run)[:, None, None]
     assert (factor - 1).abs().max() > 0.1
     said = served(Predictor(method, data.site), data, fold.test)
     torch.testing.assert_close(said * factor.to(said.dtype), method.predict(batch).mean, rtol=1e-4, atol=1e-5)

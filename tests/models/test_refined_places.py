@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import by_station
-from gsparc.models.refined_places import Linearised, displacements, move_rows, refine_places
+from gsparc.models.refined_places import Linearised, estimate_place_errors, move_rows, refine_places
 from gsparc.training.context import FitContext
 
 BRIEF = FitContext(effort=0.1)
@@ -39,7 +39,7 @@ def _told(count=40, std=0.02, seed=0):
 def test_displacements_are_those_of_a_ridge_regression():
     error, seen = _told()
     std = torch.full((40,), 0.02, dtype=torch.float64)
-    found, gain = displacements(seen, torch.arange(40), std)
+    found, gain = estimate_place_errors(seen, torch.arange(40), std)
     share = min(np.logspace(-3, 1.5, 46), key=lambda s: abs(s - 1))
     ridge = [
         np.linalg.solve(j.T @ j / (0.01 * share) + np.eye(3) / 0.02**2, j.T @ r / (0.01 * share))
@@ -53,10 +53,10 @@ def test_a_place_without_error_stays_and_one_far_too_large_gains_nothing():
     _, seen = _told()
     std = torch.full((40,), 0.02, dtype=torch.float64)
     std[::2] = 0.0
-    found, _ = displacements(seen, torch.arange(40), std)
+    found, _ = estimate_place_errors(seen, torch.arange(40), std)
     assert not found[::2].any() and found[1::2].all()
     exact = replace(seen, residual=0.1 * torch.randn(40, 4, generator=torch.manual_seed(1)).double())
-    assert displacements(exact, torch.arange(40), std)[1] < 0
+    assert estimate_place_errors(exact, torch.arange(40), std)[1] < 0
 
 
 def test_what_was_not_measured_says_nothing_and_rows_of_one_place_share():
@@ -65,11 +65,11 @@ def test_what_was_not_measured_says_nothing_and_rows_of_one_place_share():
     hidden = replace(seen, variance=seen.variance.clone())
     hidden.variance[:, 2:] = torch.inf
     fewer = Linearised(seen.residual[:, :2], seen.slope[:, :2], seen.variance[:, :2])
-    of_all, of_fewer = (displacements(each, torch.arange(40), std) for each in (hidden, fewer))
+    of_all, of_fewer = (estimate_place_errors(each, torch.arange(40), std) for each in (hidden, fewer))
     assert torch.allclose(of_all[0], of_fewer[0]) and of_all[1] == pytest.approx(of_fewer[1])
     halves = [torch.cat(part.split(2, 1)) for part in (seen.residual, seen.slope, seen.variance)]
-    stations = displacements(Linearised(*halves), torch.arange(40).repeat(2), std)
-    assert torch.allclose(stations[0], displacements(seen, torch.arange(40), std)[0])
+    stations = estimate_place_errors(Linearised(*halves), torch.arange(40).repeat(2), std)
+    assert torch.allclose(stations[0], estimate_place_errors(seen, torch.arange(40), std)[0])
 
 
 def _channels(error_m, rows=130, seed=0):

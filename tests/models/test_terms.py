@@ -37,7 +37,7 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
         field=FieldSettings(count=count), **more,
     )  # fmt: skip
     found = choose(data, settings)
-    parts = tuple(found.tries(data)) if isinstance(found, Mixture) else ()
+    parts = tuple(found.list_candidates(data)) if isinstance(found, Mixture) else ()
     return parts, not parts and found.settings.response.array
 
 

@@ -41,7 +41,7 @@ def test_spectra_of_an_array(grid, height, name):
 
 @pytest.mark.parametrize("near", [1, 5, 64])
 @pytest.mark.parametrize("kernel", [
-    Kernel.of_one(0.3, 0.1), Kernel.matern((0.05, 2.0), (0.3, 0.7), 0.01),
+    Kernel.from_length(0.3, 0.1), Kernel.from_lengths((0.05, 2.0), (0.3, 0.7), 0.01),
     Kernel((Shadowing(0.05, 0.3), ExponentialShadowing(2.0, 0.7), WhiteNoise(0.01))),
 ])  # fmt: skip
 def test_weights_of_the_nearest_rows(near, kernel):

@@ -125,7 +125,7 @@ def answers(predictor: gsparc.Predictor, asked: Arrays) -> dict[str, np.ndarray]
     ends, result = places(asked), {}
     names = [] if "station_position" not in asked else list(predictor.site.stations.name)
     for name in names or [""]:
-        one = predictor.at(name) if name else predictor
+        one = predictor.select_station(name) if name else predictor
         said = one.predict(**ends)
         parts = {"mean": said.mean, "variance": said.variance, "confidence": said.confidence}
         try:
@@ -151,7 +151,7 @@ def rows_and_places(predictor: gsparc.Predictor, asked: Arrays) -> dict[str, flo
     result: dict[str, float] = {}
     for number, name in enumerate(names or [""]):
         ends = places(asked).get("tx"), places(asked).get("rx")
-        place = (predictor.at(name) if name else predictor).queries.query(*ends).query
+        place = (predictor.select_station(name) if name else predictor).queries.query(*ends).query
         station = torch.full((len(place),), number) if name else None
         with torch.no_grad():
             told = predictor.method.predict(replace(place, station=station, **known))

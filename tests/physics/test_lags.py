@@ -34,13 +34,13 @@ def test_lags_hold_the_whole_spectrum():
     power = torch.from_numpy(bartlett(channels)).float()[None]
     space = SpectrumLags(ELEMENTS, GRID, WAVELENGTH)
     assert space.count == 35  # (2 * 4 - 1) * (2 * 3 - 1)
-    again = space.spectrum(space.of(power))
+    again = space.spectrum(space.to_lags(power))
     np.testing.assert_allclose(again, power, atol=1e-4 * float(power.max()))
 
 
 def test_an_image_no_array_could_measure_is_not_in_the_span():
     space = SpectrumLags(ELEMENTS, GRID, WAVELENGTH)
     noise = torch.rand(1, 18, 72)
-    assert (space.spectrum(space.of(noise)) - noise).square().sum() > 0.05 * noise.square().sum()
+    assert (space.spectrum(space.to_lags(noise)) - noise).square().sum() > 0.05 * noise.square().sum()
     with pytest.raises(RuntimeError):
-        space.of(torch.rand(1, 18, 71))
+        space.to_lags(torch.rand(1, 18, 71))

@@ -14,24 +14,24 @@ def images(count=12):
 def test_images_of_low_rank_come_back():
     known = images()
     basis = fit_separable(known.double().split(5), 1e-12)
-    assert basis.of(known).shape == (12, 12) and basis.image == (10, 20)
-    torch.testing.assert_close(basis.images(basis.of(known)), known, rtol=1e-5, atol=1e-5)
+    assert basis.project(known).shape == (12, 12) and basis.image == (10, 20)
+    torch.testing.assert_close(basis.images(basis.project(known)), known, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(basis.rows.T @ basis.rows, torch.eye(3), rtol=0, atol=1e-6)
-    energy = basis.of(known).square().sum(1)
+    energy = basis.project(known).square().sum(1)
     torch.testing.assert_close(energy, known.square().sum((1, 2)), rtol=1e-5, atol=0)
 
 
 def test_no_more_than_the_share_is_lost():
     known = images() + 0.1 * torch.rand(12, 10, 20, generator=torch.Generator().manual_seed(1))
     basis = fit_separable([known], 0.01)
-    left = (basis.images(basis.of(known)) - known).square().sum() / known.square().sum()
-    assert basis.of(known).shape[1] < 200 and 0 < left <= 0.02  # of both modes
+    left = (basis.images(basis.project(known)) - known).square().sum() / known.square().sum()
+    assert basis.project(known).shape[1] < 200 and 0 < left <= 0.02  # of both modes
 
 
 def test_thinned_pixels_are_those_of_the_full_image():
     known = images()
     basis = fit_separable([known.double()], 1e-12)
-    thin = basis.thinned(2).images(basis.of(known))
+    thin = basis.subsample_pixels(2).images(basis.project(known))
     torch.testing.assert_close(thin, known[:, ::2, ::2], rtol=1e-5, atol=1e-5)
 
 

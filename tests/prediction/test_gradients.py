@@ -169,7 +169,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))
     site = type(data.site)(**{**vars(data.site), "origin": data.site.origin + WORLD})
     found = Predictor(method, site)
-    return found if case.station is None else found.at(int(case.station)), data
+    return found if case.station is None else found.select_station(int(case.station)), data
 
 
 def places(predictor: Predictor, count: int = 3) -> torch.Tensor:

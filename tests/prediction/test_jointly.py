@@ -24,7 +24,7 @@ def test_stations_at_a_place_and_places_of_a_station_have_one_variance():
     level, covariance, noise = predictor.predict_joint(PLACES, numbers)
     np.testing.assert_allclose(level, predictor.rssi(tx=PLACES), rtol=1e-5)
     for number, name in enumerate(predictor.site.stations.name):
-        own, scatter = predictor.at(name).covariance(tx=PLACES)
+        own, scatter = predictor.select_station(name).covariance(tx=PLACES)
         assert scatter == pytest.approx(noise[number])
         np.testing.assert_allclose(own.diagonal() + scatter, covariance[:, number, number], rtol=1e-6)
         assert own[0, 1] > own[0, 2], "errors of neighbours are alike"
@@ -43,6 +43,6 @@ def test_a_plan_of_stations_learned_together_was_an_error_of_shapes(tmp_path):
     data = load_own(town_file(tmp_path / "town.npz"))
     method, rows = by_station(method_class("gp")(), data), np.arange(0, len(data), 7)
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, stations="together"))
-    one = Predictor(method, data.site).at(data.site.stations.name[0])
+    one = Predictor(method, data.site).select_station(data.site.stations.name[0])
     covariance, noise = one.covariance(**{data.site.moving_end: PLACES})
     assert covariance.shape == (3, 3) and covariance[0, 1] > covariance[0, 2] and noise > 0

@@ -144,7 +144,7 @@ def test_degrees_to_metres_and_back(abroad):
     latitude, longitude, height = abroad.degrees(many)
     assert np.allclose(latitude, [47.004, 47.005], atol=1e-10) and np.allclose(longitude, [11.002, 11.003])
     assert height.tolist() == [1, 2] and abroad.degrees(place)[2] == 1.5
-    assert isinstance(abroad.at(0).rssi(rx=place)[0], np.float32)
+    assert isinstance(abroad.select_station(0).rssi(rx=place)[0], np.float32)
 
 
 def test_degrees_that_mean_nothing_are_refused(abroad, spectra):
@@ -165,26 +165,26 @@ def test_utm_places_in_float32_were_half_a_metre_off(abroad):
     """The origin is taken away in float64, but steps of 5,000 km in float32 are 0.5 m: phases were lost."""
     utm = np.array([691_500.0, 5_334_500, 0])
     site = dataclasses.replace(abroad.site, origin=abroad.site.origin + utm)
-    far, place = gsparc.Predictor(abroad.method, site).at(0), abroad.metres(47.004, 11.002)
+    far, place = gsparc.Predictor(abroad.method, site).select_station(0), abroad.metres(47.004, 11.002)
     there = place + utm
-    assert np.allclose(far.rssi(rx=there), abroad.at(0).rssi(rx=place), atol=1e-4)
+    assert np.allclose(far.rssi(rx=there), abroad.select_station(0).rssi(rx=place), atol=1e-4)
     for rough in (torch.tensor(there, dtype=torch.float32), there.astype(np.float32)):
         with pytest.raises(
             ValueError, match=r"rx= is float32, which moves in steps of 0.5 m there; give float64"
         ):
             far.rssi(rx=rough)
-    abroad.at(0).rssi(rx=place.astype(np.float32))
+    abroad.select_station(0).rssi(rx=place.astype(np.float32))
 
 
 def test_two_stations_at_one_place_have_models_of_their_own(abroad):
     """Both carriers of a mast were answered by the model of the first."""
     place = abroad.metres(47.004, 11.002)
-    low, high = (float(abroad.at(number).rssi(rx=place)[0]) for number in (0, 1))
+    low, high = (float(abroad.select_station(number).rssi(rx=place)[0]) for number in (0, 1))
     assert 25 < low - high < 35
 
 
 def test_all_at_once_is_what_is_asked_one_by_one(abroad):
-    one, places = abroad.at(1), abroad.metres([47.004, 47.008], [11.002, 11.009])
+    one, places = abroad.select_station(1), abroad.metres([47.004, 47.008], [11.002, 11.009])
     said = one.predict(rx=places)
     assert np.array_equal(said.mean.numpy(), one.rssi(rx=places))
     assert np.array_equal(said.confidence.numpy(), one.confidence(rx=places))

@@ -8,7 +8,7 @@ from gsparc.processes.averages import mixture_moments
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import EXCESS, NeighbourSample, nearest_density
 
-KERNEL = Kernel.matern((1.2, 6.0), (0.4, 0.6), 0.08)
+KERNEL = Kernel.from_lengths((1.2, 6.0), (0.4, 0.6), 0.08)
 
 
 def test_variance_of_places_is_what_known_ones_leave():
@@ -34,11 +34,11 @@ def test_density_of_rows_given_their_neighbours():
     amplitude = np.mean(np.divide(squared, variance))
     excess = max(np.log(amplitude / np.mean(values[:, 0] ** 2)), 0)
     wanted = 0.5 * (np.log(amplitude) + np.mean(np.log(variance))) + EXCESS * excess**2 / 12
-    sample = NeighbourSample.of(*map(torch.from_numpy, (places, values, count)))
+    sample = NeighbourSample.from_rows(*map(torch.from_numpy, (places, values, count)))
     parameters = KERNEL.parameters().requires_grad_()
-    nats, found = nearest_density(KERNEL.at(parameters), sample)
+    nats, found = nearest_density(KERNEL.with_values(parameters), sample)
     assert abs(nats.item() - wanted) < 1e-6 and abs(found.item() / amplitude - 1) < 1e-6
-    assert torch.autograd.gradcheck(lambda at: nearest_density(KERNEL.at(at), sample)[0], parameters)
+    assert torch.autograd.gradcheck(lambda at: nearest_density(KERNEL.with_values(at), sample)[0], parameters)
 
 
 def test_variance_of_a_mixture_has_what_its_members_disagree_about():

@@ -37,7 +37,7 @@ def small_vector(count: int = 8):
 @pytest.mark.parametrize("side", [(1, 1, 1), (1, -1, 1)])
 def test_evidence_and_means_are_those_of_sampling(side):
     gram, values, unknown = small_vector()
-    told, sides = ConditionalGaussian.of(gram, values, unknown), torch.tensor(side, dtype=torch.int8)
+    told, sides = ConditionalGaussian.from_gram(gram, values, unknown), torch.tensor(side, dtype=torch.int8)
     sites = fit_by_ep(told, values[unknown], sides)
     normal = multivariate_normal(told.mean, told.covariance, seed=1)
     assert sites.settled
@@ -78,10 +78,10 @@ def test_the_slope_of_the_evidence(monkeypatch, side):
 def test_rows_certain_to_be_silent_change_nothing():
     gram, values, unknown = small_vector()
     level = values[unknown] + torch.tensor([0.0, 60.0, 0.0])
-    told = ConditionalGaussian.of(gram, values, unknown)
+    told = ConditionalGaussian.from_gram(gram, values, unknown)
     kept = told.z_score(level) < CERTAIN
     assert kept.tolist() == [True, False, True]
-    every, rest = fit_by_ep(told, level), fit_by_ep(told.at(kept), level[kept])
+    every, rest = fit_by_ep(told, level), fit_by_ep(told.marginal(kept), level[kept])
     assert np.allclose(every.value[kept], rest.value, atol=1e-2)
     assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
 

@@ -8,7 +8,7 @@ from gsparc.processes.density import LeftOutDensity, covariance_of, minimise
 from gsparc.processes.factor import NotDefiniteError
 from gsparc.processes.kernel import Kernel
 
-KERNELS = (Kernel.matern((0.3,), (1.0,), 0.1), Kernel.matern((0.1, 0.5), (0.3, 0.7), 0.1))
+KERNELS = (Kernel.from_lengths((0.3,), (1.0,), 0.1), Kernel.from_lengths((0.1, 0.5), (0.3, 0.7), 0.1))
 
 
 def rows(count: int, outputs: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -26,7 +26,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
     distance, columns, values = rows(40, outputs)
 
     def density(at: torch.Tensor) -> torch.Tensor:
-        gram = covariance_of(kernel.at(at), distance, columns)
+        gram = covariance_of(kernel.with_values(at), distance, columns)
         return LeftOutDensity.apply(gram, values, outputs + 1, bounded)[0]
 
     at = kernel.parameters().requires_grad_()
@@ -52,7 +52,7 @@ def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
 
 def test_kernels_are_their_parameters():
     for kernel in KERNELS:
-        again = kernel.at(kernel.parameters())
+        again = kernel.with_values(kernel.parameters())
         numbers = [*again.lengths, *again.shares, again.noise]
         assert np.allclose(numbers, [*kernel.lengths, *kernel.shares, kernel.noise])
 

@@ -20,7 +20,7 @@ def covariance(kind: torch.dtype, count: int = 30, batch: tuple[int, ...] = ()) 
 def test_everything_solved_is_what_torch_solves(kind, batch):
     given, close = covariance(kind, batch=batch), {"rtol": KINDS[kind], "atol": 10 * KINDS[kind]}
     values, inverse = torch.randn(*batch, 30, 4, dtype=kind), torch.linalg.inv(given)
-    factor, lower = Factor.of(given), torch.linalg.cholesky(given)
+    factor, lower = Factor.from_gram(given), torch.linalg.cholesky(given)
     torch.testing.assert_close(factor.lower, lower, **close)
     torch.testing.assert_close(factor.solve(values), inverse @ values, **close)
     torch.testing.assert_close(factor.whiten(values), torch.linalg.inv(lower) @ values, **close)
@@ -35,28 +35,28 @@ def test_complex_values_through_a_real_factor_lost_their_imaginary_parts():
     given = covariance(torch.float64)
     values = torch.randn(30, 2, dtype=torch.complex128)
     expected = torch.linalg.inv(given).to(values.dtype) @ values
-    torch.testing.assert_close(Factor.of(given).solve(values), expected)
-    torch.testing.assert_close(Factor.of(given).solve(values.conj()), expected.conj())
+    torch.testing.assert_close(Factor.from_gram(given).solve(values), expected)
+    torch.testing.assert_close(Factor.from_gram(given).solve(values.conj()), expected.conj())
 
 
 def test_gradients_go_through():
     given = covariance(torch.float64, 5).requires_grad_()
     one = torch.ones(5, 1, dtype=torch.float64)
-    assert torch.autograd.gradcheck(lambda k: Factor.of((k + k.T) / 2).solve(one), given)
+    assert torch.autograd.gradcheck(lambda k: Factor.from_gram((k + k.T) / 2).solve(one), given)
 
 
 def test_rounding_is_mended_with_a_ridge_and_what_is_more_is_refused():
     places = torch.linspace(0, 1e-3, 200)[:, None]
     alike = torch.exp(-torch.cdist(places, places).square())  # float32: eigenvalues of either sign
     assert torch.linalg.cholesky_ex(alike).info
-    lower = Factor.of(alike).lower
+    lower = Factor.from_gram(alike).lower
     assert float((lower @ lower.T - alike).abs().max()) < 1e-3
     with pytest.raises(NotDefiniteError):
-        Factor.of(alike, "raise")
+        Factor.from_gram(alike, "raise")
     with pytest.raises(NotDefiniteError, match="gsparc check"):
-        Factor.of(-torch.eye(3))
+        Factor.from_gram(-torch.eye(3))
     with pytest.raises(NotDefiniteError):
-        Factor.of(torch.eye(3).expand(2, 3, 3) * torch.tensor([1.0, -1.0])[:, None, None])
+        Factor.from_gram(torch.eye(3).expand(2, 3, 3) * torch.tensor([1.0, -1.0])[:, None, None])
 
 
 @pytest.mark.parametrize("grouped", [False, True])
@@ -64,7 +64,7 @@ def test_rounding_is_mended_with_a_ridge_and_what_is_more_is_refused():
 def test_rows_left_out_are_predictions_of_the_rest(kind, grouped):
     signal, noise = covariance(kind, 20), covariance(kind, 20) * 0.2
     given, values = signal + noise, torch.randn(20, 3, dtype=kind)
-    inverse = Factor.of(given).inverse
+    inverse = Factor.from_gram(given).inverse
     number = torch.arange(20) // (4 if grouped else 1)
     groups = rows_of_groups(number.numpy()) if grouped else None
     residual, variance = left_out_residuals(inverse, inverse @ values, groups)
@@ -82,7 +82,7 @@ def test_rows_left_out_are_predictions_of_the_rest(kind, grouped):
 def test_a_factor_of_nothing_says_nothing(capfd):
     """LAPACK printed a complaint for each of hundreds of empty factors."""
     none = torch.zeros(0, 0, dtype=torch.float64)
-    factor = Factor.of(none)
+    factor = Factor.from_gram(none)
     assert factor.whiten(torch.zeros(0, 3).double()).shape == (0, 3)
     assert factor.solve(torch.zeros(0, 3).double()).shape == (0, 3)
     assert "".join(capfd.readouterr()) == ""
@@ -94,5 +94,5 @@ def test_values_of_another_precision_are_taken_as_the_factors(rows, columns):
     """Single columns and few rows go to torch, which refuses what LAPACK converted."""
     gram = covariance(torch.float64, rows)
     values = torch.randn(rows, columns)
-    found = Factor.of(gram).solve(values)
+    found = Factor.from_gram(gram).solve(values)
     torch.testing.assert_close(gram @ found, values.double())

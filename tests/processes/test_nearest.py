@@ -17,7 +17,7 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 from tests.models.powers.test_settings import error_db, fit, town
 
-KERNEL = Kernel.matern((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
+KERNEL = Kernel.from_lengths((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
 
 def rows_of(data, count: int) -> PowerRows:
@@ -28,9 +28,9 @@ def rows_of(data, count: int) -> PowerRows:
 
 def given(rows: PowerRows, most: int = NEIGHBOURS) -> PowerProcess:
     """The same process by nearest rows."""
-    values = PlaceValues.of(rows.places, torch.from_numpy(rows.decibels)[:, None])
+    values = PlaceValues.from_rows(rows.places, torch.from_numpy(rows.decibels)[:, None])
     heard = float(np.average((rows.decibels - rows.decibels.mean()) ** 2)) / KERNEL.amplitude
-    return PowerProcess(given_places(Prior(KERNEL, Trend(-100.0)), values, 0, most=most), heard)
+    return PowerProcess(given_places(Prior(KERNEL, Trend(-100.0)), values, 0, neighbours=most), heard)
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_given_all_rows_as_neighbours_it_is_the_exact_process():
 
 
 def test_the_only_place_was_its_own_neighbour():
-    one = neighbourhood.Neighbourhood.of(np.zeros((1, 3)), 0)
+    one = neighbourhood.Neighbourhood.from_places(np.zeros((1, 3)), 0)
     assert one.nearest(np.zeros((2, 3)), np.zeros(2, int)).shape == (2, 0)
     assert one.nearest(np.ones((1, 3))).tolist() == [[0]]
     assert np.allclose(neighbourhood.nearest_distance(one.tree, torch.ones(1, 3).double()), 3**0.5)
@@ -61,7 +61,7 @@ def test_the_only_place_was_its_own_neighbour():
 def test_rows_of_one_place_are_its_mean_and_lose_nothing():
     data, rng = town(60), np.random.default_rng(0)
     often = np.repeat(np.arange(40), 3)
-    rows = rows_of(data, 60).at(often)
+    rows = rows_of(data, 60).subset(often)
     rows = PowerRows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
     whole, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     near = given(rows, 1000)
@@ -93,7 +93,7 @@ def test_silent_rows_stay_known_and_are_counted(many):
     )
     process, notes = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     assert any("of 90 censored rows 30, drawn evenly, are looked at" in note for note in notes), notes
-    loud = rows.at(np.flatnonzero(~silent))
+    loud = rows.subset(np.flatnonzero(~silent))
     deaf = given(loud)
     truth = 10 * np.log10(data.target[silent, 0])
     heard, unheard = (
@@ -119,8 +119,8 @@ def test_covariances_are_those_of_rows_that_cover_the_site(many):
     data = town(400)
     rows = rows_of(data, 300)
     process, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
-    few = process.exact()
-    assert len(few.places) == 100 and few.exact() == few and isinstance(few.posterior, Exact)
+    few = process.with_exact_posterior()
+    assert len(few.places) == 100 and few.with_exact_posterior() == few and isinstance(few.posterior, Exact)
     queries = torch.from_numpy(data.moving[300:])
     wide, narrow = few.answer(queries)[1], process.answer(queries)[1]
     assert isinstance(process.posterior, Nearest) and (wide >= narrow * 0.99).float().mean() > 0.95
@@ -162,10 +162,10 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
 def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():
     rng = np.random.default_rng(0)
     places, values = rng.uniform(0, 1, (40, 3)), torch.from_numpy(rng.normal(size=(40, 1)))
-    prior = Prior(Kernel.of_one(0.5, 0.1, term=SmoothRough))
+    prior = Prior(Kernel.from_length(0.5, 0.1, term=SmoothRough))
     queries = torch.from_numpy(rng.uniform(0, 1, (5, 3)))
-    near = given_places(prior, PlaceValues.of(places, values), 0, most=40).answer(queries)
-    exact = Exact.of(prior, torch.from_numpy(places), values).answer(queries)
+    near = given_places(prior, PlaceValues.from_rows(places, values), 0, neighbours=40).answer(queries)
+    exact = Exact.from_values(prior, torch.from_numpy(places), values).answer(queries)
     assert torch.allclose(near.mean, exact.mean, atol=1e-6) and torch.allclose(
-        near.left, exact.left, atol=1e-6
+        near.variance, exact.variance, atol=1e-6
     )

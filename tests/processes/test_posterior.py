@@ -24,8 +24,10 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     lengths, noise, level = rng.uniform(0.1, 3, 2), 10 ** rng.uniform(-3, 0), rng.normal()
     places, queries = rng.uniform(0, 4, (count, 3)), rng.uniform(-1, 5, (7, 3))
     values = rng.normal(size=(count, outputs))
-    kernel = Kernel.matern(tuple(lengths), (share, 1 - share), noise)
-    posterior = Exact.of(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
+    kernel = Kernel.from_lengths(tuple(lengths), (share, 1 - share), noise)
+    posterior = Exact.from_values(
+        Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values)
+    )
     found = posterior.answer(torch.from_numpy(queries))
     shape = ConstantKernel(share) * Matern(lengths[0], nu=1.5)
     shape = shape + ConstantKernel(1 - share) * Matern(lengths[1], nu=1.5) + ConstantKernel(1.0)
@@ -33,7 +35,7 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     mean, covariance = library.predict(queries, return_cov=True)
     covariance = covariance[..., 0] if covariance.ndim == 3 else covariance  # alike for all outputs
     np.testing.assert_allclose(found.mean, mean.reshape(7, -1) + level, atol=1e-8)
-    np.testing.assert_allclose(found.left, covariance.diagonal() + noise, atol=1e-8)
+    np.testing.assert_allclose(found.variance, covariance.diagonal() + noise, atol=1e-8)
     np.testing.assert_allclose(posterior.covariance(torch.from_numpy(queries)), covariance, atol=1e-8)
     np.testing.assert_allclose(posterior.values(), values, atol=1e-8)
 
@@ -47,7 +49,7 @@ def test_sums_of_terms_are_gpytorchs(seed):
     places, queries = (3 * torch.rand(n, 2, generator=draw, dtype=torch.float64) for n in (30, 6))
     values = torch.randn(30, generator=draw, dtype=torch.float64)
     terms = Shadowing(short, share), ExponentialShadowing(long, 1 - share)
-    ours = Exact.of(
+    ours = Exact.from_values(
         Prior(Kernel((*terms, WhiteNoise(noise)), amplitude), Trend(0.0)), places, values[:, None]
     )
 
@@ -72,7 +74,7 @@ def test_sums_of_terms_are_gpytorchs(seed):
         said, found = likelihood(theirs.eval()(queries)), ours.answer(queries)
     told = Conditioned(ours.factor, values[:, None] / amplitude**0.5, ours.weights / amplitude**0.5)
     torch.testing.assert_close(found.mean[:, 0], said.mean)
-    torch.testing.assert_close(amplitude * found.left, said.variance)
+    torch.testing.assert_close(amplitude * found.variance, said.variance)
     assert -told.nll - 15 * math.log(2 * math.pi * amplitude) == pytest.approx(float(nats))
 
 
@@ -82,14 +84,14 @@ def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
     places = torch.rand(30, 3, generator=generator, dtype=torch.float64)
     values = torch.randn(30, 2, generator=generator, dtype=torch.complex128)
     prior = Prior(Kernel((IsotropicWaves(0.7, 1.0, 20.0), WhiteNoise(0.05))))
-    both = Exact.of(prior, places, values)
-    pairs = Exact.of(prior, places, torch.cat([values.real, values.imag], 1))
+    both = Exact.from_values(prior, places, values)
+    pairs = Exact.from_values(prior, places, torch.cat([values.real, values.imag], 1))
     queries = torch.rand(6, 3, generator=generator, dtype=torch.float64)
     one, two = both.answer(queries), pairs.answer(queries)
     torch.testing.assert_close(one.mean, torch.complex(*two.mean.split(2, 1)))
-    torch.testing.assert_close(one.left, two.left)
+    torch.testing.assert_close(one.variance, two.variance)
     near = condition_on_nearest(
-        prior, PlaceValues(places.numpy(), values, torch.ones(30).double()), 0, most=1000
+        prior, PlaceValues(places.numpy(), values, torch.ones(30).double()), 0, neighbours=1000
     )
     torch.testing.assert_close(near.answer(queries).mean, one.mean, rtol=1e-5, atol=1e-6)
     again = Nearest.read(near.state()).answer(queries)
@@ -102,8 +104,8 @@ def test_density_and_slope_of_circular_values():
     covariance, values = root @ root.mH / 12, torch.randn(12, 3, generator=generator, dtype=torch.complex128)
     change = torch.randn(12, 12, generator=generator, dtype=torch.complex128)
     change = 1e-6 * (change + change.mH)
-    ends = [Conditioned.of(covariance + step * change, values).nll for step in (-0.5, 0.5)]
-    told = Conditioned.of(covariance, values)
+    ends = [Conditioned.from_gram(covariance + step * change, values).nll for step in (-0.5, 0.5)]
+    told = Conditioned.from_gram(covariance, values)
     expected = float((told.slope @ change).diagonal().sum().real)
     assert ends[1] - ends[0] == pytest.approx(expected, rel=1e-5)
     density = (
@@ -117,14 +119,14 @@ def test_variance_of_many_rows_is_of_the_nearest(trend, monkeypatch):
     """Within 2 % at places among the rows and far from all; means are the exact ones."""
     rng = np.random.default_rng(0)
     places = torch.from_numpy(np.c_[rng.uniform(0, 10, (1_500, 2)), np.zeros(1_500)])
-    kernel = Kernel.matern((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
+    kernel = Kernel.from_lengths((0.4, 3.0), (0.4, 0.6), 0.05, 20.0)
     values = -60 + 3 * torch.sin(places[:, :1]) + torch.from_numpy(rng.normal(size=(1_500, 1)))
-    many = Exact.of(Prior(kernel, trend), places, values)
+    many = Exact.from_values(Prior(kernel, trend), places, values)
     inside = torch.from_numpy(np.c_[rng.uniform(0, 10, (200, 2)), np.zeros(200)])
     queries = torch.cat([inside, inside + torch.tensor([300.0, 0.0, 0.0])])
     near = many.answer(queries)
     monkeypatch.setattr(posterior, "MANY", 10_000)
-    exact = Exact.of(Prior(kernel, trend), places, values).answer(queries)
+    exact = Exact.from_values(Prior(kernel, trend), places, values).answer(queries)
     assert torch.equal(near.mean, exact.mean)
-    assert float((near.left / exact.left - 1)[:200].abs().max()) < 0.02
-    assert float((near.left / exact.left - 1)[200:].abs().max()) < 0.02
+    assert float((near.variance / exact.variance - 1)[:200].abs().max()) < 0.02
+    assert float((near.variance / exact.variance - 1)[200:].abs().max()) < 0.02

@@ -33,7 +33,7 @@ def test_building_blocks_and_its_corner_diffracts() -> None:
     """By Keller's coefficient of a half-plane, from the corner at (8, 2)."""
     streets, user, corner = _street([[[8, -10], [12, 2]]], ground=0.0), np.array([16, 2.5]), np.array([8, 2])
     behind = trace_streets(streets, np.array([[*user, 5.0]]), 0.125)
-    assert streets.blocked(np.zeros((1, 2)), user[None])[0]
+    assert streets.are_blocked(np.zeros((1, 2)), user[None])[0]
     near, far = np.linalg.norm(corner), np.linalg.norm(user - corner)
     bend = np.arccos(corner @ (user - corner) / near / far)
     keller = 1 / (2 * np.sqrt(2 * np.pi * 2 * np.pi / 0.125) * np.sin(bend / 2))

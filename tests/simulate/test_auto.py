@@ -64,8 +64,8 @@ def decided(deliverable, record=RECORD):
     paths = heard(20, record)
     probe = probe_of(paths, paths, np.linspace(2.4e9, 2.48e9, 26))
     settings = AutoSettings(deliverable=deliverable, probes=20, held_back=20, full=FULL)
-    choice = auto.decide(probe, settings)
-    return auto.verify(choice, settings, probe.errors(choice.effects, settings.required))
+    choice = auto.choose_effects(probe, settings)
+    return auto.verify_choice(choice, settings, probe.errors(choice.effects, settings.required))
 
 
 @pytest.mark.parametrize("text, kind, tolerance", [
@@ -87,7 +87,7 @@ def test_bad_settings_are_refused(wrong):
 
 def test_coverage_drops_what_is_below_a_decibel():
     choice = decided("coverage +-1 dB")
-    assert set(choice.effects.on) == {"line_of_sight", "specular", "refraction"}
+    assert set(choice.effects.enabled) == {"line_of_sight", "specular", "refraction"}
     assert choice.effects.depth == 1
     rows = {row.effect: row for row in choice.table}
     assert rows["refraction"].share == pytest.approx(0.6 / 2.18, rel=1e-4)
@@ -98,7 +98,7 @@ def test_coverage_drops_what_is_below_a_decibel():
 
 def test_stricter_deliverable_keeps_more():
     loose, strict = decided("csi -10 dB").effects, decided("csi -60 dB").effects
-    assert set(loose.on) < set(strict.on)
+    assert set(loose.enabled) < set(strict.enabled)
     assert strict == replace(FULL, edge_diffraction=False)  # there is none in the record
 
 
@@ -111,7 +111,7 @@ def test_effects_dropped_together_are_judged_together():
 
 def test_one_odd_receiver_does_not_keep_everything():
     """A single probe in a corner once kept every effect of a whole room."""
-    choice = auto.decide(probe_of(with_odd_receiver(heard(128))), AutoSettings(full=FULL))
+    choice = auto.choose_effects(probe_of(with_odd_receiver(heard(128))), AutoSettings(full=FULL))
     assert not choice.effects.diffuse and choice.effects.specular
 
 
@@ -135,7 +135,7 @@ def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
         gain = probe.paths.gain * 1.05
         gain[: outside * len(RECORD)] *= 2
         thinned = replace(probe.paths, gain=gain)
-        return auto.fewer_rays(choice, AutoSettings(full=FULL), probe, thinned, 300)
+        return auto.choose_rays(choice, AutoSettings(full=FULL), probe, thinned, 300)
 
     taken = tried(3)
     row = taken.table[-1]
@@ -149,7 +149,7 @@ def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
 def test_violated_requirement_is_reported():
     other = probe_of(heard(30, [(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]))
     choice, settings = decided("coverage +-1 dB"), AutoSettings()
-    verdict = auto.verify(choice, settings, other.errors(choice.effects, settings.required)).verdict
+    verdict = auto.verify_choice(choice, settings, other.errors(choice.effects, settings.required)).verdict
     assert verdict is not None and not verdict.kept and verdict.met == 0.0
 
 
@@ -157,7 +157,7 @@ def test_spectra_are_judged_against_the_nearest_receiver():
     choice = decided("spectrum skill 0.9")
     assert choice.effects.line_of_sight and choice.effects.specular
     paths = heard(20)
-    same = probe_of(paths, paths.select(paths.order == 0))
+    same = probe_of(paths, paths.select_paths(paths.order == 0))
     assert (same.errors(paths, Deliverable("spectrum", 0.1)) == 0).all()
     assert (same.errors(paths, Deliverable("csi", -20.0)) == -99).all()
     with pytest.raises(ValueError, match="nearest"):
@@ -169,11 +169,11 @@ def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
                   np.array([[0, 0, 1], [0, 0, 1]], np.float32), np.array([0, SPECULAR], np.uint8),
                   np.array([0, 1], np.uint8))  # fmt: skip
     probe, h = probe_of(paths), 1 + 0.1 * np.exp(-2j * np.pi * 24)
-    assert probe.nmse(FULL.without("specular"))[0] == pytest.approx(0.01 / abs(h) ** 2, rel=1e-4)
-    assert probe.shares(FULL.without("specular"))[0] == pytest.approx(0.01 / 1.01, rel=1e-4)
+    assert probe.nmse(FULL.switch_off("specular"))[0] == pytest.approx(0.01 / abs(h) ** 2, rel=1e-4)
+    assert probe.lost_power_shares(FULL.switch_off("specular"))[0] == pytest.approx(0.01 / 1.01, rel=1e-4)
     assert probe.nmse(FULL)[0] == 0.0
 
 
 def test_decision_survives_its_file():
     decision = Decision(decided("coverage +-1 dB"), FULL, 300)
-    assert Decision.of(json.loads(json.dumps(decision.note()))) == decision
+    assert Decision.from_dict(json.loads(json.dumps(decision.to_dict()))) == decision

@@ -23,7 +23,7 @@ from gsparc.data.schema import LIGHT
 from gsparc.evaluation.simulated import draw_floor_plan
 from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns
-from gsparc.simulate.assembly import SECONDS, assemble, join_shards, shard_arrays
+from gsparc.simulate.assembly import SECONDS, assemble_dataset, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
@@ -257,7 +257,7 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
     outcome = simulate(plan(effects=FEW_PROBES), tmp_path / "box.h5")
     choice = outcome.choice
     assert choice is not None and choice.verdict is not None and choice.verdict.kept
-    assert set(outcome.effects.on) == {"line_of_sight", "specular"} and 1 <= outcome.effects.depth < 4
+    assert set(outcome.effects.enabled) == {"line_of_sight", "specular"} and 1 <= outcome.effects.depth < 4
     stored = json.loads(arrays(tmp_path / "box.h5")[1]["auto"])
     assert [row["effect"] for row in stored["table"]] == [row.effect for row in choice.table]
     facts = summary_facts(outcome)
@@ -290,7 +290,7 @@ class Rays(ShoeboxEngine):
 
     random, samples, off = True, None, 1.05
 
-    def thinned(self, samples):
+    def with_samples(self, samples):
         other = Rays(self.room, self.transmitter, LIGHT / self.wavelength)
         other.samples = samples
         return other
@@ -339,13 +339,13 @@ def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
 
 def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     """A run said NOT MET and simulated the choice all the same."""
-    real, full = deciding.auto.verify, replace(MIRROR, depth=4)
+    real, full = deciding.auto.verify_choice, replace(MIRROR, depth=4)
 
     def refuted(*arguments):
         choice = real(*arguments)
         return replace(choice, verdict=replace(choice.verdict, kept=False, met=0.9))
 
-    monkeypatch.setattr(deciding.auto, "verify", refuted)
+    monkeypatch.setattr(deciding.auto, "verify_choice", refuted)
     settings = replace(FEW_PROBES, full=full)
     outcome = simulate(plan(effects=settings), tmp_path / "box.h5")
     assert outcome.effects == outcome.choice.effects == full
@@ -385,12 +385,14 @@ def put_together(out: Path, receivers: int) -> int:
     made = shard_arrays(survey.trace(np.arange(20), MIRROR), asked, wavelength)
     turned = np.random.default_rng(0).permutation(receivers).reshape(-1, 20)
     for number, rows in enumerate(turned, 1):
-        shards.put(number, {**made, ROWS: rows, SECONDS: np.array(0.0)})
+        shards.write(number, {**made, ROWS: rows, SECONDS: np.array(0.0)})
     usual = gc.get_threshold()
     gc.set_threshold(700, 10, 10)  # Python's own: what is looked for seldom stays longer
     tracemalloc.start()
     try:
-        assemble(asked, survey, asked.effects, None, None, 0.0, shards, join_shards(shards, receivers))
+        assemble_dataset(
+            asked, survey, asked.effects, None, None, 0.0, shards, join_shards(shards, receivers)
+        )
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -22,13 +22,13 @@ def test_path_needs_all_its_mechanisms_and_depth():
     found = paths_of([0, SPECULAR, SPECULAR | DIFFUSE, REFRACTION, EDGE], [0, 1, 2, 1, 1])
 
     def left(effects):
-        return effects.allows(found.mechanisms, found.order).tolist()
+        return effects.allows_paths(found.mechanisms, found.order).tolist()
 
     assert left(EVERYTHING) == [True] * 5
-    assert left(EVERYTHING.without("line_of_sight")) == [False, True, True, True, True]
-    assert left(EVERYTHING.without("specular")) == [True, False, False, True, True]
-    assert left(EVERYTHING.without("diffuse")) == [True, True, False, True, True]
-    assert left(EVERYTHING.without("diffraction")) == [True, True, True, True, False]
+    assert left(EVERYTHING.switch_off("line_of_sight")) == [False, True, True, True, True]
+    assert left(EVERYTHING.switch_off("specular")) == [True, False, False, True, True]
+    assert left(EVERYTHING.switch_off("diffuse")) == [True, True, False, True, True]
+    assert left(EVERYTHING.switch_off("diffraction")) == [True, True, True, True, False]
     assert left(Effects(depth=1)) == [True, True, False, True, True]
     assert left(Effects(depth=0)) == [True, False, False, False, False]
 
@@ -48,7 +48,7 @@ def test_contradictions_are_refused(config, words):
 
 def test_receivers_that_lose_everything_stay():
     found = paths_of([0, SPECULAR, SPECULAR], [0, 1, 1], owner=[0, 0, 1])
-    less = found.keep_effects(Effects(depth=3).without("specular"))
+    less = found.keep_effects(Effects(depth=3).switch_off("specular"))
     assert less.offsets.tolist() == [0, 1, 1] and less.received_power().tolist() == [1.0, 0.0]
     both = join_receivers([found, less])
     assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]
@@ -57,11 +57,11 @@ def test_receivers_that_lose_everything_stay():
 def test_delay_spread_of_two_equal_paths():
     found = paths_of([0, SPECULAR], [0, 1])
     assert found.delay_spread()[0] == pytest.approx(0.5e-9)
-    assert found.select(np.array([True, False])).delay_spread()[0] == 0.0
+    assert found.select_paths(np.array([True, False])).delay_spread()[0] == 0.0
 
 
 def test_response_of_one_path():
-    found = paths_of([0, SPECULAR], [0, 1]).select(np.array([False, True]))  # 1 ns, from +x
+    found = paths_of([0, SPECULAR], [0, 1]).select_paths(np.array([False, True]))  # 1 ns, from +x
     tones, wavelength = np.array([2.4e9, 2.5e9]), 0.125
     elements = np.array([[0.0, 0, 0], [wavelength / 4, 0, 0]])
     channel = found.responses(tones, elements, wavelength)[0]

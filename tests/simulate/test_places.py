@@ -166,6 +166,8 @@ def test_places_that_repeat_were_drawn_again_and_neighbours_of_themselves():
 
 
 def test_the_sky_over_an_area_beside_the_scene_was_the_mean_of_nothing():
-    empty = SimpleNamespace(box=lambda: np.zeros((2, 3)), height=lambda across: np.full(len(across), -np.inf))
+    empty = SimpleNamespace(
+        bounding_box=lambda: np.zeros((2, 3)), surface_height=lambda across: np.full(len(across), -np.inf)
+    )
     with pytest.raises(ValueError, match="nothing of the scene is there"):
         RayTracer.has_open_sky(empty, np.array([[500.0, 500.0], [600.0, 600.0]]))

@@ -24,8 +24,8 @@ def test_images_are_mirrors_in_the_walls():
     wanted = [(mirror(point, *wall), gain) for wall, gain in zip(walls, ROOM.reflection, strict=True)]
     wanted += [(mirror(mirror(point, 0, 4.0), 0, -1.0), 0.9 * 0.8)]  # in the high wall, then in the low one
     for place, gain in wanted:
-        nearest = np.linalg.norm(mirrored.of(point) - place, axis=1).argmin()
-        np.testing.assert_allclose(mirrored.of(point)[nearest], place)
+        nearest = np.linalg.norm(mirrored.mirror_points(point) - place, axis=1).argmin()
+        np.testing.assert_allclose(mirrored.mirror_points(point)[nearest], place)
         assert mirrored.gain[nearest] == pytest.approx(gain)
 
 
@@ -75,7 +75,9 @@ def test_moving_transmitter_sees_a_mirrored_array():
     array = np.array([[0.0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]])
     tx, rx = scatter(ROOM, 10, seed=4), np.array([3.0, 2.0, 1.2])
     traced = trace_room(ROOM, tx, rx, 2.4e9, max_order=2, array=array)
-    mirrored = traced.images.of(rx + array)  # (A, I, 3): images of the elements, not of the transmitter
+    mirrored = traced.images.mirror_points(
+        rx + array
+    )  # (A, I, 3): images of the elements, not of the transmitter
     distance = np.linalg.norm(tx[:, None, None] - mirrored, axis=-1)
     k = 2 * np.pi * 2.4e9 / LIGHT
     expected = (

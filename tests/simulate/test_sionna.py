@@ -117,7 +117,7 @@ def test_attribution_equals_a_run_without(room, places):
     """What remains of a full run under fewer effects is what a run with fewer effects finds, in power."""
     full = replace(PLAIN, depth=3)
     whole = room.trace(places, full)
-    for less in (replace(full, depth=1), full.without("refraction")):
+    for less in (replace(full, depth=1), full.switch_off("refraction")):
         kept, alone = whole.keep_effects(less).received_power(), room.trace(places, less).received_power()
         strong = alone > 0.01 * alone.max()
         assert np.median(np.abs(10 * np.log10(kept[strong] / alone[strong]))) < 0.1
@@ -170,7 +170,7 @@ def test_other_places_compile_nothing(places):
         dr.kernel_history()
         room.trace(places[20:50], PLAIN)
         compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
-        room.thinned(1777).trace(places[:50], PLAIN)
+        room.with_samples(1777).trace(places[:50], PLAIN)
         anew = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
     assert len(compiled) < 10  # of what follows the number of paths
     assert all(kernel["operation_count"] < 1000 for kernel in anew if kernel["size"] == 1777)  # of rays
@@ -190,11 +190,11 @@ def test_shipped_scene_needs_only_its_name():
     survey = build_survey(city, QUICK)
     engine, places = survey.engine, survey.places
     assert all(m["scattering"] > 0 for m in engine.materials().values())
-    height, ground = engine.surface(places[:, :2])
+    height, ground = engine.highest_surface(places[:, :2])
     assert ground.all() and (places[:, 2] - height < 1.81).all() and (places[:, 2] - height > 1.19).all()
     assert np.ptp(places[:, :2], axis=0).max() <= 400 and survey.transmitters[0, 2] >= 10
     above = build_survey(replace(city, over="roofs"), QUICK)
-    assert not above.engine.surface(above.places[:, :2])[1].all()
+    assert not above.engine.highest_surface(above.places[:, :2])[1].all()
     assert not build_survey(
         from_config({**shipped_scene_settings("box"), "num_receivers": 20}), QUICK
     ).engine.has_open_sky(np.array([[-4.0, -4], [4, 4]]))

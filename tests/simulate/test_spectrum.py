@@ -3,7 +3,7 @@ import pytest
 
 from gsparc.ops import SphereGrid
 from gsparc.simulate.paths import Paths
-from gsparc.simulate.spectrum import SpectrumSettings, spectra
+from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
 
 WAVELENGTH = 0.125
 TONES = 2.4e9 + np.linspace(-40e6, 40e6, 7)
@@ -29,7 +29,7 @@ def random_waves(count=9, seed=0):
 def test_bartlett_by_lags_equals_the_definition():
     """|a^H h|^2 averaged over the tones, element by element."""
     settings, waves = SpectrumSettings(rows=4, columns=3), random_waves()
-    images, peak = spectra(waves, settings, TONES, WAVELENGTH)
+    images, peak = render_spectra(waves, settings, TONES, WAVELENGTH)
     elements = settings.elements(WAVELENGTH)
     h = waves.responses(TONES, elements, WAVELENGTH)[0]
     directions = settings.grid.directions().numpy().reshape(-1, 3)
@@ -44,7 +44,7 @@ def test_wave_is_brightest_in_its_pixel(kind):
     grid = SphereGrid.hemisphere()
     for row, column in ((40, 37), (60, 200), (30, 359)):
         wave = arriving([grid.directions()[row, column].numpy()], [1.0])
-        image = spectra(wave, SpectrumSettings(kind=kind), TONES, WAVELENGTH)[0][0]
+        image = render_spectra(wave, SpectrumSettings(kind=kind), TONES, WAVELENGTH)[0][0]
         found = np.unravel_index(image.argmax(), image.shape)
         assert found == (row, column)
 
@@ -52,13 +52,13 @@ def test_wave_is_brightest_in_its_pixel(kind):
 def test_waves_from_below_the_horizon_are_not_received():
     up = arriving([[1, 1, 1]], [1.0])
     both = arriving([[1, 1, 1], [0, 1, -1]], [1.0, 5.0])
-    one, other = (spectra(w, SpectrumSettings(), TONES, WAVELENGTH)[0] for w in (up, both))
+    one, other = (render_spectra(w, SpectrumSettings(), TONES, WAVELENGTH)[0] for w in (up, both))
     np.testing.assert_array_equal(one, other)
 
 
 def test_silence_is_black():
-    silent = random_waves(seed=1).select(np.zeros(9, bool))
-    image, divided = spectra(silent, SpectrumSettings(), TONES, WAVELENGTH)
+    silent = random_waves(seed=1).select_paths(np.zeros(9, bool))
+    image, divided = render_spectra(silent, SpectrumSettings(), TONES, WAVELENGTH)
     assert not image.any() and divided[0] == 1.0
 
 
@@ -66,7 +66,9 @@ def test_both_polarisations_add_their_powers():
     waves = random_waves(seed=2)
     doubled = Paths(waves.offsets, np.repeat(waves.gain, 2, axis=1), waves.delay, waves.direction,
                     waves.mechanisms, waves.order)  # fmt: skip
-    (one, low), (two, high) = (spectra(w, SpectrumSettings(), TONES, WAVELENGTH) for w in (waves, doubled))
+    (one, low), (two, high) = (
+        render_spectra(w, SpectrumSettings(), TONES, WAVELENGTH) for w in (waves, doubled)
+    )
     np.testing.assert_allclose(one, two, atol=1e-6)
     assert high[0] == pytest.approx(2**0.5 * low[0], rel=1e-5)
 

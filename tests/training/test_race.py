@@ -12,7 +12,9 @@ OWN = torch.randn(2, 60, 2, dtype=torch.complex64, generator=torch.Generator().m
 
 def race(looks=None):
     target = torch.full((60, 2), 10.0, dtype=torch.complex64)
-    return Race.of(ROWS, target + OWN[0], target, lambda *look: None if looks is None else looks.append(look))
+    return Race.from_mean(
+        ROWS, target + OWN[0], target, lambda *look: None if looks is None else looks.append(look)
+    )
 
 
 def test_a_candidate_behind_goes_on_where_its_errors_are_its_own():

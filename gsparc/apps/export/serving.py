@@ -227,7 +227,7 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
         model = {"model": predictor.method.name, "end": site.moving_end, "unit": predictor.unit, **stations}
         return {"status": "ok", "kind": site.kind, **model}
 
-    async def pieces(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
+    async def stream_blocks(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
         rows, loop = max(1, PIECE // each), asyncio.get_running_loop()
         for first in range(0, len(values), rows):
             part = values, raw, predictor.unit, first, first + rows
@@ -265,7 +265,7 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
         if values.size <= PIECE:
             whole = _written(values, raw, predictor.unit, 0, len(values))
             return Response(whole, headers=about, media_type=kind)
-        return StreamingResponse(pieces(values, raw), headers=about, media_type=kind)
+        return StreamingResponse(stream_blocks(values, raw), headers=about, media_type=kind)
 
     return app if token is None else _guarded(app, f"Bearer {token}".encode())
 

@@ -112,13 +112,13 @@ class Adaptation:
         # Infinite where there is no such MCS: it carries nothing, as one that always fails.
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 
-        def of(table: Tensor, mcs: Tensor) -> np.ndarray:
+        def gathered(table: Tensor, mcs: Tensor) -> np.ndarray:
             return table.gather(1, mcs[:, None])[:, 0].double().numpy()
 
         return Rates(
             10 * math.log10(band.median_power / noise), oracle.numpy(), chosen.numpy(),
-            of(delivered, oracle), of(delivered, chosen), delivered.max(1).values.numpy(),
-            of(fails.clamp_max(1), chosen), regret.numpy(), of(fails, oracle) > OUTAGE, care,
+            gathered(delivered, oracle), gathered(delivered, chosen), delivered.max(1).values.numpy(),
+            gathered(fails.clamp_max(1), chosen), regret.numpy(), gathered(fails, oracle) > OUTAGE, care,
         )  # fmt: skip
 
     def _effective_db(self, sinr: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ class Channels:
     confidence: Tensor
     source: str
 
-    def of(self, index: np.ndarray) -> Channels:
+    def select_positions(self, index: np.ndarray) -> Channels:
         """Some of the positions."""
         at = torch.from_numpy(index)
         rest = self.variance[at], self.confidence[at], self.source

@@ -65,7 +65,7 @@ class LinkStudy:
         if not self.states_variance:
             text = "%s states no error variance: rates are chosen as if it were exact, pilots do not mend it"
             log.warning(text, self.method.name)
-        self.grid, bad = grid.of(self.test), promise.is_bad(evidence.error[self.test])
+        self.grid, bad = grid.select_positions(self.test), promise.is_bad(evidence.error[self.test])
         self.facts: dict[str, Any] = {
             "seed": int(settings["seed"]), "positions": len(self.test), "confidence/kind": kind,
             "accepted": float(self.accepted.mean()), "promise/alpha": promise.alpha,

@@ -170,7 +170,7 @@ def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int,
     coarse, fine, batch = sizes
     order = np.arange(max(coarse, fine)) % len(band.true)
 
-    def at(level: float) -> list[pd.DataFrame]:
+    def send_at(level: float) -> list[pd.DataFrame]:
         few = pusch.run(band, level, order[:coarse], batch)
         rate = few.groupby("receiver").failed.mean()
         # An error floor of predictions is looked at too, as long as perfect knowledge fails somewhere.
@@ -178,7 +178,7 @@ def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int,
         steep = fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]
         return [few, pusch.run(band, level, order[coarse:fine], batch)] if steep else [few]
 
-    return pd.concat(chain(*(blocks for _, blocks in run_each(at, levels, "Eb/N0"))), ignore_index=True)
+    return pd.concat(chain(*(blocks for _, blocks in run_each(send_at, levels, "Eb/N0"))), ignore_index=True)
 
 
 def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.search import Search
 
-# Bounds of the search, within which `of` clips the simplex.
+# Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
 LOOKS = 160
@@ -35,12 +35,12 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
 
     # In logarithms: all are positive and known up to factors.
-    def of(point: np.ndarray) -> Trust:
+    def decode_trust(point: np.ndarray) -> Trust:
         inflation, temperature, tail, spread = np.exp(np.clip(point, *spans)).tolist()
         return Trust(inflation, temperature, tail, edge * spread)
 
     def surprise(point: np.ndarray) -> float:
-        trust, pairs = of(point), zip(snapshots, places, strict=True)
+        trust, pairs = decode_trust(point), zip(snapshots, places, strict=True)
         return -float(np.mean([one.posterior(trust).log_density_at(place) for one, place in pairs]))
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
@@ -48,7 +48,7 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
     simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
     how = {"maxfev": LOOKS, "initial_simplex": simplex}
     optimum = minimize(surprise, first, method="Nelder-Mead", options=how)
-    return calibrate_level(of(optimum.x), snapshots, places, share)
+    return calibrate_level(decode_trust(optimum.x), snapshots, places, share)
 
 
 def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:

@@ -28,11 +28,11 @@ class Cells:
         return len(self.centre)
 
     @property
-    def size(self) -> np.ndarray:
+    def volume(self) -> np.ndarray:
         """Length, area or volume (G,) [m, m^2, m^3]."""
         return np.where(self.edge > 0, self.edge, 1.0).prod(1)
 
-    def at(self, chosen: np.ndarray) -> Cells:
+    def subset(self, chosen: np.ndarray) -> Cells:
         """Return the cells `chosen`."""
         return Cells(self.centre[chosen], self.edge[chosen])
 

@@ -39,10 +39,10 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
     how: Any = "file" if config.data else chosen.split
     cut = float(chosen.side_m), float(chosen.held_out)
     if config.data:
-        known, heard = rows, read_fingerprints(config.data, False).of_access_points(rows.access_point)
+        known, heard = rows, read_fingerprints(config.data, False).select_access_points(rows.access_point)
     else:
-        known, heard = map(rows.at, split_fingerprints(rows, how, *cut, int(config.seed)))
-    heard = heard.at(sample_rows(config, len(heard.level)))
+        known, heard = map(rows.subset, split_fingerprints(rows, how, *cut, int(config.seed)))
+    heard = heard.subset(sample_rows(config, len(heard.level)))
     both = fingerprint_snapshots(heard), fingerprint_snapshots(known)
     place, each_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])
     facts = {

@@ -195,7 +195,7 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             raw.arrays[place] = np.linspace(low, high, count)
         other = align_to_site(interpret_and_log(raw, config.data), site)
         heard = group_snapshots(other, np.arange(len(other)))
-    return heard.at(sample_rows(config, len(heard))), placed
+    return heard.subset(sample_rows(config, len(heard))), placed
 
 
 def sample_rows(config: DictConfig, count: int) -> np.ndarray:

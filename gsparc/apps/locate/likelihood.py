@@ -38,7 +38,7 @@ class Misfit:
         squared, size, silent = (torch.cat(pair, 1) for pair in pairs)
         return Misfit(squared, size, self.count, silent)
 
-    def at(self, places: Tensor) -> Misfit:
+    def subset(self, places: Tensor) -> Misfit:
         """Return the misfit at places (g,) by number."""
         return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
 

@@ -52,10 +52,10 @@ class Located:
     seconds: float
 
     @classmethod
-    def of(cls, posterior: Posterior, level: float, place: np.ndarray, seconds: float = 0.0) -> Self:
-        """Return what is known at a place (3,) [m, local], with the area of cells of a mass `level`."""
-        area = float(posterior.cells.size[posterior.densest_cells(level)].sum())
-        return cls(place, area, len(posterior.modes(level)), posterior, seconds)
+    def from_posterior(cls, posterior: Posterior, mass: float, place: np.ndarray, seconds: float = 0) -> Self:
+        """Return what is known at a place (3,) [m, local], with the area of cells of a `mass`."""
+        area = float(posterior.cells.volume[posterior.densest_cells(mass)].sum())
+        return cls(place, area, len(posterior.modes(mass)), posterior, seconds)
 
 
 @dataclass(frozen=True)
@@ -86,17 +86,17 @@ class Locator:
         current = Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
         for _ in range(LEVELS):
             cells = current.cells
-            likely = densest_cells(current.log_density(trust), cells.size, KEPT)
+            likely = densest_cells(current.log_density(trust), cells.volume, KEPT)
             wide = cells.edge[likely].max(1)
             likely, wide = likely[wide > trust.spread], wide[wide > trust.spread]
             if not len(likely) or (len(likely) >= ENOUGH and wide.max() < 1.01 * wide.min()):
                 break
             chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
-            finer = cells.at(chosen).halve()
+            finer = cells.subset(chosen).halve()
             more = compute_misfit(heard, self.field.moments_at(torch.from_numpy(finer.centre)), self.unknown)
             rest = np.setdiff1d(np.arange(len(cells)), chosen)
-            others = current.misfit.at(torch.from_numpy(rest))
-            current = Search(cells.at(rest).join(finer), others + more)
+            others = current.misfit.subset(torch.from_numpy(rest))
+            current = Search(cells.subset(rest).join(finer), others + more)
         return current
 
     def locate(self, heard: Snapshots) -> list[Located]:
@@ -105,8 +105,8 @@ class Locator:
         results = []
         for number in range(len(heard)):
             started = time.perf_counter()
-            posterior = self.search_cells(heard.at(np.array([number])), self.trust).posterior(self.trust)
-            located = Located.of(posterior, self.trust.level, posterior.peak())
+            posterior = self.search_cells(heard.subset(np.array([number])), self.trust).posterior(self.trust)
+            located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
             results.append(replace(located, seconds=time.perf_counter() - started))
         return results
 
@@ -131,7 +131,7 @@ def learn_trust(
         without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
         heard = group_snapshots(data, inner.test)
         sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
-        pairs += [(without, heard.at(np.array([row]))) for row in sample]
+        pairs += [(without, heard.subset(np.array([row]))) for row in sample]
     places = np.concatenate([heard.place for _, heard in pairs])
 
     def looks(trust: Trust) -> list[Search]:

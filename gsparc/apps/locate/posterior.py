@@ -51,12 +51,12 @@ class Posterior:
         density = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
         logarithm = np.log(density + LEAST)
         # Normalised again: densities at centres do not sum to 1, and a blur leaves the site.
-        return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.size))
+        return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.volume))
 
     @property
     def mass(self) -> np.ndarray:
         """Of each cell (G,)."""
-        return np.exp(self.log_density) * self.cells.size
+        return np.exp(self.log_density) * self.cells.volume
 
     def log_density_at(self, place: np.ndarray) -> float:
         """Log density at a place (3,) itself, not of its cell."""
@@ -76,7 +76,7 @@ class Posterior:
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
         blurred = np.zeros(len(self.cells), bool)
-        blurred[densest_cells(self.sharp, self.cells.size, BLURRED)] = True
+        blurred[densest_cells(self.sharp, self.cells.volume, BLURRED)] = True
         return blurred
 
     def _density(self, places: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ class Posterior:
         middle = centre.mean(0)
         near, apart = centre - middle, places[:, live] - middle
         squared = apart**2 @ precision.T + (near**2 * precision).sum(1) - 2 * apart @ (near * precision).T
-        mass = np.exp(self.sharp[self._blurred]) * self.cells.size[self._blurred]
+        mass = np.exp(self.sharp[self._blurred]) * self.cells.volume[self._blurred]
         weight = mass * np.sqrt(precision / (2 * np.pi)).prod(1)
         return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision
 
@@ -114,7 +114,7 @@ class Posterior:
 
     def densest_cells(self, share: float) -> np.ndarray:
         """Return the most likely cells (c,) that hold a share of the mass, most likely first."""
-        return densest_cells(self.log_density, self.cells.size, share)
+        return densest_cells(self.log_density, self.cells.volume, share)
 
     def modes(self, share: float) -> list[np.ndarray]:
         """Cells of each connected part of the area that holds a share of the mass, heaviest first."""

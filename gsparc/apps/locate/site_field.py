@@ -59,7 +59,7 @@ class SiteField:
     def _chunk(self, places: Tensor) -> Moments:
         site = self.site
         station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
-        query = Query.at(site, places.float().repeat_interleave(self.count, 0), station)
+        query = Query.from_places(site, places.float().repeat_interleave(self.count, 0), station)
         prediction = self.predictor.predict_query(query)
         if prediction.variance is None:
             name = self.predictor.method.name

@@ -34,7 +34,7 @@ class Snapshots:
     def __len__(self) -> int:
         return len(self.values)
 
-    def at(self, chosen: np.ndarray) -> Snapshots:
+    def subset(self, chosen: np.ndarray) -> Snapshots:
         """Return the snapshots `chosen`."""
         index = torch.from_numpy(np.asarray(chosen))
         floor = None if self.floor is None else self.floor[index]

@@ -59,7 +59,7 @@ def error_covariances(
     """
     covariances = []
     for name in stations:
-        asking = predictor if predictor.site.stations is None else predictor.at(name)
+        asking = predictor if predictor.site.stations is None else predictor.select_station(name)
         number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
         covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
         weight = np.ones(len(places))

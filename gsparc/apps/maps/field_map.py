@@ -118,7 +118,7 @@ class FieldMap:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""
         known = self.grid.inside & ~self.refused
 
-        def of(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
+        def reduce(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
             values = layer[known & np.isfinite(layer)]
             return float(reduced(values)) if len(values) else None
 
@@ -126,11 +126,11 @@ class FieldMap:
         figures = {
             "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
             "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
-            "lowest_db": of(power, np.min), "highest_db": of(power, np.max),
-            "width_db": of(self.at_best_server(self.upper_db - self.lower_db)),
-            "expected_error_db": of(self.layer("expected_error_db"), lambda v: np.sqrt(np.mean(v**2))),
-            "threshold_db": self.threshold_db,
-            "outage": of(self.outage), "sinr_db": of(self.sinr_db), "server_unsure": of(1.0 * self.unsure),
+            "lowest_db": reduce(power, np.min), "highest_db": reduce(power, np.max),
+            "width_db": reduce(self.at_best_server(self.upper_db - self.lower_db)),
+            "expected_error_db": reduce(self.layer("expected_error_db"), lambda v: np.sqrt(np.mean(v**2))),
+            "threshold_db": self.threshold_db, "outage": reduce(self.outage),
+            "sinr_db": reduce(self.sinr_db), "server_unsure": reduce(1.0 * self.unsure),
         }  # fmt: skip
         return {f"map/{name}": value for name, value in figures.items()} | {"map/unit": self.unit}
 

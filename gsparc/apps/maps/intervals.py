@@ -49,7 +49,7 @@ class Evidence:
     def __len__(self) -> int:
         return len(self.level_db)
 
-    def at(self, rows: np.ndarray) -> Evidence:
+    def subset(self, rows: np.ndarray) -> Evidence:
         """Some of them."""
         return Evidence(*(getattr(self, field.name)[rows] for field in fields(self)))
 
@@ -117,7 +117,7 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     Raises:
         ValueError: too few rows.
     """
-    used = evidence.at(np.flatnonzero(np.isfinite(evidence.error)))
+    used = evidence.subset(np.flatnonzero(np.isfinite(evidence.error)))
     heard = used.side == 0
     if heard.sum() < LEAST_ROWS:
         fault = f"{heard.sum()} of them were held out, {LEAST_ROWS} at least are needed"
@@ -129,7 +129,7 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     count = int(np.clip(min(heard.sum() // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
     first = [float(part[0]) for part in np.array_split(np.sort(used.distance[heard]), count)[1:]]
     which = np.searchsorted(first, used.distance, side="right")
-    bins = [used.at(np.flatnonzero(which == number)) for number in range(count)]
+    bins = [used.subset(np.flatnonzero(which == number)) for number in range(count)]
     middle = np.array([float(np.median(one.distance)) for one in bins])
     spreads = [error_distribution(one) for one in bins]
     half = np.array([weighted_quantiles(np.abs(error), mass, level) for error, mass in spreads])
@@ -190,7 +190,7 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
     whole = typical(used)
     factors = np.ones(int(used.station.max()) + 1)
     for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
-        own = used.at(np.flatnonzero(used.station == number))
+        own = used.subset(np.flatnonzero(used.station == number))
         if (own.side == 0).sum() >= LEAST_ROWS:
             blocks = len(np.unique(own.block))
             ratio = max(typical(own), 1e-3 * whole) / whole
@@ -257,7 +257,7 @@ def cross_validate(evidence: Evidence, share: float) -> Coverage:
     half = float(norm.ppf((1 + share) / 2)) * evidence.spread_db
     for turn in range(min(PARTS, len(blocks))):
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
-        calibration, own_part = calibrate(evidence.at(rest), share), evidence.at(tried)
+        calibration, own_part = calibrate(evidence.subset(rest), share), evidence.subset(tried)
         inside[tried], width[tried] = interval_coverage(calibration, own_part)
         own[tried] = _inside(calibration, own_part, half[tried])
     known = np.isfinite(width)

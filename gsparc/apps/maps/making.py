@@ -78,7 +78,7 @@ def predict_map(
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     about = station_facts(site, numbers)
     load_of = field_map.read_loads(load, names, about["stations"])
-    level = PowerUnit.of(unit, site.level_unit, levels=True)
+    level = PowerUnit.from_name(unit, site.level_unit, levels=True)
     # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
     noise_db = None if noise_db is None else noise_db - level.raised_db
@@ -181,7 +181,7 @@ def choose_stations(
     # Names may be given twice, by name and by number.
     for name in dict.fromkeys(names):
         try:
-            predictor.at(name)
+            predictor.select_station(name)
             if promise is not None and not (promise.station == stations.name.index(name)).any():
                 raise DataError(f"station {name} was never heard, so that nothing can be promised of its map")
         except ValueError as error:
@@ -210,7 +210,7 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
 
 
 def _asker(
-    predictor: Predictor, joint: bool, grid: Grid, other: Sequence[float] | None,
+    predictor: Predictor, joint: bool, grid: Grid, other_end: Sequence[float] | None,
     names: Sequence[str], numbers: np.ndarray,
 ) -> Callable[[np.ndarray], np.ndarray]:  # fmt: skip
     """Levels and deviations [dB] of cells (n,), in chunks, as many at once as torch has threads.
@@ -218,12 +218,12 @@ def _asker(
     Of one station (n, 2), or of those that are known together (n, 3 T), with the correlation of their
     errors with the strongest's.
     """
-    own = predictor if joint or predictor.site.stations is None else predictor.at(names[0])
+    own = predictor if joint or predictor.site.stations is None else predictor.select_station(names[0])
 
     def one(cells: np.ndarray) -> np.ndarray:
         if (every := joint_levels(own, grid.places(cells), numbers) if joint else None) is not None:
             return every.reshape(len(cells), -1)
-        return np.column_stack(predict_levels(own, grid.places(cells), other))
+        return np.column_stack(predict_levels(own, grid.places(cells), other_end))
 
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
@@ -237,24 +237,24 @@ def _asker(
 
 
 def predict_levels(
-    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None = None,
+    predictor: Predictor, places: np.ndarray, other_end: Sequence[float] | None = None,
     station: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted_levels` and `query_ends`."""
     parts = []
     for part in _chunks(places, CHUNK):
-        ends = query_ends(predictor.site, part, other, station)
+        ends = query_ends(predictor.site, part, other_end, station)
         parts.append(predicted_levels(predictor.predict_linear(**ends), predictor.site.kind))
     level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
     return level, spread
 
 
 def query_ends(
-    site: Site, places: np.ndarray, other: Sequence[float] | None, station: np.ndarray | None = None
+    site: Site, places: np.ndarray, other_end: Sequence[float] | None, station: np.ndarray | None = None
 ) -> dict[End, np.ndarray]:
     """World places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
 
-    `other` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
+    `other_end` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
 
     Raises:
         DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
@@ -262,12 +262,12 @@ def query_ends(
     if station is not None and site.static_end is not None:
         return {site.static_end: station, site.moving_end: places}
     if site.static_end is not None:
-        if other is not None:
+        if other_end is not None:
             raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
         return {site.moving_end: places}
-    if other is None:
+    if other_end is None:
         raise DataError(OTHER_END)
-    return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other), places.shape)}
+    return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other_end), places.shape)}
 
 
 def read_place(name: str, value: Any) -> np.ndarray:
@@ -278,7 +278,7 @@ def read_place(name: str, value: Any) -> np.ndarray:
     return place
 
 
-def to_local(site: Site, places: np.ndarray, other: Sequence[float] | None, both: bool) -> np.ndarray:
+def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None, both: bool) -> np.ndarray:
     """World places (n, 3) of the moving end as local ones, (n, 6) of transmitter and receiver if `both` [m].
 
     Raises:
@@ -287,9 +287,9 @@ def to_local(site: Site, places: np.ndarray, other: Sequence[float] | None, both
     local = places - site.origin
     if not both:
         return local
-    if site.static_position is None and other is None:
+    if site.static_position is None and other_end is None:
         raise DataError(OTHER_END)
-    still = np.asarray(other) - site.origin if site.static_position is None else site.static_position
+    still = np.asarray(other_end) - site.origin if site.static_position is None else site.static_position
     pair = np.broadcast_to(still, local.shape), local
     return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
 
@@ -306,7 +306,7 @@ def _usual_levels(
     if promise is None:
         return usual, floor
     for row, number in enumerate(numbers):
-        own = promise.evidence.at(np.flatnonzero(promise.evidence.station == number))
+        own = promise.evidence.subset(np.flatnonzero(promise.evidence.station == number))
         if len(own):
             usual[row] = own.level_db.mean(), own.level_db.std()
             quiet = own.level_db[own.side > 0]

@@ -44,7 +44,7 @@ class Legend:
     high: float
     colours: str = "viridis"
 
-    def of(self, values: np.ndarray) -> np.ndarray:
+    def to_colours(self, values: np.ndarray) -> np.ndarray:
         """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
         # Masked: what is infinite is grey, too, instead of the colour of an end.
         share = Normalize(self.low, self.high, clip=True)(np.ma.masked_invalid(values))

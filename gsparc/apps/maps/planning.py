@@ -185,7 +185,7 @@ def walkable_places(
         every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
         points.append(every[contains_xy(area, every)])
     if lines:
-        streets = Streets.of(lines, grid.step / 2)
+        streets = Streets.from_lines(lines, grid.step / 2)
         # One of each step's square: a street with many bends has no more of them.
         square = np.unique((streets.node / grid.step * 2).round(), axis=0, return_index=True)[1]
         points.append(streets.node[square])

@@ -141,7 +141,7 @@ def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.
     before = data.moving[known], station_numbers(data, known)
     far = intervals.nearest_distances(*before, data.moving[rows], station)
     evidence = Evidence(level, mean, spread, far, block, station, side)
-    return evidence.at(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
+    return evidence.subset(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
 
 
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ class Streets:
     length: csr_matrix
 
     @classmethod
-    def of(cls, lines: Sequence[LineString], step_m: float) -> Self:
+    def from_lines(cls, lines: Sequence[LineString], step_m: float) -> Self:
         """Return the graph of lines, nodes of which are no more than a step apart."""
         import shapely
 

@@ -89,7 +89,7 @@ def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float
     chosen = evenly_spaced(len(measured.places), MOST_POINTS)
     places, values = measured.places[chosen], measured.values[chosen]
     legends[VALUES] = Legend.over(measured.label, values)
-    return Points(VALUES, places, legends[VALUES].of(values), DOT * extent)
+    return Points(VALUES, places, legends[VALUES].to_colours(values), DOT * extent)
 
 
 def _cloud_part(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> Part:
@@ -103,7 +103,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
     most = float(np.abs(cloud.strengths).max(initial=0.0))
     level = 20 * np.log10(np.maximum(np.abs(cloud.strengths), most * 1e-6 + 1e-300) / (most or 1.0))
     legend = Legend(f"{cloud.label} [dB of the strongest]", -RANGE_DB, 0.0, "plasma")
-    return legend, legend.of(level)
+    return legend, legend.to_colours(level)
 
 
 def model_gaussians(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
@@ -152,7 +152,7 @@ class Sphere:
     size: float
 
     @classmethod
-    def of(cls, site: Site, extent: float) -> Sphere:
+    def from_site(cls, site: Site, extent: float) -> Sphere:
         """Return directions of a site of spectra; not more than `DIRECTIONS`."""
         assert site.grid is not None
         directions = site.grid.directions().numpy()
@@ -166,7 +166,7 @@ class Sphere:
 
     def colours(self, spectrum: np.ndarray) -> np.ndarray:
         """(n, 3) uint8 of a spectrum (H, W) in [0, 1]."""
-        return Legend("", 0.0, 1.0, "inferno").of(spectrum[self.rows, self.columns])
+        return Legend("", 0.0, 1.0, "inferno").to_colours(spectrum[self.rows, self.columns])
 
 
 def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
@@ -181,7 +181,7 @@ def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     length = paths.delay_ns * 1e-9 * LIGHT
     reach = np.minimum(length, REACH * extent)
     ends = receiver + paths.towards * reach[:, None]
-    colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))
+    colours = PATHS.to_colours(paths.gain_db - paths.gain_db.max(initial=-np.inf))
     segments = np.stack([np.broadcast_to(receiver, ends.shape), ends], axis=1)
     return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)
 

@@ -37,11 +37,11 @@ class Plane:
 
 
 def refine_plane(
-    predictor: Predictor, grid: Grid, other: Sequence[float] | None = None
+    predictor: Predictor, grid: Grid, other_end: Sequence[float] | None = None
 ) -> Iterator[Plane | None]:
     """Planes of ever smaller strides; None between them, about every `STEP_S`.
 
-    `other` (3,) is the transmitter's world place [m] where both ends move.
+    `other_end` (3,) is the transmitter's world place [m] where both ends move.
     """
     ny, nx = grid.shape
     level = np.full(grid.shape, np.nan)
@@ -53,7 +53,7 @@ def refine_plane(
         cells, start = np.flatnonzero(chosen), 0
         while start < len(cells):
             begin, part = time.perf_counter(), cells[start : start + chunk]
-            level.reshape(-1)[part] = predict_levels(predictor, grid.places(part), other)[0]
+            level.reshape(-1)[part] = predict_levels(predictor, grid.places(part), other_end)[0]
             start += len(part)
             took = time.perf_counter() - begin
             chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
@@ -77,7 +77,7 @@ def plane_sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, benea
     Half a dot lower, dots of the same height are seen whole.
     """
     clear = np.where(np.isfinite(values), round(255 * OPACITY), 0)[..., None].astype(np.uint8)
-    image = np.concatenate([legend.of(values), clear], axis=-1)
+    image = np.concatenate([legend.to_colours(values), clear], axis=-1)
     left, right, low, high = grid.extent
     return Sheet(
         name, np.array([left, high, grid.height - beneath]), np.array([right - left, 0.0, 0.0]),

@@ -84,7 +84,7 @@ def legend_html(legends: Iterable[Legend], surfaces: Iterable[Part] = ()) -> str
         swatch = f'<span style="background:rgb{colour};opacity:.6">&emsp;</span>'
         rows.append(f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>')
     for legend in dict.fromkeys(legends):
-        strip = legend.of(np.linspace(legend.low, legend.high, 16))
+        strip = legend.to_colours(np.linspace(legend.low, legend.high, 16))
         stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in strip)
         rows.append(
             f'<div style="margin:.35em .7em;font-size:.8em">{html.escape(legend.label)}'

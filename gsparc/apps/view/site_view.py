@@ -99,9 +99,9 @@ class SiteView:
     def sphere(self, name: str | None) -> Sphere | None:
         """Directions of a spectrum; None of other kinds."""
         site = self.viewed.site
-        return None if site.kind != "spectrum" or site.grid is None else Sphere.of(site, self.extent(name))
+        return Sphere.from_site(site, self.extent(name)) if site.kind == "spectrum" and site.grid else None
 
-    def starts(self, name: str | None) -> dict[str, np.ndarray]:
+    def initial_places(self, name: str | None) -> dict[str, np.ndarray]:
         """World places (3,) where the ends that move first stand."""
         viewed, first = self.viewed, self.viewed.moving[-1]
         at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
@@ -115,7 +115,7 @@ class SiteView:
 
     def plane(self, name: str | None, grid: Grid) -> Plane:
         """Power over all of some cells, the transmitter where it first stands if both ends move."""
-        other = None if self.viewed.site.static_end is not None else self.starts(name)["tx"].tolist()
+        other = None if self.viewed.site.static_end is not None else self.initial_places(name)["tx"].tolist()
         *_, plane = refine_plane(self.viewed.predictor_of(name), grid, other)
         assert plane is not None
         return plane

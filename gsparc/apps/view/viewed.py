@@ -68,11 +68,11 @@ class Viewed:
 
     def predictor_of(self, station: str | None) -> Predictor:
         """Return the predictor of a station."""
-        return self.predictor if station is None else self.predictor.at(station)
+        return self.predictor if station is None else self.predictor.select_station(station)
 
     def static_place(self, station: str | None) -> np.ndarray | None:
         """Return the world place (3,) [m] of the static end; None where it is unknown or moves."""
-        site = self.site if station is None else self.predictor.at(station).site
+        site = self.site if station is None else self.predictor.select_station(station).site
         place = site.static_position
         return None if place is None else place + site.origin
 

@@ -55,9 +55,9 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     if config == "simulate":
         offer_scenes()
     if config == "train" and any(word.startswith("ckpt_path=") for word in sys.argv):
-        from gsparc.commands.shared.continued import with_settings_of_run  # which brings torch
+        from gsparc.commands.shared.continued import add_settings_of_run  # which brings torch
 
-        sys.argv[1:] = with_settings_of_run(sys.argv[1:])
+        sys.argv[1:] = add_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     given = get_args_parser().parse_known_args(sys.argv[1:])[0]

@@ -11,7 +11,7 @@ PATHS = ("init_from", "known_walls")  # settings that may be files, beside those
 DEEP = 4  # RUN/fold0/refit/last.ckpt
 
 
-def with_settings_of_run(words: Sequence[str]) -> list[str]:
+def add_settings_of_run(words: Sequence[str]) -> list[str]:
     """Return a command line with the settings of the run that `ckpt_path=` names; its own win.
 
     Args:

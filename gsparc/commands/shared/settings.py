@@ -45,7 +45,7 @@ class RunSettings(Checked):
     stations: str = setting("auto", choice("auto", "each", "together"))
 
     @classmethod
-    def of(cls, config: DictConfig) -> RunSettings:
+    def from_config(cls, config: DictConfig) -> RunSettings:
         """Check what can be checked before anything is read, and set the number of threads.
 
         Raises:

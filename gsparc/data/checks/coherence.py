@@ -70,7 +70,7 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         return None
     stations = 1 if site.stations is None else len(site.stations)
     few = max(MOST_ENTRIES // (stations * data.target[0].size), 1)
-    rows = Snapshots.of(data, np.arange(min(len(data), few)))
+    rows = Snapshots.from_rows(data, np.arange(min(len(data), few)))
     if rows.values[0].size < 2:
         return None
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))

@@ -53,7 +53,7 @@ class Score:
     fit: float
 
     @property
-    def total(self) -> float:
+    def log_likelihood(self) -> float:
         """Of all rows; phases of neighbouring rows are not independent, and count half."""
         return float(self.rows.sum()) + self.phases / 2
 
@@ -83,7 +83,7 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     single = data.site.kind == "csi" and data.target.shape[1] == 1
     if stations is None or data.place is None or len(stations) < COHERENT or not single:
         return data, run * (int(station.max()) + 1) + station
-    heard = Snapshots.of(data, np.arange(len(data)))
+    heard = Snapshots.from_rows(data, np.arange(len(data)))
     measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
     middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(heard.places), 1, 1))
     ends = heard.places, np.tile(middle, (len(heard.places), 1)), turned
@@ -130,12 +130,12 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
         return clear and rival.fit > FIT[kind]
 
     rivals = {name: one for name, one in rivals.items() if may_be(name, one)}
-    best = max(rivals.values(), key=lambda one: one.total, default=declared)
+    best = max(rivals.values(), key=lambda one: one.log_likelihood, default=declared)
     gain = best.rows - declared.rows
     of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
     if float(of_group[:-DROPPED].sum()) + (best.phases - declared.phases) / 2 <= RATIO:
         return []
-    named, *alike = [name for name, one in rivals.items() if one.total > best.total - RATIO]
+    named, *alike = [name for name, one in rivals.items() if one.log_likelihood > best.log_likelihood - RATIO]
     others = "".join(f" or dataset.{name}=true" for name in alike)
     others += ", which these rows do not tell apart" if others else ""
     how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better with "

@@ -116,7 +116,8 @@ def _static(site: Site) -> str:
         where += f", {lost} of them at unknown places" if lost else ""
         pairs = zip(stations.label or stations.name, stations.name, strict=True)
         names = [own if own == name else f"{own} ({name})" for own, name in pairs]
-        return f"the {end}, {len(stations)} stations{where}: {list_first(names, 4)}"
+        count = f"{len(stations)} station{'s' * (len(stations) > 1)}"
+        return f"the {end}, {count}{where}: {list_first(names, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64

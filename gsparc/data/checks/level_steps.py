@@ -108,7 +108,7 @@ def _precision(places: np.ndarray, level: np.ndarray, regressors: np.ndarray) ->
     for reach in REACHES:
         for nugget in NUGGETS:
             shape = _covariance(distance[np.ix_(some, some)], reach * extent, nugget)
-            factor = Factor.of(torch.from_numpy(shape))
+            factor = Factor.from_gram(torch.from_numpy(shape))
             weighed = factor.solve(torch.from_numpy(regressors[some])).numpy()
             mean = np.linalg.lstsq(regressors[some].T @ weighed, weighed.T @ level[some], rcond=None)[0]
             rest = level[some] - regressors[some] @ mean
@@ -118,7 +118,7 @@ def _precision(places: np.ndarray, level: np.ndarray, regressors: np.ndarray) ->
             best = max(best, (float(likelihood), reach, nugget, variance))
     _, reach, nugget, variance = best
     whole = torch.from_numpy(_covariance(distance, reach * extent, nugget))
-    return Factor.of(whole).inverse.numpy() / variance
+    return Factor.from_gram(whole).inverse.numpy() / variance
 
 
 def _covariance(distance: np.ndarray, reach: float, nugget: float) -> np.ndarray:

@@ -59,12 +59,12 @@ class Fingerprints:
     time_s: np.ndarray
     access_point: np.ndarray
 
-    def at(self, rows: np.ndarray) -> Fingerprints:
+    def subset(self, rows: np.ndarray) -> Fingerprints:
         """Return the rows (n,) alone."""
         parts = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "access_point"}
         return replace(self, **parts)
 
-    def of_access_points(self, names: np.ndarray) -> Fingerprints:
+    def select_access_points(self, names: np.ndarray) -> Fingerprints:
         """Return columns in the order of `names` (P,) of another campaign; NaN where they are not here."""
         column = {name: number for number, name in enumerate(self.access_point.tolist())}
         columns = np.array([column.get(name, -1) for name in names.tolist()])

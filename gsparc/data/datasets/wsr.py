@@ -153,10 +153,10 @@ def _way(path: Path) -> np.ndarray:
         return way[:, [0, -3, -2, -1]]
 
 
-def _link(robot: Log, other: Log, way: np.ndarray, spacing_m: float) -> Iterator[Pair]:
+def _link(robot: Log, other_robot: Log, way: np.ndarray, spacing_m: float) -> Iterator[Pair]:
     """Places (n, 3) and channels (n, 30) of each part of a run in which the root can be followed."""
     # A log does not name its own card: it is the sender with whose packets the oscillators cancel.
-    tried = [_square(robot, other, sender) for sender in np.unique(robot.sender)]
+    tried = [_square(robot, other_robot, sender) for sender in np.unique(robot.sender)]
     agree, mine, square = max(tried, key=lambda one: one[0])
     if agree < LEAST_AGREEMENT:
         return
@@ -172,10 +172,10 @@ def _link(robot: Log, other: Log, way: np.ndarray, spacing_m: float) -> Iterator
             yield place[part][kept], root[around].mean(axis=1)
 
 
-def _square(robot: Log, other: Log, sender: np.void) -> tuple[float, np.ndarray, np.ndarray]:
+def _square(robot: Log, other_robot: Log, sender: np.void) -> tuple[float, np.ndarray, np.ndarray]:
     """How well neighbours agree (at most 1), the robot's packets (n,), the square of the channel (n, 30)."""
-    mine, theirs, late = _paired(robot, other, sender)
-    square = remove_delay_slope(robot.csi[mine, :, 0] * other.csi[theirs, :, 0])
+    mine, theirs, late = _paired(robot, other_robot, sender)
+    square = remove_delay_slope(robot.csi[mine, :, 0] * other_robot.csi[theirs, :, 0])
     turn, step = np.sum(square[1:] * square[:-1].conj(), axis=1), np.diff(late)
     offsets = np.arange(-MOST_OFFSET_HZ, MOST_OFFSET_HZ, OFFSET_STEP_HZ)  # of the two oscillators [Hz]
     agree = [np.real(np.sum(turn * np.exp(-2j * np.pi * hz * step))) for hz in offsets]
@@ -184,11 +184,11 @@ def _square(robot: Log, other: Log, sender: np.void) -> tuple[float, np.ndarray,
     return float(np.max(agree) / max(np.sum(np.abs(turn)), np.finfo(float).tiny)), mine, square
 
 
-def _paired(robot: Log, other: Log, sender: np.void) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _paired(robot: Log, other_robot: Log, sender: np.void) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Packets of one exchange by their counter, in both logs, and how late it was heard [s]."""
     here = np.flatnonzero(robot.sender == sender)
-    number, mine, theirs = np.intersect1d(robot.number[here], other.number, return_indices=True)
-    late, usual = robot.tick[here[mine]] - other.tick[theirs], np.ones(len(number), bool)
+    number, mine, theirs = np.intersect1d(robot.number[here], other_robot.number, return_indices=True)
+    late, usual = robot.tick[here[mine]] - other_robot.tick[theirs], np.ones(len(number), bool)
     if len(number) < 2:
         return here[:0], theirs[:0], late[:0]
     for _ in range(5):  # without the drift of the clocks; what waited for the channel is not usual

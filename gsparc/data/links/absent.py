@@ -43,7 +43,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     moment = number_lists(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
-    lists = StrongestLists.of(moment, of[heard], levels[heard], moving, count)
+    lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
     if not lists.are_strongest():
         return
     # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.

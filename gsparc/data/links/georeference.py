@@ -37,7 +37,7 @@ class Georeference:
             raise DataError(f"origin: {fault[1]}")
 
     @classmethod
-    def about(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
+    def from_coordinates(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
         """Place the origin of (n,) [deg] at their median, rounded to 1e-4 degrees.
 
         Raises:

@@ -110,7 +110,7 @@ def _in_metres(check: Checker) -> Georeference | None:
     if len(check.problems) > before:
         return None
     # About the rows rather than the stations: a distant station must not distort the site.
-    origin = Georeference.about(*places[""])
+    origin = Georeference.from_coordinates(*places[""])
     end = _moving(check)
     for prefix, name in (("", end), ("station_", "station")):
         if prefix in places:

@@ -151,4 +151,4 @@ def split_by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stati
     called = zip(first, carrier, several, strict=True)
     names = [stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called]
     arrays["station"] = which.reshape(-1).astype(np.int64)
-    return replace(stations.at(first, names), carrier_hz=carrier)
+    return replace(stations.subset(first, names), carrier_hz=carrier)

@@ -62,7 +62,7 @@ class StrongestLists:
     place: np.ndarray
 
     @classmethod
-    def of(
+    def from_rows(
         cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int
     ) -> StrongestLists:
         """Build from rows (n,) of `lists`, stations `who` of `count`, levels [dB], places `at` (n, 3) [m]."""

@@ -62,7 +62,7 @@ class PublicSet:
         return platform_cache() / "data" / self.name
 
     @property
-    def size(self) -> str:
+    def size_text(self) -> str:
         """What is fetched, in words."""
         total = sum(source.bytes for source in self.sources)
         return f"{total / 1e6:.1f} MB in {len(self.sources)} file{'s' * (len(self.sources) > 1)}"
@@ -120,7 +120,7 @@ def fetched_path(choice: str, setting: str = "file") -> Path:
         by_hand = [f"get it from {one.by_hand} and " for one in sets]
         raise DataError(f"dataset.{setting} is not set; {''.join(by_hand)}{say}")
     part = f", of which {len(missing)} are missing" if len(missing) < len(here.sources) else ""
-    how = f"get it with `gsparc data {here.name}` ({here.size}{part})"
+    how = f"get it with `gsparc data {here.name}` ({here.size_text}{part})"
     raise DataError(f"dataset.{setting} is not set; {how}, or {say}")
 
 

@@ -63,7 +63,7 @@ class State:
     program: str
 
     @classmethod
-    def of(cls, config: DictConfig, data: str = "", split: str = "") -> State:
+    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
         """Return the state of a resolved configuration, of hashes of measurements and of their split."""
         kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
@@ -78,7 +78,7 @@ class State:
     @classmethod
     def unread(cls, config: DictConfig) -> State | None:
         """Return the state by the bytes of its files, no data read; None where other files may be read."""
-        state = cls.of(config)
+        state = cls.from_config(config)
         alone = state.settings.get("dataset._target_") == WHOLE and "dataset.file" in state.files
         return state if alone or "dataset.root" in state.files else None
 

@@ -86,7 +86,7 @@ class FoldFits:
     limited_by: Clock | None = None
     cost: Cost = NO_COST
 
-    def with_scores(self, data: Measurements, split: Split) -> FoldFits:
+    def score_on(self, data: Measurements, split: Split) -> FoldFits:
         """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
         return replace(self, figures=pool_figures(score_methods(self.methods, data, split), data, split))
 
@@ -101,7 +101,7 @@ def fit_folds(
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Method, FitReport], None] | None = None,
 ) -> FoldFits:  # fmt: skip
-    """Fit an unfitted method on every fold; `FoldFits.with_scores` scores them together.
+    """Fit an unfitted method on every fold; `FoldFits.score_on` scores them together.
 
     Args:
         factory: an unfitted method, or what chooses one.

@@ -101,7 +101,7 @@ def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | 
 
 def _alone(method: Method) -> bool:
     """Whether the process beside the field has all the weight."""
-    return method.without_process() is not None and not method.size()
+    return method.without_process() is not None and not method.count_components()
 
 
 def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str:

@@ -101,7 +101,7 @@ def prepare_cell(
     """Compose a cell's configuration and name its folder, `dataset/split/method/budget/seed`."""
     overrides = [*problem.chosen, *contender.overrides(cell.budget_s)]
     config = compose(settings, overrides, problem.draw, cell.seed)
-    state = State.of(config, problem.content, problem.folds.sha256)
+    state = State.from_config(config, problem.content, problem.folds.sha256)
     return PreparedCell(cell, problem, config, cells_dir / str(cell), state, reuse)
 
 

@@ -180,13 +180,13 @@ class Study:
                 )
                 learned_from = partial(learned.change_training, seed=seed)
                 made = fit_folds(self.variants[variant](), data, split, contexts, learned=learned_from)
-                fits[learned] = made.with_scores(data, split)
+                fits[learned] = made.score_on(data, split)
                 extra = {"fold": 0, "split_sha256": split.sha256}
                 # Without the configuration of the study: a variant has other settings.
                 checkpoint.save(learned.model(folder), made.methods[0], "", extra)
             outcome = fits[learned]
             if condition.what == "query":
-                outcome = outcome.with_scores(condition.change_test(data, split, seed), split)
+                outcome = outcome.score_on(condition.change_test(data, split, seed), split)
             # Where rows were silent they count, as in every other table.
             figure = WITH_SILENT if WITH_SILENT in outcome.figures else DECIDING[data.site.scored]
             folds = [condition.change_training(data, fold, seed)[1] for fold in split.folds]

@@ -257,7 +257,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
     own = block[block.method == ours]
     bold = {"bold": str((own.method + own.label).iloc[0])} if len(own) else {}
     shown = [column for there, column in columns if there]
-    return Table.of(title_of(block), shown, block.to_dict("records"), **bold)  # type: ignore[arg-type]
+    return Table.from_rows(title_of(block), shown, block.to_dict("records"), **bold)  # type: ignore[arg-type]
 
 
 def shown(figure: str, score_db: float) -> float:

@@ -80,7 +80,7 @@ def measure_candidates(
         index, count = key
         (settings, method), (figures, close) = candidates[index], scored[index]
         label = f"{describe_point(settings)}, {count} thread{'s' if count > 1 else ''}"
-        points.append(Point(label, settings, count, figures, close, ms, method.size()))
+        points.append(Point(label, settings, count, figures, close, ms, method.count_components()))
     return points, {name: times[name] for name in others}
 
 

@@ -103,7 +103,7 @@ def table_of_results(runs: Sequence[Run]) -> Table:
         "Brackets: 95 % intervals over test samples (independent samples assumed). Baselines are timed "
         "in turns within a run, the models of a sweep alone after it."
     )
-    return Table.of("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
+    return Table.from_rows("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
 
 
 def table_of_seeds(runs: Sequence[Run]) -> Table:
@@ -151,7 +151,9 @@ def differing_settings(runs: Sequence[Run]) -> dict[str, str]:
 def table_of_worst(runs: Sequence[Run]) -> Table:
     """Return the three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].row["kind"]]
-    numbers = [Column(head, ".2f") for head in (heading_of(name), "gp there", "confidence")]
+    rival = f"baseline/gp/{name}"
+    beside = ("gp there",) if any(rival in run.samples for run in runs) else ()
+    numbers = [Column(head, ".2f") for head in (heading_of(name), *beside, "confidence")]
     columns = [SETTING, SEED, Column("sample", ""), Column("where [m]", ""), *numbers]
     rows = []
     for run in runs:
@@ -162,9 +164,9 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
         error = np.abs(own[name]) if name == "error_db" else -own[name]
         for i in np.argsort(-np.nan_to_num(error, nan=-np.inf))[:WORST]:
             place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
-            rival = own.get(f"baseline/gp/{name}")
-            there = None if rival is None else float(rival[i])
+            there = [float(own[rival][i]) if rival in own else None for _ in beside]
             head = [run.setting, run.row["seed"], str(own["name"][i]), place]
-            rows.append([*head, float(own[name][i]), there, float(own["confidence"][i])])
-    note = "The moving end's position; the Gaussian process there shows whether it is hard for all."
+            rows.append([*head, float(own[name][i]), *there, float(own["confidence"][i])])
+    hard = "; the Gaussian process there shows whether it is hard for all" if beside else ""
+    note = f"The moving end's position{hard}."
     return Table("The three worst places", columns, rows, note)

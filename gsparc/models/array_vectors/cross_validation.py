@@ -77,10 +77,10 @@ def choose_kernel(
 
     def kernel_at(parameters: np.ndarray) -> Kernel:
         length, noise = np.exp(np.clip(parameters, np.log(LEAST), np.log(LARGEST)))
-        return Kernel.of_one(float(length * wavelength), float(noise), term=SmoothRough)
+        return Kernel.from_length(float(length * wavelength), float(noise), term=SmoothRough)
 
     def inverse_of(kernel: Kernel) -> np.ndarray:
-        return Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
+        return Factor.from_gram(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
 
     def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
         kernel = kernel_at(parameters)

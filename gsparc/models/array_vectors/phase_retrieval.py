@@ -68,7 +68,7 @@ def recover_vectors(
         most: every row is solved once from its neighbours or from random starts; of restarts there are at
             most so many, rows times starts, as spectra of another array never converge.
     """
-    problem = _Problem.of(site, images)
+    problem = _Problem.from_images(site, images)
     generator = torch.Generator().manual_seed(seed)
     n = len(images)
     state, cost = torch.zeros(n, problem.unknowns, dtype=torch.float64), torch.full((n,), torch.inf).double()
@@ -137,7 +137,7 @@ class _Problem:
     offsets: bool
 
     @staticmethod
-    def of(site: Site, images: np.ndarray) -> _Problem:
+    def from_images(site: Site, images: np.ndarray) -> _Problem:
         array, grid, wavelength = site.array_geometry()
         known = co_array(array, wavelength)
         basis = known.basis(grid, wavelength)
@@ -210,7 +210,7 @@ def _search(
         normal = slope.transpose(1, 2) @ slope
         lift = damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-12
         normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
-        step = Factor.of(normal, "ignore").solve(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
+        step = Factor.from_gram(normal, "ignore").solve(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
         tried = state - step
         new_error, new_slope = problem.residual(tried, rows[owner])
         new_cost = new_error.square().sum(1)

@@ -153,4 +153,4 @@ def set_emissions(model: GaussianModel, process: VectorProcess, receiver: Pose) 
     model.emission.bias2.zero_()
     response.background = process.background
     if model.error is not None:
-        model.error.set(*process.error)
+        model.error.set_error_law(*process.error)

@@ -105,7 +105,7 @@ def align_by_likelihood(
         partner: of `mirror_elements`.
         kernel: length and noise.
     """
-    inverse = Factor.of(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
+    inverse = Factor.from_gram(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
     return refine_alignment(align_along_tree(vectors, positions, partner), inverse, partner)
 
 

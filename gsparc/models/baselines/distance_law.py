@@ -148,7 +148,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     """
     rng = np.random.default_rng(seed)
     if len(rows.places) > LOOKED_AT:
-        rows = rows.at(np.sort(rng.permutation(len(rows.places))[:LOOKED_AT]))
+        rows = rows.subset(np.sort(rng.permutation(len(rows.places))[:LOOKED_AT]))
     low, high = rows.places.min(0), rows.places.max(0)
     size = max(float(np.linalg.norm(high - low)), TINY_M)
     bounds = np.stack([low - size, high + size], 1)

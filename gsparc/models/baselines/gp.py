@@ -15,6 +15,7 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from gsparc.data.blocks import row_blocks
+from gsparc.data.limits import check_arguments, choice, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
@@ -99,11 +100,12 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
-        return Kernel.of_one(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
+        return Kernel.from_length(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2))] * count
     bounds += [*[(-SHARES, SHARES)] * (count - 1), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
-    starts = [Kernel.matern(one, [1 / count] * count, 0.01) for one in combinations(spread * STARTS, count)]
+    lengths = combinations(spread * STARTS, count)
+    starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
     # The figures move by 1e-4 beyond this.
     known = starts, distances(places, places), None, values, bounds
@@ -130,10 +132,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     scores: Posterior | None = None  # of what is not
 
     def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
-        if components < 1:
-            raise ValueError(f"gp: components must be at least 1, got {components}")
-        if mean not in MEANS:
-            raise ValueError(f"gp: mean={mean!r} is none of {', '.join(MEANS)}")
+        check_arguments(locals(), components=whole(1), mean=choice(*MEANS))
         self.limit, self.about = components, mean
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
@@ -143,7 +142,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         parts = principal_components(targets, self.kind, self.limit)
         looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
-        self.scores = Exact.of(Prior(kernel), torch.from_numpy(positions), torch.from_numpy(parts.scores))
+        at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
+        self.scores = Exact.from_values(Prior(kernel), at, scores)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
         notes = [f"gp: {kernel.description}"]
@@ -181,7 +181,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return None if self.powers is None else self.powers.exact()
+        return None if self.powers is None else self.powers.with_exact_posterior()
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
@@ -200,8 +200,8 @@ class GaussianProcess(Differentiable, ClosedForm):
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
         mean = self._composed(result.mean, dtype)
         # What the components leave out is an error of every prediction.
-        variance = (kernel.amplitude * result.left + self.lost).to(dtype)
-        unknown = (result.left / (1 + kernel.noise)).to(dtype)
+        variance = (kernel.amplitude * result.variance + self.lost).to(dtype)
+        unknown = (result.variance / (1 + kernel.noise)).to(dtype)
         return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
 
     def mean_at(self, query: Query) -> Tensor:
@@ -275,7 +275,7 @@ def choose_nearest_kernel(
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     once = torch.ones(rows.shape, dtype=torch.float64)
-    sample = NeighbourSample.of(torch.from_numpy(places[rows]), values, once)
+    sample = NeighbourSample.from_rows(torch.from_numpy(places[rows]), values, once)
     result = fit_kernel_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"

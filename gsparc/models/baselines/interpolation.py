@@ -84,7 +84,7 @@ class Interpolator(Method):
         self.site, self.shape, self.seen = site, tuple(state["shape"]), int(state["seen"])
         self._relearn(state)
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of stored training samples."""
         return self.seen
 

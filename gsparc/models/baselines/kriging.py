@@ -53,7 +53,7 @@ class Variogram(Stored):
     range: float
 
     @property
-    def total(self) -> float:
+    def variance(self) -> float:
         """Variance of a measurement far from all others [dB^2]."""
         return self.nugget + self.sill
 
@@ -144,7 +144,7 @@ class Kriging(Interpolator):
         n = distance.shape[-1]
         system = np.ones((*distance.shape[:-2], n + 1, n + 1))
         system[..., :n, :n] = self._covariance(distance)
-        system[..., np.arange(n), np.arange(n)] += self.variogram.nugget + JITTER * self.variogram.total
+        system[..., np.arange(n), np.arange(n)] += self.variogram.nugget + JITTER * self.variogram.variance
         system[..., n, n] = 0.0
         return system
 
@@ -164,7 +164,7 @@ class Kriging(Interpolator):
             near = self.positions[place]
             apart = np.linalg.norm(near[:, :, None] - near[:, None], axis=-1)
             solved = np.linalg.solve(self._systems(apart), right[..., None])[..., 0]
-        left = np.clip(self.variogram.total - (solved * right).sum(1), 0.0, None)
+        left = np.clip(self.variogram.variance - (solved * right).sum(1), 0.0, None)
         return place, solved[:, :-1], left
 
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
@@ -197,7 +197,7 @@ class Kriging(Interpolator):
         else:
             towards = weighed(self.channels, torch.complex64)
             mean = torch.polar(from_decibels(decibels / 2), towards.angle()).view(-1, *self.shape)
-        unknown = (variance / self.variogram.total).clamp(0, 1)
+        unknown = (variance / self.variogram.variance).clamp(0, 1)
         return Prediction(mean, entry_variance(variance, mean, "rssi") if power else None, unknown)
 
     def _relearn(self, state: dict[str, Any]) -> None:

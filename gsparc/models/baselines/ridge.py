@@ -69,11 +69,11 @@ class Ridge(UplinkMethod):
 
     def _inputs(self, uplink: Tensor) -> Tensor:
         """(B, M, F): M maps of F inputs each."""
-        return uplink.flatten(1)[:, None] if self.inputs == "all" else self.own(uplink)
+        return uplink.flatten(1)[:, None] if self.inputs == "all" else self.select_antennas(uplink)
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; of the uplink alone."""
-        mean = torch.einsum("bmf,mfo->bmo", self._inputs(self.heard(query)), self.maps)
+        mean = torch.einsum("bmf,mfo->bmo", self._inputs(self.query_uplinks(query)), self.maps)
         assert self.site is not None and self.site.antennas is not None
         return Prediction(mean.reshape(len(query), len(self.site.antennas), -1))
 

@@ -278,7 +278,7 @@ def fit_factors(
         runs: number.
         factors: of runs, estimated by likelihood unless given.
     """
-    solved = [Factor.of(covariance) for covariance in covariances]
+    solved = [Factor.from_gram(covariance) for covariance in covariances]
     if factors is None:
         factors = torch.ones(1, dtype=torch.complex128) if runs == 1 else _run_factors(groups, solved, runs)
     known = []

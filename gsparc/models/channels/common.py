@@ -31,7 +31,7 @@ class SharedGains:
     level: float
 
     @staticmethod
-    def of(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> SharedGains:
+    def from_groups(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> SharedGains:
         """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
@@ -51,7 +51,7 @@ class SharedGains:
         reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
         return SharedGains(gain * reliability, explained, sum(levels) / count)
 
-    def at(self, prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
+    def mean_and_variance(self, prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
         before = self.level / _away(prior, at.slot) ** 2 * prior.variance(at)
         waves, _, away = _waves(prior, at)

@@ -121,7 +121,7 @@ class ComplexGP(ClosedForm):
         kernel = min(kernels, key=lambda one: negative_log_likelihood(*_aligned(one, few, len(names))))
         factors, ((_, told),) = _aligned(kernel, rows, len(names))
         prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
-        self.posterior = Exact.of(prior, places, told.values, None, told.factor)
+        self.posterior = Exact.from_values(prior, places, told.values, None, told.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
             notes.append(self._factors_note(names, run))
@@ -139,7 +139,7 @@ class ComplexGP(ClosedForm):
         )
         squares = mean_at_places(data.moving[known], _power(targets))[1]
         scatter = torch.from_numpy((count * (squares - _power(means))).clip(0))
-        near = Neighbourhood.of(values.places, 0)
+        near = Neighbourhood.from_places(values.places, 0)
         row = covering_rows(values.places, TRIED_ON, 0)
         rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
@@ -149,8 +149,8 @@ class ComplexGP(ClosedForm):
         kernel = min(kernels, key=lambda one: _density(one, *sample))
         power = max(float(sample[1][:, 0].abs().square().mean()), TINY)
         prior = Prior(replace(kernel, amplitude=power))
-        self.posterior = condition_on_nearest(prior, values, 0, most=NEAREST)
-        self.runs = RunFactors.none()
+        self.posterior = condition_on_nearest(prior, values, 0, neighbours=NEAREST)
+        self.runs = RunFactors.identity()
         of = f"of {len(count)} places, of" if len(count) < len(known) else "of"
         by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
         return [by, f"settings chosen on {len(row)} of them, each given its nearest"]
@@ -170,10 +170,10 @@ class ComplexGP(ClosedForm):
         assert self.site is not None
         dtype, kernel = query.tx.dtype, self.kernel
         posterior = self._fitted().answer(query.places(self.site), dtype == torch.float64)
-        share = posterior.left / (1 + kernel.noise)
+        share = posterior.variance / (1 + kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
         told = Prediction(mean, (kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
-        return self.runs.restored(told, query.run)
+        return self.runs.restore_run(told, query.run)
 
     def _fitted(self) -> Posterior:
         if self.posterior is None:
@@ -189,7 +189,7 @@ class ComplexGP(ClosedForm):
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
         self.posterior, self.runs = restored(state["posterior"]), restored(state["runs"])
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of training samples kept."""
         return 0 if self.posterior is None else len(self.posterior.places)
 

@@ -47,7 +47,7 @@ def fit_drift(
         eye = torch.eye(len(group), dtype=torch.float64)
         held = Dense(signal[None]), Dense(drift.correlations(group, group).to(torch.complex128))
         # No parameter of these terms changes the signal.
-        parts.append(BasisGroup.of(group, eye, held, torch.eye(1 + len(SHARES), dtype=torch.float64)[:, 1:]))
+        parts.append(BasisGroup.from_group(group, eye, held, torch.eye(1 + len(SHARES)).double()[:, 1:]))
     white = torch.tensor([1.0, 0.0, 0.0, level], dtype=torch.float64)
     before = sum(solve_group(part, white).nll for part in parts)
     fitted, least = fit_terms(parts, (drift, noise), 0.0, STEPS)

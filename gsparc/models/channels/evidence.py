@@ -53,7 +53,7 @@ class BasisGroup:
     rest: float
 
     @staticmethod
-    def of(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> BasisGroup:
+    def from_group(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> BasisGroup:
         """Return it with the group's targets in the basis."""
         target = basis.T.to(torch.complex128) @ group.target
         rest = max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
@@ -114,10 +114,10 @@ def compress_groups(
     for group in groups:
         key = group.displacements, group.slot.wavenumber, prior.frame.envelope, noise
         alike = partial(prior[Isotropic].correlation, group, group)
-        basis = get_or_make(cache, key, partial(Basis.of, key, group.places, alike, noise, cache))
-        pieces = tuple(piece for term in prior.signals for piece in term.pieces(group, basis))
+        basis = get_or_make(cache, key, partial(Basis.from_matrix, key, group.places, alike, noise, cache))
+        pieces = tuple(piece for term in prior.signals for piece in term.covariances_in_basis(group, basis))
         design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
-        parts.append(BasisGroup.of(group, basis.columns, pieces, design))
+        parts.append(BasisGroup.from_group(group, basis.columns, pieces, design))
     return tuple(parts)
 
 
@@ -127,7 +127,7 @@ def without_rows(part: BasisGroup, left_out: Tensor) -> BasisGroup:
     # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
     pieces = tuple(piece.change_basis(mixed) for piece in part.pieces)
-    return BasisGroup.of(part.group.take(rest), basis, pieces, part.design)
+    return BasisGroup.from_group(part.group.take(rest), basis, pieces, part.design)
 
 
 def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
@@ -138,7 +138,7 @@ def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     for piece, level in zip(part.pieces, powers, strict=True):
         covariance = piece.add_to(covariance, level)
     covariance.diagonal().add_(noise)
-    given = Conditioned.of(covariance, part.target)
+    given = Conditioned.from_gram(covariance, part.target)
     count, outputs = part.group.target.shape
     # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
     quadratic = given.scale * part.target.numel() + part.rest / noise
@@ -209,7 +209,7 @@ def fit_terms(
         options={"maxiter": steps, "ftol": SETTLED},
     )  # fmt: skip
     found = torch.from_numpy(optimum.x)
-    fitted = tuple(term.at(own) for term, own in zip(terms, found.split(sizes), strict=True))
+    fitted = tuple(term.with_values(own) for term, own in zip(terms, found.split(sizes), strict=True))
     return fitted, sum(solve_group(part, (part.design @ found).exp()).nll for part in parts)
 
 

@@ -77,7 +77,7 @@ class Weights:
         error = (squares - few.abs().square().sum(1)).abs().max()
         return short if float(error) <= ROUNDED * self.noise else root
 
-    def learned(self, cross: Tensor) -> Tensor:
+    def explained_variance(self, cross: Tensor) -> Tensor:
         """Return the variance (m,) that the rows take away from places of covariances (m, n) with them."""
         cross = (cross.real if self.is_real else cross).to(self.root.dtype)
         return (cross.conj() @ self.root.T).abs().square().sum(1)
@@ -101,7 +101,7 @@ class ChannelField(ClosedForm):
         self.stations: dict[int, list[Weights]] = {}
         self.common: SharedGains | None = None
         self.rows = np.zeros(0, np.int64)
-        self.runs = RunFactors.none()
+        self.runs = RunFactors.identity()
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose terms and their powers from training and validation rows, and condition on these.
@@ -118,9 +118,9 @@ class ChannelField(ClosedForm):
     @property
     def apart(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
-        return self.prior.get(Direct) is not None or self.size() > 0
+        return self.prior.get(Direct) is not None or self.count_components() > 0
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of images."""
         images = self.prior.get(Images)
         return 0 if images is None else len(images.planes)
@@ -133,7 +133,7 @@ class ChannelField(ClosedForm):
     def objects(self) -> SiteObjects:
         """Return the mirror planes that static ends share."""
         images = self.prior.get(Images)
-        return SiteObjects.of(planes=None if images is None else images.planes.numpy())
+        return SiteObjects.from_arrays(planes=None if images is None else images.planes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; factors of runs are estimated by likelihood where there are several.
@@ -163,7 +163,7 @@ class ChannelField(ClosedForm):
             self.stations.setdefault(known.group.slot.station, []).append(known)
         heard = [(known.group, known.given.weights, known.scale) for known in self.weights]
         # One end alone does not tell what ends have in common.
-        self.common = SharedGains.of(prior, heard) if len(self.stations) > 1 else None
+        self.common = SharedGains.from_groups(prior, heard) if len(self.stations) > 1 else None
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
@@ -186,9 +186,9 @@ class ChannelField(ClosedForm):
             mean.to(device),
             after.to(dtype).to(device),
             (after / before.clamp_min(TINY)).clamp(0, 1).to(dtype).to(device),
-            share.to(device) if self.size() else None,
+            share.to(device) if self.count_components() else None,
         )
-        return self.runs.restored(told, query.run)
+        return self.runs.restore_run(told, query.run)
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
@@ -201,21 +201,21 @@ class ChannelField(ClosedForm):
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
 
-        def tell(slot: Slot, here: Tensor, said: Tensor, left: Tensor, whole: Tensor) -> None:
+        def tell(slot: Slot, here: Tensor, said: Tensor, variance: Tensor, whole: Tensor) -> None:
             slot.put(mean, here, said)
-            for total, part in ((after, left), (before, whole)):
+            for total, part in ((after, variance), (before, whole)):
                 # Variances are means over all A K entries, of which this slot has so many.
                 total.index_add_(0, here, part * (said.shape[1] / size))
 
         for alike in self._by_places(moving, turned, station):
             asked = [SlotPlaces(known.group.slot, places) for known, _, places in alike]
-            crosses = prior.together(asked, [known.group for known, _, _ in alike])
+            crosses = prior.end_covariances(asked, [known.group for known, _, _ in alike])
             for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
                 if images is not None:
                     at.slot.put(share, here, known.given.mean(images.covariance(at, known.group)))
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
-                removed = known.given.explained_variance(cross) if exact else known.learned(cross)
-                whole = prior.variance(at) + prior.disturbed
+                removed = known.given.explained_variance(cross) if exact else known.explained_variance(cross)
+                whole = prior.variance(at) + prior.disturbance_variance
                 left = known.scale * (whole - removed).clamp_min(0)
                 tell(at.slot, here, known.given.mean(cross), left, known.scale * whole)
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
@@ -228,7 +228,7 @@ class ChannelField(ClosedForm):
                 # Antennas of the new end stand about its place as those of the known one do.
                 slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
                 at = SlotPlaces(slot, slot.antenna_places(moving[here], turned[here]))
-                common, left, whole = self.common.at(prior, at)
+                common, left, whole = self.common.mean_and_variance(prior, at)
                 tell(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
 

@@ -264,17 +264,15 @@ class _Search:
     def _measured(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
         """With what left-out rows say."""
         errors = np.mean([_left_out(part, prior).mean(1) for part in parts], axis=0)
-        return Candidate(prior, negative_log_evidence(parts, prior) + self._worth(prior), errors)
+        numbers = sum(2 * group.target.numel() for group in self.groups)
+        # What the terms beside the isotropic field must gain [nats].
+        worth = 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
+        return Candidate(prior, negative_log_evidence(parts, prior) + worth, errors)
 
     def _fitted(self, prior: ChannelPrior) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(prior)
         return self._measured(fit_powers(parts, prior, SHRINKAGE)[0], parts)
-
-    def _worth(self, prior: ChannelPrior) -> float:
-        """What the terms beside the isotropic field must gain [nats]."""
-        numbers = sum(2 * group.target.numel() for group in self.groups)
-        return 0.5 * (sum(term.worth for term in prior.terms) - 2) * math.log(numbers)
 
     @property
     def one_end(self) -> bool:
@@ -292,7 +290,7 @@ class _Search:
         tried: list[tuple[ChannelPrior, float]] = []
         for bound in sorted({frame.envelope, LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if direct else GAINS[:1]:
-                trial = prior.with_frame(envelope=bound, gain=gain * self.wavelength)
+                trial = prior.change_frame(envelope=bound, gain=gain * self.wavelength)
                 tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
         return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
 
@@ -304,7 +302,7 @@ class _Search:
         offset = find_static_offset(self._compressed(prior), prior, self.wavelength)
         if offset is None:
             return candidate
-        moved = self._fitted(prior.with_frame(offset=offset))
+        moved = self._fitted(prior.change_frame(offset=offset))
         return moved if moved.nll < candidate.nll else candidate
 
     def _with_mirrors(self, before: Candidate) -> Candidate | None:
@@ -316,7 +314,7 @@ class _Search:
         planes = find_mirrors(rough, wide._compressed(prior), prior, self.wavelength, most)
         if not len(planes):
             return None
-        images = Images.of(prior.frame, planes, NEW * float(prior[Isotropic].power))
+        images = Images.from_planes(prior.frame, planes, NEW * float(prior[Isotropic].power))
         mirrored = self._fitted(prior.with_terms(images))
         images, power = mirrored.prior[Images], mirrored.prior.power
         heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
@@ -377,7 +375,7 @@ class _Search:
         for group, signal in zip(groups, known, strict=True):
             for sums, at in zip(errors, (before.prior, prior), strict=True):
                 other = at.disturbance(group).to(torch.complex128)
-                given = Conditioned.of(signal + other, group.target)
+                given = Conditioned.from_gram(signal + other, group.target)
                 left = [given.left_out_signal(other, rows)[0] for rows in _groupings(group.places)]
                 sums += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers

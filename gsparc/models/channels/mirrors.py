@@ -49,30 +49,30 @@ class _Searcher:
         self.ends = torch.stack([probe.group.slot.end for probe in probes])
         self.planes, self.risen = torch.zeros(0, 4, dtype=torch.float64), 0.0
 
-    def gains(
-        self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.explained
+    def likelihood_gains(
+        self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision
     ) -> Tensor:
         """Rise of the log likelihood (W, levels) of each plane alone."""
 
         def waves(probe: Probe, chunk: Tensor) -> Tensor:
-            return Images.of(self.frame, planes[chunk]).waves(probe.group)
+            return Images.from_planes(self.frame, planes[chunk]).waves(probe.group)
 
         return likelihood_gains(probes, len(planes), waves, LEVELS, known)
 
-    def keep(self, plane: Tensor, level: float, gain: float) -> None:
+    def add_plane(self, plane: Tensor, level: float, gain: float) -> None:
         """One more plane (4,)."""
         self.planes, self.risen = torch.cat([self.planes, plane[None]]), self.risen + gain
-        image = Images.of(self.frame, plane[None])
+        image = Images.from_planes(self.frame, plane[None])
         self.rough, self.probes = (
-            tuple(probe.with_wave(image.waves(probe.group)[0], level) for probe in each)
+            tuple(probe.add_wave(image.waves(probe.group)[0], level) for probe in each)
             for each in (self.rough, self.probes)
         )
 
-    def starts(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
+    def initial_planes(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
         """The best planes whose images of the ends are apart."""
         chosen: list[Tensor] = []
         for number in scores.argsort(descending=True).tolist():
-            tried = Images.of(self.frame, torch.stack([*chosen, grid[number]]))
+            tried = Images.from_planes(self.frame, torch.stack([*chosen, grid[number]]))
             placed = tried.mirror(self.ends)
             away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
             if not bool((away < APART * self.wavelength).any()):
@@ -81,7 +81,7 @@ class _Searcher:
                 break
         return chosen
 
-    def moved(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
+    def refine_plane(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
         """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
         middle, shift = self.frame.middle, STEP * self.wavelength / 2
         normal, away = plane[:-1], plane[-1]
@@ -97,7 +97,7 @@ class _Searcher:
             turned = turned / turned.norm(dim=1, keepdim=True)
             shifted = away - normal @ middle + share * shift * moves[:, 2]
             tried = torch.cat([turned, (shifted + turned @ middle)[:, None]], 1)
-            gains = self.gains(self.probes, tried)
+            gains = self.likelihood_gains(self.probes, tried)
             best = int(gains.argmax()) // len(LEVELS)
             plane, level = tried[best], LEVELS[int(gains[best].argmax())]
             (normal, away), gain = (plane[:-1], plane[-1]), float(gains[best].max())
@@ -117,22 +117,22 @@ def find_mirrors(
         wavelength: [m].
         most: planes.
     """
-    rough, probes = (tuple(Probe.of(part, prior) for part in each) for each in (coarse, parts))
+    rough, probes = (tuple(Probe.from_group(part, prior) for part in each) for each in (coarse, parts))
     search = _Searcher(rough, probes, prior.frame, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
     grid, turn = candidate_planes(rough, prior.frame, wavelength)
     while len(search.planes) < most:
         raise_if_cancelled()
-        scores = search.gains(search.rough, grid, _about).max(1).values
+        scores = search.likelihood_gains(search.rough, grid, _about).max(1).values
         if not len(search.planes):
             top = scores.topk(min(PROMISING, len(grid))).indices
             grid, scores = grid[top], scores[top]
-        moved = [search.moved(start, turn / 2) for start in search.starts(grid, scores)]
+        moved = [search.refine_plane(start, turn / 2) for start in search.initial_planes(grid, scores)]
         plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:
             break
-        search.keep(plane, level, gain)
+        search.add_plane(plane, level, gain)
     return search.planes if 2 * search.risen > LEAST * numbers else search.planes[:0]
 
 
@@ -158,8 +158,8 @@ def candidate_planes(probes: Probes, frame: Frame, wavelength: float) -> tuple[T
 
 
 def _about(probe: Probe, waves: Tensor) -> Tensor:
-    """`Probe.explained` by that of a few: an isotropic field knows waves from everywhere alike."""
+    """`Probe.wave_precision` by that of a few: an isotropic field knows waves from everywhere alike."""
     size = waves.abs().square().sum(1)
     few = torch.linspace(0, len(waves) - 1, min(LOOKED_AT, len(waves))).long()
-    share = probe.explained(waves[few]).sum() / size[few].sum().clamp_min(TINY)
+    share = probe.wave_precision(waves[few]).sum() / size[few].sum().clamp_min(TINY)
     return size * share

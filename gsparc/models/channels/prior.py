@@ -40,7 +40,7 @@ class ChannelPrior(Stored):
         ordered = (kinds[kind] for kind in dict.fromkeys([*KINDS, *kinds]) if kind in kinds)
         return ChannelPrior(tuple(term for term in ordered if len(term.power)))
 
-    def with_frame(self, **numbers: Any) -> ChannelPrior:
+    def change_frame(self, **numbers: Any) -> ChannelPrior:
         """Return the prior with some numbers of `frame` changed."""
         frame = replace(self.frame, **numbers)
         return ChannelPrior(tuple(replace(term, frame=frame) for term in self.terms))
@@ -71,13 +71,13 @@ class ChannelPrior(Stored):
         return float(self[Noise].power)
 
     @property
-    def disturbed(self) -> Tensor:
+    def disturbance_variance(self) -> Tensor:
         """Variance () of what is no signal."""
         return torch.cat([term.power for term in self.terms if not term.is_signal]).sum()
 
-    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterator[Tensor]:
-        """Yield covariances (n, m) complex128 of several ends' signals, see `ChannelTerm.together`."""
-        for parts in zip(*(term.together(a, b) for term in self.signals), strict=True):
+    def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterator[Tensor]:
+        """Yield covariances (n, m) complex128 of several ends' signals, see `ChannelTerm.end_covariances`."""
+        for parts in zip(*(term.end_covariances(a, b) for term in self.signals), strict=True):
             # From the first part on: `0 + tensor` would copy a matrix for nothing.
             yield sum(parts[1:], parts[0]).to(torch.complex128)
 
@@ -89,7 +89,7 @@ class ChannelPrior(Stored):
         result: list[Tensor] = [torch.empty(0)] * len(groups)
         for numbers in alike.values():
             here = [groups[number] for number in numbers]
-            for number, covariance in zip(numbers, self.together(here, here), strict=True):
+            for number, covariance in zip(numbers, self.end_covariances(here, here), strict=True):
                 result[number] = covariance
         return result
 

@@ -45,15 +45,15 @@ class Probe:
     scale: float
 
     @staticmethod
-    def of(part: BasisGroup, prior: ChannelPrior) -> Probe:
+    def from_group(part: BasisGroup, prior: ChannelPrior) -> Probe:
         """Factor a group's covariance with its own powers."""
         at, basis, noise = solve_group(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
-        root = basis @ Factor.of(inverse + 1e-12 * torch.eye(len(inverse))).lower
+        root = basis @ Factor.from_gram(inverse + 1e-12 * torch.eye(len(inverse))).lower
         return Probe(part.group, basis, root, basis[:, :0], alpha, noise, at.scale)
 
-    def explained(self, waves: Tensor) -> Tensor:
+    def wave_precision(self, waves: Tensor) -> Tensor:
         """Return f^H C^-1 f (m,) float64 of waves (m, n)."""
         inside, basis, downdate = (
             (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
@@ -61,16 +61,16 @@ class Probe:
         outside = waves.abs().square().sum(1) - basis
         return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
-    def gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
+    def likelihood_gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
         """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power.
 
         `known` (m,) stands in for `known(waves)`.
         """
         inner = (waves.conj() @ self.alpha).abs().square().sum(1)
-        size = 1 + level * (self.explained(waves) if known is None else known)
+        size = 1 + level * (self.wave_precision(waves) if known is None else known)
         return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
 
-    def with_wave(self, wave: Tensor, level: float) -> Probe:
+    def add_wave(self, wave: Tensor, level: float) -> Probe:
         """Return the probe with a wave (n,) of some power among the terms."""
         own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
         own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
@@ -81,7 +81,7 @@ class Probe:
 
 def likelihood_gains(
     probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
-    known: Callable[[Probe, Tensor], Tensor] = Probe.explained,
+    known: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
 ) -> Tensor:  # fmt: skip
     """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
@@ -89,7 +89,7 @@ def likelihood_gains(
         for chunk in torch.arange(count).split(max(ENTRIES // len(probe.group), 1)):
             each = waves(probe, chunk)
             size = known(probe, each)
-            total[chunk] += torch.stack([probe.gain(each, level, size) for level in levels], 1)
+            total[chunk] += torch.stack([probe.likelihood_gain(each, level, size) for level in levels], 1)
     return total
 
 
@@ -102,7 +102,7 @@ def find_static_offset(
     """
     direct = prior[Direct]
     none = prior.with_terms(replace(direct, power=torch.full_like(direct.power, TINY)))
-    probes, level = [Probe.of(part, none) for part in parts], float(direct.power.sum())
+    probes, level = [Probe.from_group(part, none) for part in parts], float(direct.power.sum())
 
     def gain(offsets: Tensor) -> Tensor:
         def waves(probe: Probe, chunk: Tensor) -> Tensor:

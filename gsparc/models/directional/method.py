@@ -67,7 +67,7 @@ class DirectionalGP(SourcesInFrame):
         if len(known) > MAX_RECEIVERS:
             known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
         places = data.rx_position[known].astype(np.float64)
-        rays = Rays.of(
+        rays = Rays.from_receivers(
             places, [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
         )
         clusters = triangulate(rays, self.seed)
@@ -78,14 +78,14 @@ class DirectionalGP(SourcesInFrame):
         order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
         sources = sources[order[: SearchSettings.max_sources]]
         everything = draw_rows(data, known, self.row_limit, self.seed)
-        self.frame = Frame.of(data.site, data.target.shape[1], everything)
+        self.frame = Frame.from_rows(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         at = {int(row): k for k, row in enumerate(known)}
         self.posterior = SightedSources(
             self.frame.normalise(everything),
             torch.tensor([at[int(row)] for row in everything.receiver]),
             UncertainPositions(points - self.frame.middle, covariance),
-            VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, sources]),
+            VisibilityGP.from_visibility(torch.from_numpy(places) - self.frame.middle, seen[:, sources]),
             torch.ones(len(sources)),
             REFINEMENT_KERNEL,
         )
@@ -95,7 +95,7 @@ class DirectionalGP(SourcesInFrame):
         changed = self._update_visibility()
         self.posterior.precompute()
         note = (
-            f"directional_gp: {self.size()} triangulated sources, direction error "
+            f"directional_gp: {self.count_components()} triangulated sources, direction error "
             f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
             f"constant share of the gains' variance {self.posterior.kernel.constant:.1%}"
         )
@@ -139,12 +139,12 @@ class DirectionalGP(SourcesInFrame):
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])
-            rates = RayErrorRates.of(rays, seen)
+            rates = RayErrorRates.from_visibility(rays, seen)
             visibility = replace(visibility, seen=seen.double())
             self.posterior = replace(now, visibility=visibility)
         changed = int((visibility.seen.float() != rays).sum())
         if changed:
-            again = VisibilityGP.of(visibility.places, visibility.seen)
+            again = VisibilityGP.from_visibility(visibility.places, visibility.seen)
             self.posterior = replace(self.posterior, visibility=again)
             self._refit()
         return changed
@@ -154,17 +154,17 @@ class DirectionalGP(SourcesInFrame):
         return self.posterior.positions.points + self._fitted().middle, self.posterior.power.sqrt()
 
     # ---- answers ----
-    def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
         """See `SourcesInFrame`."""
-        process = self.posterior.exact if exact else self.posterior
-        at = process.at(places, torch.tensor(self.frame.carrier_hz))
+        process = self.posterior.exact if float64 else self.posterior
+        at = process.arrival_at(places, torch.tensor(self.frame.carrier_hz))
         gains = at.probability[:, :, None] * process.gains(at)
         mean = gains.mT @ wave_over_band(at.away, tones, process.power.dtype)
         return mean, *process.variance(at, self.frame.carrier_hz)
 
     def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `SourcesInFrame`."""
-        at = self.posterior.at(places, torch.tensor(self.frame.carrier_hz))
+        at = self.posterior.arrival_at(places, torch.tensor(self.frame.carrier_hz))
         gain = at.probability * wave(at.away, self.frame.carrier_hz)
         gain = self.posterior.gains(at) * gain[:, :, None]
         return gain.mT, at.away, self.posterior.positions.points
@@ -187,6 +187,6 @@ class DirectionalGP(SourcesInFrame):
         """Of sources whose receivers are measured, too."""
         return ("phase", "visibility")
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of sources."""
         return len(self.posterior.power) if self.site is not None else 0

@@ -61,7 +61,7 @@ class UncertainPositions:
     def lower(self) -> Tensor:
         """(K, 3, 3), Cholesky factors of the covariances."""
         jitter = torch.full_like(self.points, JITTER_M2).diag_embed()
-        return Factor.of(self.covariance + jitter, "raise").lower
+        return Factor.from_gram(self.covariance + jitter, "raise").lower
 
     def phase_vectors(self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return (K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
@@ -139,7 +139,7 @@ class PositionRefinement:
         phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
         return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
 
-    def total(self, without: int | None = None) -> Tensor:
+    def sum_source_covariances(self, without: int | None = None) -> Tensor:
         """Return the covariance (n, n) of the rows by all sources but one."""
         power = self.power.to(self.terms.dtype)
         if without is not None:  # a difference of covariances need not be positive definite
@@ -150,7 +150,7 @@ class PositionRefinement:
         """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            given = condition_with_noise(self.total(), self.noise, self.rows.target)
+            given = condition_with_noise(self.sum_source_covariances(), self.noise, self.rows.target)
             explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
             due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
             self.power = self.power * (explained / due.clamp_min(TINY)).clamp(1 / MAX_RATIO, MAX_RATIO)
@@ -202,7 +202,7 @@ class ConditionalLikelihood:
 
     def __init__(self, refinement: PositionRefinement, k: int) -> None:
         rows, prior = refinement.rows, refinement.prior
-        given = condition_with_noise(refinement.total(without=k), refinement.noise, rows.target)
+        given = condition_with_noise(refinement.sum_source_covariances(k), refinement.noise, rows.target)
         in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
         self.rows, self.alpha = rows.take(in_view), given.weights[in_view]
         self.inverse = given.factor.inverse[in_view[:, None], in_view]

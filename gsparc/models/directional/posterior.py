@@ -163,7 +163,7 @@ class SightedSources:
             power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(TINY)
         return replace(self, power=power, kernel=kernel)
 
-    def at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
+    def arrival_at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
         """Return geometry of places (m, 3) [m], frequencies (m,) or () [Hz]; probability (m, K) if known."""
         dtype = self.power.dtype
         probability = self.visibility.probability(places) if probability is None else probability
@@ -176,7 +176,7 @@ class SightedSources:
 
     def at_rows(self, probability: Tensor) -> Arrival:
         """Return the rows' own geometry, with the probability (receivers, K) that each sees each source."""
-        return self.at(self.rows.position, self.rows.frequency, probability[self.observer])
+        return self.arrival_at(self.rows.position, self.rows.frequency, probability[self.observer])
 
     def gains(self, at: Arrival) -> Tensor:
         """Return the posterior mean gains (m, K, R) where they are seen."""

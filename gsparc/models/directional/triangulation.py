@@ -51,7 +51,7 @@ class Rays:
     owner: np.ndarray
 
     @staticmethod
-    def of(places: np.ndarray, rays: list[np.ndarray]) -> Rays:
+    def from_receivers(places: np.ndarray, rays: list[np.ndarray]) -> Rays:
         """Gather one array (paths, 3) per receiver."""
         flat = np.concatenate([places[:0], *rays])
         flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -49,7 +49,7 @@ class VisibilityGP:
     left_out: Tensor
 
     @staticmethod
-    def of(places: Tensor, seen: Tensor) -> VisibilityGP:
+    def from_visibility(places: Tensor, seen: Tensor) -> VisibilityGP:
         """Learn from the visibility of K sources at n receivers."""
         apart, mean = torch.cdist(places, places), seen.mean(0)
         length, weights = torch.full_like(mean, LENGTHS_M[-1]), torch.zeros_like(seen)
@@ -107,7 +107,7 @@ class RayErrorRates:
         return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
     @staticmethod
-    def of(rays: Tensor, seen: Tensor) -> RayErrorRates:
+    def from_visibility(rays: Tensor, seen: Tensor) -> RayErrorRates:
         """Estimate from rays and visibility, both (n, K) of zeros and ones."""
         missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
         spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))

@@ -25,7 +25,7 @@ UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before an
 
 def direct_path_scene(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
     """Return the static end (3,) [m] alone, with its share of the power of unit rows."""
-    scene = Scene.direct(static, torch.zeros(1), math.log(UNEXPLAINED))
+    scene = Scene.from_static_end(static, torch.zeros(1), math.log(UNEXPLAINED))
     power = (1 - UNEXPLAINED) / scene.waves(rows).abs().square().mean()
     return replace(scene, log_amplitude=power.sqrt().log().reshape(1), noise_floor=noise_floor)
 

@@ -15,9 +15,10 @@ from torch.nn.functional import normalize
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.rows import Rows, channel_places, moving_end, static_array
+from gsparc.models.image_sources.rows import Rows, channel_places, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.places import moving_end
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 
@@ -41,7 +42,7 @@ class Frame:
     carrier_hz: float
 
     @staticmethod
-    def of(site: Site, antennas: int, rows: Rows) -> Frame:
+    def from_rows(site: Site, antennas: int, rows: Rows) -> Frame:
         """Return that in which these rows have zero mean position and unit power.
 
         Raises:
@@ -96,7 +97,7 @@ class SourcesInFrame(ClosedForm):
     factors = torch.ones(1, dtype=torch.complex64)
 
     @abstractmethod
-    def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
 
         Normalised; the prior is the power that is expected without any rows.
@@ -142,7 +143,7 @@ class SourcesInFrame(ClosedForm):
         return *merge_equal_paths(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
 
     def _fitted(self) -> Frame:
-        if self.site is None or not self.size():
+        if self.site is None or not self.count_components():
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.frame
 

@@ -33,7 +33,7 @@ def condition_with_noise(covariance: Tensor, noise: float, target: Tensor) -> Co
     # Rounding grows with the diagonal, which sources near the places raise far above 1.
     level = max(1.0, float(covariance.diagonal().real.mean()))
     covariance.diagonal().add_(noise + JITTER * level)
-    return Conditioned.of(covariance, target)
+    return Conditioned.from_gram(covariance, target)
 
 
 class CircularGains:
@@ -60,7 +60,7 @@ class CircularGains:
         """Return the rows' targets given the covariance with noise of this variance."""
         # In place and for good: `Posterior.conditioned` calls it once.
         self._real.diagonal().add_(noise)
-        return Conditioned.of(self.matrix, self.target)
+        return Conditioned.from_gram(self.matrix, self.target)
 
     def grad_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """Return slopes (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
@@ -112,7 +112,7 @@ class PhasedGains(CircularGains):
     def condition(self, noise: Tensor | float) -> Conditioned:
         """Return the rows' targets, half of the noise in either part."""
         self.matrix.diagonal().add_(noise / 2)
-        return Conditioned.of(self.matrix, stack_real_imag(self.target)[0])
+        return Conditioned.from_gram(self.matrix, stack_real_imag(self.target)[0])
 
     def grad_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
         """See `CircularGains`."""
@@ -158,7 +158,7 @@ class Posterior:
         return PhasedGains(self.rows, self.scene.quadrature)
 
     @cached_property
-    def summed(self) -> CircularGains:
+    def source_gram(self) -> CircularGains:
         """Covariance of all sources, without noise until `conditioned` adds it."""
         gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
@@ -168,26 +168,26 @@ class Posterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return self.summed.condition(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
+        return self.source_gram.condition(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
 
     @property
     def covariance(self) -> Tensor:
         """Covariance of the rows, noise included."""
         # The noise is added to the sums when they are first conditioned.
         _ = self.conditioned
-        return self.summed.matrix
+        return self.source_gram.matrix
 
     @property
     def nll(self) -> float:
         """Negative log marginal likelihood up to a constant."""
         return self.conditioned.nll
 
-    def without(self, k: int) -> float:
+    def nll_without_source(self, k: int) -> float:
         """Return `nll` of the scene without source k, of circular gains."""
         one, source = CircularGains(self.rows), self.scene.sources[k]
         correlation = self.scene.visibility.correlation(self.rows.places, source)
         one.add_source(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
-        return Conditioned.of(self.covariance - one.matrix, self.rows.target).nll
+        return Conditioned.from_gram(self.covariance - one.matrix, self.rows.target).nll
 
     # ---- of gains of fixed phases ----
     @property

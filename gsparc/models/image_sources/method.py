@@ -89,14 +89,14 @@ class ImageSourceGP(SourcesInFrame):
         """
         require_static_phase(data.site, self.name)
         require_fixed_rotation(data)
-        known = np.concatenate([fold.train, fold.val])
+        seen = np.concatenate([fold.train, fold.val])
         self._groups = context.leave_out
         effort = context.effort * (1.0 if context.leave_out else ALONE)
         budget, settings = replace(context, effort=effort).time_budget(), self.settings
         self.site, antennas = data.site, data.target.shape[1]
         # The frame is of rows of all searches: their scenes are averaged in it.
-        self.frame = Frame.of(data.site, antennas, draw_rows(data, known, settings.rows, settings.seed))
-        noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
+        self.frame = Frame.from_rows(data.site, antennas, draw_rows(data, seen, settings.rows, settings.seed))
+        noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[seen]))
         # Simulated channels may have no noise, and float32 needs some to factor.
         self.noise_floor = max(JITTER, noise / self.frame.scale**2)
         notes: list[str] = []
@@ -104,16 +104,16 @@ class ImageSourceGP(SourcesInFrame):
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
         if calibrated:
             # Against the direct wave first, as a search needs aligned antennas; again against what it found.
-            start = self._searched_rows(data, known, 0)
+            start = self._searched_rows(data, seen, 0)
             data = self._calibrated(
                 data, start, direct_path_scene(start, self._transmitter(), self.noise_floor)
             )
         if settings.offsets != "none":
-            data = self._without_offsets(data, known, budget)
+            data = self._without_offsets(data, seen, budget)
             notes.append(
                 f"{self.name}: {settings.offsets} offset of every snapshot estimated; predictions have none"
             )
-        row_sets = self._row_sets(data, known)
+        row_sets = self._row_sets(data, seen)
         look = None
         if self._groups and context.race is not None:
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
@@ -124,12 +124,12 @@ class ImageSourceGP(SourcesInFrame):
         if calibrated:
             again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
-                data, row_sets = again, self._row_sets(again, known)
+                data, row_sets = again, self._row_sets(again, seen)
                 # Factors change little the second time: a refinement does, no other search.
                 members = [ensemble.refine_member(row_sets[one.number], one) for one in members]
-        rows = self._rows(data, known)
+        rows = self._rows(data, seen)
         self._become(rows, members)
-        self.held = self._left_out_rows(data, known, members, len(rows))
+        self.held = self._left_out_rows(data, seen, members, len(rows))
         notes += self._described(members, budget)
         return FitReport(budget.counted.wall, tuple(notes), budget.limited_by)
 
@@ -229,7 +229,7 @@ class ImageSourceGP(SourcesInFrame):
 
     def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        direct = Scene.direct(self._transmitter(), torch.zeros(1))
+        direct = Scene.from_static_end(self._transmitter(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
@@ -259,9 +259,9 @@ class ImageSourceGP(SourcesInFrame):
         target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)
 
-    def _answer(self, places: Tensor, tones: Tensor, exact: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
         """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""
-        stack, variance, prior = (self.query.exact if exact else self.query).means(places, tones)
+        stack, variance, prior = (self.query.in_float64 if float64 else self.query).means(places, tones)
         weight = self.weights[:, None, None, None]
         mean = (weight * stack).sum(0)  # of (members, B E, R, K)
         return mean, variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1), prior
@@ -327,7 +327,7 @@ class ImageSourceGP(SourcesInFrame):
         # n.p = b about the frame's middle m is n.p = b + n.m in local coordinates.
         moved = torch.cat([normal, offset + (normal @ middle)[:, None]], 1)
         boxes = scene.clutter.boxes.double().unflatten(1, (2, -1)) + middle
-        return SiteObjects.of(moved.numpy(), boxes.numpy())
+        return SiteObjects.from_arrays(moved.numpy(), boxes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; offsets of snapshots were estimated with the gains, which stay."""
@@ -335,6 +335,6 @@ class ImageSourceGP(SourcesInFrame):
             data = replace(data, target=data.target * self.factors.numpy()[:, None])
             self._conditioned(self._rows(data, rows), [member.scene for member in self.members])
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of sources of the largest scene."""
         return max((len(member.scene.sequences) for member in self.members), default=0)

@@ -117,7 +117,7 @@ def learn_visibility(
     optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=BETAS)
 
     def current() -> Scene:
-        trial = replace(scene, visibility=KernelVisibility.of(value.detach()).plain())
+        trial = replace(scene, visibility=KernelVisibility.from_parameters(value.detach()).to_floats())
         if scene.quadrature == 1:
             return trial
         return replace(trial, quadrature=float(torch.sigmoid(value.detach()[-1])))
@@ -132,7 +132,7 @@ def learn_visibility(
         scaled = posterior.waves * scene.log_amplitude.exp()
         loss = ((value - about) / width).square().sum()
         for k, source in enumerate(scene.sources):
-            correlation = KernelVisibility.of(value).correlation(rows.places, source)
+            correlation = KernelVisibility.from_parameters(value).correlation(rows.places, source)
             loss = loss + (gains.grad_correlation(slope, scaled[:, k]) * correlation).sum()
         optimizer.zero_grad()
         loss.backward()

@@ -66,7 +66,7 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
             sequences[i] = candidate
         else:
             numbers.discard(i)
-    return replace(scene, sequences=tuple(sequences)).only(sorted(numbers))
+    return replace(scene, sequences=tuple(sequences)).select_sources(sorted(numbers))
 
 
 def _distances(scene: Scene, sequences: list[Reflections], places: Tensor) -> Tensor:
@@ -187,7 +187,7 @@ def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     explained = replace(
         scene, planes=torch.stack(planes), sequences=tuple(sequences), log_amplitude=scene.log_amplitude[ids]
     )
-    return explained.only(list(range(len(ids))))
+    return explained.select_sources(list(range(len(ids))))
 
 
 def prune_sources(rows: Rows, scene: Scene, least: float) -> Scene:
@@ -197,8 +197,8 @@ def prune_sources(rows: Rows, scene: Scene, least: float) -> Scene:
         if out_of_time():
             break
         sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in scene.sequences[i])
-        lost = posterior.without(kept.index(i)) - posterior.nll
+        lost = posterior.nll_without_source(kept.index(i)) - posterior.nll
         if lost < (2 * least if sole_user else least):
             kept.remove(i)
-            posterior = Posterior(rows, scene.only(kept))
-    return scene.only(kept)
+            posterior = Posterior(rows, scene.select_sources(kept))
+    return scene.select_sources(kept)

@@ -14,10 +14,11 @@ from torch.nn.functional import normalize
 
 from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.rows import Rows, moving_end
+from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.places import moving_end
 
 BETAS = 0.8, 0.95  # decay rates of Adam's moments: of tens of steps, not its usual thousand
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
@@ -52,18 +53,18 @@ class KernelVisibility:
         return self.constant + (1 - self.constant) * matern32_of_squares(squared)
 
     @staticmethod
-    def of(value: Tensor) -> KernelVisibility:
+    def from_parameters(value: Tensor) -> KernelVisibility:
         """Make it from the logit of `constant` and the logarithms of both lengths; differentiable."""
         return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
 
     def parameters(self, least: float, *shares: float) -> Tensor:
-        """Return what `of` reads, then the logits of more `shares`; all shares are at least `least`."""
+        """Return what `from_parameters` reads, then logits of more `shares`; all are at least `least`."""
         # A logit has no value at 0 and 1, and hardly a slope near them.
         clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
         first, *rest = (math.log(share / (1 - share)) for share in clipped)
         return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
 
-    def plain(self) -> KernelVisibility:
+    def to_floats(self) -> KernelVisibility:
         """Return it with numbers instead of tensors."""
         return KernelVisibility(float(self.constant), float(self.angle), float(self.length))
 
@@ -93,13 +94,13 @@ class Scene:
     log_amplitude: Tensor
     log_noise: float
     visibility: KernelVisibility = KernelVisibility()
-    clutter: Clutter = field(default_factory=Clutter.none)
+    clutter: Clutter = field(default_factory=Clutter.empty)
     phase: Tensor | None = None
     quadrature: float = 1.0
     noise_floor: float = JITTER
 
     @staticmethod
-    def direct(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
+    def from_static_end(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
         """Return the static end (3,) [m] alone, of log amplitude (1,)."""
         return Scene(transmitter, NO_PLANES, ((),), log_amplitude, log_noise)
 
@@ -156,11 +157,11 @@ class Scene:
         known = set(self.sequences)
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
-    def with_other_sequences(self, sequences: Iterable[Reflections]) -> Scene:
+    def replace_sequences(self, sequences: Iterable[Reflections]) -> Scene:
         """Return other sequences over the same planes, of gains that are not known."""
         return replace(self, sequences=tuple(sequences), phase=None)
 
-    def with_sequences(
+    def add_sequences(
         self, sequences: list[Reflections], amplitude: Tensor, phase: Tensor | None = None
     ) -> Scene:
         """Return more sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
@@ -171,7 +172,7 @@ class Scene:
             self, sequences=(*self.sequences, *sequences), log_amplitude=log_amplitude, phase=phase
         )
 
-    def only(self, indices: list[int], planes: Iterable[int] = ()) -> Scene:
+    def select_sources(self, indices: list[int], planes: Iterable[int] = ()) -> Scene:
         """Return the sources of these indices, and the planes that they use, or that are named."""
         sequences = [self.sequences[i] for i in indices]
         used = sorted({index for sequence in sequences for index in sequence}.union(planes))
@@ -181,7 +182,7 @@ class Scene:
             planes=self.planes[used],
             sequences=tuple(tuple(new[index] for index in sequence) for sequence in sequences),
             log_amplitude=self.log_amplitude[indices],
-            clutter=self.clutter.with_planes_renumbered(new),
+            clutter=self.clutter.renumber_planes(new),
             phase=None if self.phase is None else self.phase[indices],
         )
 

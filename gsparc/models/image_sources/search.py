@@ -25,7 +25,7 @@ from gsparc.models.image_sources.refine import (
     learn_visibility,
     refine_scene,
 )
-from gsparc.models.image_sources.rows import LEAST_ROWS, Rows, bounding_box
+from gsparc.models.image_sources.rows import LEAST_ROWS, Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
@@ -92,15 +92,16 @@ class Search:
         self.rows, self.settings, self.last_round = rows, settings, last_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
-        self.box = bounding_box(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
+        measured = torch.cat([rows.position, transmitter[None]])
+        self.box = torch.stack([measured.amin(0) - settings.margin, measured.amax(0) + settings.margin])
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
-        self.scene = Scene.direct(transmitter, loudness, math.log(NOISE))
+        self.scene = Scene.from_static_end(transmitter, loudness, math.log(NOISE))
         if found is not None and settings.order:
             places, amplitude = (each[: settings.max_sources - 1] for each in found)
             images = (places - transmitter).norm(dim=1) > 2 * orders.MIN_IMAGE_SHIFT_M
             planes = bisector(transmitter, places[images])
             words: list[Reflections] = [(i,) for i in range(len(planes))]
-            self.scene = replace(self.scene, planes=planes).with_sequences(words, amplitude[images])
+            self.scene = replace(self.scene, planes=planes).add_sequences(words, amplitude[images])
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
@@ -158,14 +159,14 @@ class Search:
     def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
         scene, most = self.scene, most or SEQUENCES_PER_ROUND
-        more = scene.with_other_sequences(scene.longer_sequences(self.settings.order))
+        more = scene.replace_sequences(scene.longer_sequences(self.settings.order))
         if not more.sequences:
             return 0
         scores, amplitude = likelihood_gain(Posterior(self.rows, scene), more.images(self.rows))
         apart = 0.5 * self.wavelength
         chosen = select_separated(more.sources, scores, apart, most, SEQUENCE_SCORE, scene.sources)
         if chosen:
-            self.scene = scene.with_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
+            self.scene = scene.add_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
     def _add_free(self) -> int:
@@ -185,7 +186,7 @@ class Search:
             for position, _, amplitude in found:
                 sequence, plane = self._parent(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
-                self.scene = replace(self.scene, planes=planes).with_sequences(
+                self.scene = replace(self.scene, planes=planes).add_sequences(
                     [(*sequence, len(planes) - 1)], amplitude[None]
                 )
             if found:
@@ -206,7 +207,7 @@ class Search:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
-        scene = self.scene.with_other_sequences((parent,))
+        scene = self.scene.replace_sequences((parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
     def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:

@@ -35,7 +35,7 @@ class LearnsTogether(MethodFactory):
     init: InitSettings
     own_terms: tuple[Columns, ...] = ()  # of one station's powers
 
-    def shares(self, site: Site) -> bool:
+    def learns_jointly(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
@@ -46,7 +46,7 @@ class LearnsTogether(MethodFactory):
         """See `Method.choose_stations`."""
         if self.own_terms:
             return "each", "model.terms are of one station"
-        if not self.shares(data.site) or self.init.name == "scene":
+        if not self.learns_jointly(data.site) or self.init.name == "scene":
             return "each", ""
         return choose_stations(data, fold, context)
 

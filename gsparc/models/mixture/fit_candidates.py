@@ -89,7 +89,7 @@ def fit_candidates(
                 field.held = _held(field, data, rows, groups)
             if field.held is not None:
                 target = in_error_unit(data.batch(field.held.rows).target, data.site)
-                one = Race.of(field.held.rows, in_error_unit(field.held.mean, data.site), target, note)
+                one = Race.from_mean(field.held.rows, in_error_unit(field.held.mean, data.site), target, note)
                 note(name, mean_square(one.missed))
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:
@@ -205,9 +205,9 @@ def weigh_process(
     left_out = left_out if spectra else None
     process = GaussianProcess()
     process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
-    if not field.size() or (left_out is None and len(fold.val) < LEAST_HELD):
+    if not field.count_components() or (left_out is None and len(fold.val) < LEAST_HELD):
         few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
-        log.info("%s: a Gaussian process alone", few if field.size() else "no Gaussians")
+        log.info("%s: a Gaussian process alone", few if field.count_components() else "no Gaussians")
         return (process, 1.0), None
     rows, explained, weight = [], None, 0.0
     val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
@@ -236,8 +236,8 @@ def weigh_process(
     return ((process, weight) if weight > 0 else None), explained
 
 
-def _left_out(left: LeftOut, distance: float | None) -> HeldOutPair:
+def _left_out(left_out: LeftOut, distance: float | None) -> HeldOutPair:
     """Training rows as far from what is left as held-out rows are, as field and process predict them."""
-    gap = left.nearest_gap(distance)
-    own, target = left.at(gap, left.predicted)
-    return HeldOutPair(own, left.at(gap, left.predict_by_process())[0], target)
+    gap = left_out.nearest_gap(distance)
+    own, target = left_out.pairs_at_gap(gap, left_out.predicted)
+    return HeldOutPair(own, left_out.pairs_at_gap(gap, left_out.predict_by_process())[0], target)

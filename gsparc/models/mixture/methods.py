@@ -27,7 +27,7 @@ class ImageSources(Mixture):
 
     name = "image_sources"
 
-    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+    def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`."""
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
@@ -44,7 +44,7 @@ class Channels(Mixture):
 
     name = "channels"
 
-    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+    def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; no phase tells of paths where rows have phases of their own."""
         return _named("aligned" if data.site.phase_reference == "neighbours" else "diffuse")
 
@@ -75,7 +75,7 @@ class Powers(Mixture):
         heeded.count_reads(*["model.terms"] * bool(self.own_terms))  # a tuple is not noted when it is read
         return super().fit(data, fold, replace(context, terms=self.own_terms))
 
-    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+    def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; `init=scene` is the process of one station that knows walls."""
         if self.init.name == "scene":
             return {"scene": CANDIDATES["powers"]}
@@ -94,7 +94,7 @@ class Bearings(Mixture):
 
     name = "bearings"
 
-    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+    def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`."""
         return _named("bearings", *["process"] * (self.plain and len(data) <= PROCESS_ROWS))
 

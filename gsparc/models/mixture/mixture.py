@@ -66,7 +66,7 @@ class Mixture(LearnsTogether, ClosedForm):
         check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
         self.switches, self.init = effects, init or InitSettings()
         self.position_std, self.residual_alone = position_std, residual_alone
-        self.runs = RunFactors.none()  # of channels, learned in the phase and level of the largest run
+        self.runs = RunFactors.identity()  # of channels, learned in the phase and level of the largest run
         self.members: list[ClosedForm] = []
         self.weights: tuple[float, ...] = ()  # (M,) of the mean, of sum 1
         self.started = ""  # names of members
@@ -74,7 +74,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.init_s: float | None = None
 
     @abstractmethod
-    def tries(self, data: Measurements) -> Mapping[str, Candidate]:
+    def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """Return candidates by name, weighed where they are several."""
 
     @abstractmethod
@@ -94,11 +94,11 @@ class Mixture(LearnsTogether, ClosedForm):
         Raises:
             ValueError: these measurements are of another kind, or the only initialiser cannot solve this.
         """
-        self.site, self.runs = data.site, RunFactors.none()
+        self.site, self.runs = data.site, RunFactors.identity()
         with heeded.set_apart():
             if (why := self.obstacle(data)) is not None:
                 raise ValueError(f"{self.name}: {why}")
-            parts = self.tries(data)
+            parts = self.list_candidates(data)
             named = self.init.name in ("auto", "diffuse", *parts)
             # An initialiser of another kind of site means nothing here: what this kind has is tried.
             name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
@@ -123,7 +123,7 @@ class Mixture(LearnsTogether, ClosedForm):
         # Files of the folder are of the second pass, which an interrupted run goes on with.
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
-        rows, by, note = refine_places(self, self.runs.aligned(data), std)
+        rows, by, note = refine_places(self, self.runs.align_channels(data), std)
         if by.any() and budget.is_spent():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
@@ -154,7 +154,7 @@ class Mixture(LearnsTogether, ClosedForm):
         log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
         self.runs = _runs(data, known, context)
-        data = self.runs.aligned(data)
+        data = self.runs.align_channels(data)
         stages = {"factors of runs": budget.counted.wall} if len(self.runs) > 1 else {}
         cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
         found, reports, read = fit_candidates.fit_candidates(
@@ -203,7 +203,7 @@ class Mixture(LearnsTogether, ClosedForm):
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
-        if self.only is None or not self.only.forgets:
+        if self.single is None or not self.single.forgets:
             return None
         # Deep, as members are conditioned in place and those of this method must stay as they are.
         result = copy.deepcopy(self)
@@ -217,7 +217,7 @@ class Mixture(LearnsTogether, ClosedForm):
         if not self.members:
             raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
         told = Prediction.joined([self._mean(part) for part in query.split(QUERY_CHUNK)])
-        return self.runs.restored(told, query.run)
+        return self.runs.restore_run(told, query.run)
 
     def _mean(self, query: Query) -> Prediction:
         """In the phase and level of the largest run."""
@@ -244,14 +244,14 @@ class Mixture(LearnsTogether, ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return self.only.process() if isinstance(self.only, HasProcess) else None
+        return self.single.process() if isinstance(self.single, HasProcess) else None
 
     def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `HasPaths`; of solutions that are made of paths each source once, by their weights in the mean.
 
         What other solutions and the residual add to channels is in no path.
         """
-        made = [(weight, one) for weight, one in self.parts() if isinstance(one, HasPaths)]
+        made = [(weight, one) for weight, one in self.weighted_members() if isinstance(one, HasPaths)]
         if not made:
             raise ValueError("its channels are not made of paths")
         gains, delays, units, carriers = zip(*(method.paths(query) for _, method in made), strict=True)
@@ -262,24 +262,24 @@ class Mixture(LearnsTogether, ClosedForm):
     # -- what it is made of --------------------------------------------------------------------------
 
     @property
-    def only(self) -> ClosedForm | None:
+    def single(self) -> ClosedForm | None:
         """Return the member, where it is one."""
         return self.members[0] if len(self.members) == 1 else None
 
     @property
     def reducible(self) -> Method | None:
         """See `Method.reducible`; what answers faster knows nothing of runs' factors."""
-        return self.only if len(self.runs) == 1 else None
+        return self.single if len(self.runs) == 1 else None
 
-    def parts(self) -> Iterator[tuple[float, ClosedForm]]:
+    def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""
         for weight, one in zip(self.weights, self.members, strict=True):
-            yield from ((weight * more, part) for more, part in one.parts())
+            yield from ((weight * more, part) for more, part in one.weighted_members())
 
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return self.name if self.only is None else self.only.label.replace(self.only.name, self.name, 1)
+        return self.name if self.single is None else self.single.label.replace(self.single.name, self.name, 1)
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -297,7 +297,7 @@ class Mixture(LearnsTogether, ClosedForm):
         terms = ", ".join(self.terms) or "a process alone"
         return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of Gaussians of all members."""
         return sum(member.count for member in self.members)
 
@@ -331,8 +331,8 @@ class Mixture(LearnsTogether, ClosedForm):
 
 def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFactors:
     """Factors of several runs of channels, by the waves that explain rows (n,); else none."""
-    if not RunFactors.several(data, known):
-        return RunFactors.none()
+    if not RunFactors.has_several_runs(data, known):
+        return RunFactors.identity()
     # Validation rows too: candidates are weighed by them in the phase of the same run.
     result = estimate_run_factors(data, known, context.time_budget())
     log.info("channels of %d runs: the factor of each was estimated by waves of all runs", len(result))

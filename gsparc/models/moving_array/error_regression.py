@@ -104,7 +104,7 @@ def fit_errors(
     distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
     near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
-    regression = RelativeErrorRegression.of(columns, relative_error)
+    regression = RelativeErrorRegression.from_rows(columns, relative_error)
     precision, farthest = _precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M)
     return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 
@@ -118,7 +118,7 @@ def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor
 def _precision(kernel: Kernel, places: Tensor) -> Tensor:
     """Inverse correlations (m, k, k) with noise, of rows at (m, k, 3) float64 [m]."""
     noise = max(kernel.noise, LEAST_NOISE) * torch.eye(places.shape[1], dtype=torch.float64)
-    return Factor.of(kernel.between(places, places) + noise, "raise").inverse
+    return Factor.from_gram(kernel.between(places, places) + noise, "raise").inverse
 
 
 def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ class Spectra:
         """Return places (n, 3) float32 [m]."""
         return torch.from_numpy(self.places).float()
 
-    def at(self, rows: np.ndarray) -> Spectra:
+    def subset(self, rows: np.ndarray) -> Spectra:
         """Return some of them."""
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
@@ -134,7 +134,8 @@ class MovingArrayField(Differentiable, ClosedForm):
         rows = _spread(len(positions), self.rest_rows)
         left, kernel = left_out_error(positions[rows], spectra.values[rows] - modelled[rows])
         self._complete(spectra, modelled, kernel, targets)
-        note = f"{self.name}: {self.size()} sources, leave-one-out error {left / targets[0].size:.4g}"
+        error, count = left / targets[0].size, self.count_components()
+        note = f"{self.name}: {count} sources, leave-one-out error {error:.4g}"
         fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
         return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
 
@@ -164,17 +165,17 @@ class MovingArrayField(Differentiable, ClosedForm):
         return exponent
 
     def _spectra(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
-        parts = [(self.lags().of(b**self.exponent), self.basis.of(b)) for b in self._blocks(targets)]
-        lags, values = (torch.cat(part) for part in zip(*parts, strict=True))
+        both = [(self.lags().to_lags(b**self.exponent), self.basis.project(b)) for b in self._blocks(targets)]
+        lags, values = (torch.cat(part) for part in zip(*both, strict=True))
         return Spectra(places, lags, values)
 
     def _find(self, spectra: Spectra) -> Tensor:
         """Sources (K, 3) [m]."""
         assert self.site is not None and self.site.grid is not None
-        some, static = spectra.at(_spread(len(spectra.places), self.search.rows)), self.site.static_position
-        first = None if static is None else torch.from_numpy(np.asarray(static)).float()
+        few, still = spectra.subset(_spread(len(spectra.places), self.search.rows)), self.site.static_position
+        first = None if still is None else torch.from_numpy(np.asarray(still)).float()
         return find_sources(
-            some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
+            few.lags, few.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
             self.seed, self._budget.is_spent,
         )  # fmt: skip
 
@@ -195,7 +196,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Images (n, R) of sources of powers (n, K)."""
         array = self.array()
         return torch.cat([
-            self.basis.of(array.render(sources, places, part))
+            self.basis.project(array.render(sources, places, part))
             for places, part in zip(spectra.receivers.split(BLOCK), power.split(BLOCK), strict=True)
         ])  # fmt: skip
 
@@ -203,10 +204,10 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Kernel of a trend, by leave-one-out error."""
         rows = _spread(len(spectra.places), self.trend.rows)
         # Lengths are shares of the site's diagonal, of 1 m where all rows are at one place.
-        some, diagonal = spectra.at(rows), float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0
+        some, diagonal = spectra.subset(rows), float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0
         errors = {}
         for length in self.trend.lengths:
-            kernel = Kernel.of_one(length * diagonal, self.trend.noise)
+            kernel = Kernel.from_length(length * diagonal, self.trend.noise)
             left = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
             missed = some.values - self._modelled(some, sources, left)
             errors[kernel] = left_out_error(some.places, missed)[0]
@@ -248,7 +249,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         """See `Differentiable`; `explained` are the sources' images alone."""
         query, errors = self.query(), self.errors
         if dtype == torch.float64:
-            query, errors = query.exact, to_double(errors)
+            query, errors = query.in_float64, to_double(errors)
         answer = query(queries)
         # Stored pixels lie in [0, 1]; sources and residual need not add up to such.
         mean = answer.image.clamp_(0, 1)
@@ -264,7 +265,7 @@ class MovingArrayField(Differentiable, ClosedForm):
             self._query = ImageRenderer(self.array(), self.basis, self.found, self.residual, places)
         return self._query
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of sources."""
         return len(self.found.sources) if "found" in vars(self) else 0
 

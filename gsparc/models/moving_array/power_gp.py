@@ -54,7 +54,7 @@ class PowerTrend(Stored):
 
 def solve_and_leave_out(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out residuals (n, K)."""
-    posterior = Exact.of(Prior(kernel), torch.from_numpy(places), values)
+    posterior = Exact.from_values(Prior(kernel), torch.from_numpy(places), values)
     return posterior.weights, left_out_residuals(posterior.factor.precision, posterior.weights)[0]
 
 

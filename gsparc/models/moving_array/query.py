@@ -40,7 +40,7 @@ class ReceivingArray:
 
     def __init__(self, space: SpectrumLags, rotation: Tensor, exponent: int, stride: int = 1) -> None:
         self.space, self.rotation, self.exponent = space, rotation, exponent
-        self._pixels = space.pixels if stride == 1 else space.pixels.thinned(stride)
+        self._pixels = space.pixels if stride == 1 else space.pixels.subsample_pixels(stride)
 
     def atoms(self, sources: Tensor, receivers: Tensor) -> Tensor:
         """Return lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
@@ -101,7 +101,7 @@ class ImageRenderer:
         return ImageAnswers(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
 
     @cached_property
-    def exact(self) -> ImageRenderer:
+    def in_float64(self) -> ImageRenderer:
         """The same in float64."""
         return to_double(self)
 
@@ -136,8 +136,8 @@ class ReducedMean(View):
 
     def __init__(self, inner: MovingArrayField, count: int, stride: int) -> None:
         super().__init__(inner)
-        basis = inner.basis if stride == 1 else inner.basis.thinned(stride)
-        residual = inner.residual.first(count)
+        basis = inner.basis if stride == 1 else inner.basis.subsample_pixels(stride)
+        residual = inner.residual.keep_axes(count)
         places = torch.from_numpy(inner.positions)
         self._query = ImageRenderer(inner.array(stride), basis, inner.found, residual, places)
         self._count = count
@@ -148,6 +148,6 @@ class ReducedMean(View):
         assert self.inner.site is not None
         return Prediction(self._query(query.places(self.inner.site)).image.clamp_(0, 1))
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of components kept."""
         return self._count

@@ -42,7 +42,7 @@ class Residual(Stored):
         """Return coefficients (m, R) of images at places `far` (m, n) [m] from the training receivers."""
         return torch.addmm(self.mean, self.kernel.correlation(far) @ self.weights, self.axes)
 
-    def first(self, count: int) -> Residual:
+    def keep_axes(self, count: int) -> Residual:
         """Return the process with the `count` axes that most is predicted along."""
         return Residual(self.kernel, self.mean, self.axes[:count], self.weights[:, :count].contiguous())
 

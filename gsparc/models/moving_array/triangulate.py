@@ -191,7 +191,7 @@ def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
     residual = {}
     for exponent in (2, 1):
         power = images**exponent
-        again = space.spectrum(space.of(power))
+        again = space.spectrum(space.to_lags(power))
         residual[exponent] = float((again - power).square().sum() / power.square().sum())
     exponent = min(residual, key=lambda e: residual[e])
     return exponent, residual[exponent]

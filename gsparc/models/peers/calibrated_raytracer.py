@@ -112,7 +112,7 @@ class CalibratedRayTracer(Method):
         apply_materials(tracer, start)
         # Paths are traced once: materials change what they carry, not where they run.
         replay = Replay(tracer, places, self._traced_effects())
-        traced = replay.powers()
+        traced = replay.received_powers()
         reached = traced > 0
         # Gain and scale of the residuals are learned at least: two unknowns.
         if reached.sum() < 2:

@@ -35,7 +35,7 @@ class Coder(Network):
         self.encoder = perceptron(2 * len(scene.site.uplink_hz), 2 * self.code, settings.hidden, 2, nn.GELU)
         self.decoder = perceptron(self.code, 2 * scene.shape[1], settings.hidden, 2, nn.GELU)
 
-    def coded(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def predict_downlink(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the downlink (B, K) and the code's divergence from a standard normal (B,)."""
         middle, log_variance = self.encoder(torch.view_as_real(uplink).flatten(1)).chunk(2, dim=1)
         code = middle if noise is None else middle + noise * (log_variance / 2).exp()
@@ -44,25 +44,25 @@ class Coder(Network):
         out = self.decoder(code)
         return torch.view_as_complex(out.view(len(out), -1, 2)), divergence
 
-    def heard(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
+    def normalise_uplink(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
         """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
         # Both bands lose alike along the path: the uplink's level carries over to the downlink.
         scale = root_mean_power(uplink)[:, None, None]
         return uplink[:, self.antennas] / scale, scale
 
-    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the mean squared error () of unit channels, and the code's divergence by its weight."""
         assert batch.uplink is not None
-        own, scale = self.heard(batch.uplink)
+        own, scale = self.normalise_uplink(batch.uplink)
         # As many antennas of snapshots as there are snapshots, whatever the array: steps cost alike.
-        pick = torch.randint(own.shape[0] * own.shape[1], (len(own),), generator=draw)
+        pick = torch.randint(own.shape[0] * own.shape[1], (len(own),), generator=generator)
         # Snapshots have arbitrary phase: rotating both ends augments the data.
-        angle = 2 * math.pi * torch.rand(len(own), 1, generator=draw)
+        angle = 2 * math.pi * torch.rand(len(own), 1, generator=generator)
         turn, noise = (
             torch.polar(torch.ones_like(angle), angle),
-            torch.randn(len(own), self.code, generator=draw),
+            torch.randn(len(own), self.code, generator=generator),
         )
-        guess, divergence = self.coded(own.flatten(0, 1)[pick] * turn, noise)
+        guess, divergence = self.predict_downlink(own.flatten(0, 1)[pick] * turn, noise)
         missed = guess - (batch.target / scale).flatten(0, 1)[pick] * turn
         return missed.abs().square().mean() + self.weight * divergence.mean()
 
@@ -95,7 +95,7 @@ class Fire(UplinkMethod, TrainedPeer):
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; of the uplink alone."""
-        network, uplink = self.fitted(), self.heard(query)
+        network, uplink = self.fitted(), self.query_uplinks(query)
         assert isinstance(network, Coder)
-        own, scale = network.heard(uplink)
-        return Prediction(network.coded(own.flatten(0, 1))[0].view(*own.shape[:2], -1) * scale)
+        own, scale = network.normalise_uplink(uplink)
+        return Prediction(network.predict_downlink(own.flatten(0, 1))[0].view(*own.shape[:2], -1) * scale)

@@ -71,10 +71,10 @@ class MarchedField(Network):
         wave = torch.polar(gain, turn.cumsum(1) - turn + phase[1])
         return magnitude(wave.sum(1).abs().square())
 
-    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Mean squared error () of rays drawn at random."""
-        sample = torch.randint(len(batch), (self.rays,), generator=draw)
-        pixel = torch.randint(len(self.directions), (self.rays,), generator=draw)
+        sample = torch.randint(len(batch), (self.rays,), generator=generator)
+        pixel = torch.randint(len(self.directions), (self.rays,), generator=generator)
         origin, heading = self._rays(batch.rx, sample, pixel)
         seen = self.march(origin, heading, self.scene.site.moving(batch.tx, batch.rx)[sample])
         error = (seen - batch.target.flatten(1)[sample, pixel]).square()

@@ -69,14 +69,14 @@ class DirectedRays(Network):
         best = share.topk(max(int((share >= 0.5).sum(1).max()), 1), dim=1)
         return self.precomputed["virtual"][best.indices], best.values >= 0.5
 
-    def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
+    def march(self, places: Tensor, goals: Tensor, likely: Tensor, rng: torch.Generator | None) -> Tensor:
         """Return channels (B,) of rays from places (B, 3) to goals (B, P, 3) [m], those likely (B, P)."""
         towards = goals - places[:, None]
         apart = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
         heading = towards / apart
         half = self.samples // 2
         shape = (*heading.shape[:2], half)
-        jitter = torch.full((2, *shape), 0.5) if draw is None else torch.rand((2, *shape), generator=draw)
+        jitter = torch.full((2, *shape), 0.5) if rng is None else torch.rand((2, *shape), generator=rng)
         steps = torch.arange(half)
         coarse = NEAR + (self.far - NEAR) * (steps + jitter[0]) / half
         fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
@@ -97,10 +97,10 @@ class DirectedRays(Network):
         places = torch.atleast_2d(rx.position)
         return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
 
-    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Mean squared error along measured directions."""
         places = torch.atleast_2d(batch.rx.position)
-        seen = self.march(places, *self.search(places, True), draw).view(-1, 1, 1)
+        seen = self.march(places, *self.search(places, True), generator).view(-1, 1, 1)
         return (seen - batch.target).abs().square().mean()
 
 

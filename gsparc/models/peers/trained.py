@@ -16,9 +16,8 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.gradient_stage import interruptible, make_trainer, read_trainer_result, requested_steps
-from gsparc.field.initial import Snapshot
-from gsparc.field.losses import task_loss
-from gsparc.field.module import LossSettings, NetworkModule
+from gsparc.field.losses import LossSettings, task_loss
+from gsparc.field.module import NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction
@@ -54,7 +53,7 @@ class Scene:
     def receiver(self) -> Pose | None:
         """Pose of the static receiver; None when it moves."""
         moves = self.site.static_end == "tx" or self.site.static_position is None
-        return None if moves else Query.at(self.site, self.box).rx
+        return None if moves else Query.from_places(self.site, self.box).rx
 
     @property
     def reach(self) -> float:
@@ -72,16 +71,15 @@ class Network(nn.Module):
         count: Gaussians, or virtual transmitters.
     """
 
-    ssim_weight = LossSettings().ssim_weight
-    snapshot: Snapshot = "none"
+    losses = LossSettings()
 
     def __init__(self, scene: Scene, count: int = 0) -> None:
         super().__init__()
         self.scene, self.count = scene, count
 
-    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Return the training loss () of a batch; `draw` for whatever is drawn at random."""
-        return task_loss(self(batch.tx, batch.rx), batch, self).mean()
+    def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
+        """Return the training loss () of a batch; `generator` for whatever is drawn at random."""
+        return task_loss(self(batch.tx, batch.rx), batch, self.losses).mean()
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
@@ -170,7 +168,7 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
-        origin = Origin.of(data, fold, context)
+        origin = Origin.from_fit(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
         asked = requested_steps(context, len(rows), self.max_steps)
         budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
@@ -208,7 +206,7 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.network
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of Gaussians or virtual transmitters; 0 without, and before `fit`."""
         return 0 if self.network is None else self.network.count
 

@@ -67,13 +67,6 @@ class PowerField(ClosedForm):
         self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
         self.decibels = np.zeros(0)
 
-    @classmethod
-    def of(cls, site: Site, prior: Prior) -> PowerField:
-        """Return one of known settings, to be conditioned."""
-        result = cls()
-        result.site, result.priors = site, ((1.0, prior),)
-        return result
-
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose settings by training and validation rows, and condition on these.
 
@@ -95,20 +88,20 @@ class PowerField(ClosedForm):
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, budget.effort.chosen_on
         # Checked once: a query has no time for it, nor has `torch.func`.
-        more = tuple(UserTerm.of(one, site).about(torch.from_numpy(seen.places)) for one in self.own_terms)
+        own = tuple(UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places)) for t in self.own_terms)
         if self.walls is not None:
             walls = walls_of_file(self.walls, site.origin, site.static_position)
             # A law goes through so few rows exactly, and leaves next to no variance.
             told = int((~seen.silent).sum()) >= LAW_NEEDS
-            rest = less_means(seen, more)
+            rest = less_means(seen, own)
             law, notes = fit_site_law(rest, site) if told else (None, ())
-            trend = about_terms(rest, replace(trend_about_rows(rest, law), more=(walls,)), more)
+            trend = about_terms(rest, replace(trend_about_rows(rest, law), more=(walls,)), own)
             best = choose_candidate(seen, [(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"
             note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
             return (note, *notes, *best.notes)
-        found, said = candidate_priors(seen, site, self.seed, chosen_on, more), list[str]()
+        found, said = candidate_priors(seen, site, self.seed, chosen_on, own), list[str]()
         self.priors = ((1.0, found[0].prior),)
         # A level that silent rows are below is no power that waves could be fitted to.
         if self.waves and not seen.silent.any() and resolves_wavelength(seen.places, site.wavelength):
@@ -116,7 +109,7 @@ class PowerField(ClosedForm):
             order = np.argsort(rows)
             assert site.wavelength is not None
             self.fringes, note = fit_fringes(
-                seen.at(order), rows[order], found[0].prior, site.wavelength, self.seed, budget
+                seen.subset(order), rows[order], found[0].prior, site.wavelength, self.seed, budget
             )
             said.append(note)
             if self.fringes is not None:  # their share was learned beside this process
@@ -136,9 +129,9 @@ class PowerField(ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return None if self.powers is None else self.powers.exact()
+        return None if self.powers is None else self.powers.with_exact_posterior()
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """See `ClosedForm.count`; coherent waves count as Gaussians of no extent, far away."""
         return 0 if self.fringes is None else len(self.fringes.weights)
 
@@ -160,7 +153,7 @@ class PowerField(ClosedForm):
         self.powers = replace(each[0][1], others=tuple(each[1:]))
         # The tree is of the rows before.
         self._tree = None
-        loud = seen.at(np.flatnonzero(~seen.silent))
+        loud = seen.subset(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
         if isinstance(nearest := self.powers.posterior, Nearest):
             # A silent row may lie at the same place; its noise is larger than any mean's.
@@ -180,7 +173,7 @@ class PowerField(ClosedForm):
             part.to(query.tx.dtype) for part in (mean, spread, share, explained)
         )
         power = self._power(mean)
-        explained_power = self._power(explained) if self.size() else None
+        explained_power = self._power(explained) if self.count_components() else None
         return Prediction(power, entry_variance(spread, power, "rssi"), share, explained_power)
 
     def left_out(self) -> LeftOutRows:
@@ -229,7 +222,7 @@ class PowerField(ClosedForm):
         if self.fringes is None:
             return mean, spread, share, mean
         mean, factor = self.fringes.add_fringes(mean, places, self._distance(places))
-        return mean, spread * factor, share, self.fringes.solutions(places).mean(1)
+        return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)
 
     def _distance(self, places: Tensor) -> Tensor:
         """From the nearest known row (B,) [m]."""

@@ -54,7 +54,7 @@ class Blend(Stored):
     share: tuple[float, float]
     left: tuple[float, float]
 
-    def at(self, distance: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
+    def share_and_inflation(self, distance: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
         """Return shares (n,) of the solutions, and factors (n,) of the process's variance."""
         near, far = self.distance
         # Linear between the two distances that were measured, constant beyond either.
@@ -93,7 +93,7 @@ class Fringes(Stored):
     def _mixed(self) -> Tensor:
         return torch.from_numpy(self.basis.mixture @ self.weights)
 
-    def solutions(self, places: Tensor) -> Tensor:
+    def solution_powers(self, places: Tensor) -> Tensor:
         """Return powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
         phase = places @ torch.from_numpy(self.basis.waves).T
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
@@ -107,7 +107,7 @@ class Fringes(Stored):
             places: (n, 3) [m].
             distance: (n,) to the nearest row that it knows [m].
         """
-        return self._shared(decibels, self.solutions(places).mean(1), distance)
+        return self._shared(decibels, self.solution_powers(places).mean(1), distance)
 
     def add_left_out_fringes(
         self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
@@ -115,11 +115,11 @@ class Fringes(Stored):
         """Return the same at rows (n,) by those solutions that never saw them or their surroundings."""
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
         fold = np.where(self.rows[at] == rows, self.fold[at], -1)
-        mean = _held_out_mean(self.solutions(places).numpy(), fold, self.blind)
+        mean = _held_out_mean(self.solution_powers(places).numpy(), fold, self.blind)
         return self._shared(decibels, torch.from_numpy(mean), distance)
 
     def _shared(self, decibels: Tensor, mean: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        share, factor = self.blend.at(distance, self.wavelength)
+        share, factor = self.blend.share_and_inflation(distance, self.wavelength)
         return decibels + share * (mean - decibels), factor
 
 
@@ -158,14 +158,14 @@ def fit_fringes(
     for k, part in enumerate(parts):
         fold[part] = k
     fold[order[:probes]] = -1
-    chosen = np.sort(order[: probes + count])
-    every, rows, numbers, group, fold = rows, rows.at(chosen), numbers[chosen], squares[chosen], fold[chosen]
+    kept = np.sort(order[: probes + count])
+    every, rows, numbers, group, fold = rows, rows.subset(kept), numbers[kept], squares[kept], fold[kept]
     level = float(to_decibels(from_decibels(rows.decibels).mean()))
     basis = make_basis(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
-    error, distance = (one[chosen] for one in _apart(every, [*parts, order[:probes]], plain, seed))
+    error, distance = (one[kept] for one in _apart(every, [*parts, order[:probes]], plain, seed))
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: ErrorGain | None = None
@@ -215,13 +215,13 @@ def _apart(
     Of all rows, as it will answer: at some of them alone it would seem worse than it is.
     """
     error, distance = np.zeros((2, len(rows.places)))
-    if many := len(rows.places) > MOST_ROWS:
-        dense = condition_on_nearest(prior, rows.means_at_places(), seed)
-        at = dense.near.tree.query(rows.places)[1]
+    if big := len(rows.places) > MOST_ROWS:
+        full = condition_on_nearest(prior, rows.means_at_places(), seed)
+        at = full.near.tree.query(rows.places)[1]
     for part in parts:
-        rest = np.setdiff1d(at, at[part]) if many else np.setdiff1d(np.arange(len(rows.places)), part)
+        fit = np.setdiff1d(at, at[part]) if big else np.setdiff1d(np.arange(len(rows.places)), part)
         known: Posterior = (
-            dense.at(rest, seed) if many else condition_on_powers(rows.at(rest), prior, seed)[0].posterior
+            full.subset(fit, seed) if big else condition_on_powers(rows.subset(fit), prior, seed)[0].posterior
         )
         places = torch.from_numpy(rows.places[part])
         error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]

@@ -57,7 +57,7 @@ class UserTerm(Columns):
     unit: float = 1.0
 
     @classmethod
-    def of(cls, term: Columns, site: Site) -> Self:
+    def from_site(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
         still = np.full_like(site.origin, np.nan) if site.static_position is None else site.static_position
         places = [torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)]
@@ -86,7 +86,7 @@ class UserTerm(Columns):
             raise ValueError(f"{gave}; a torch tensor ({len(places)}, Q) is needed")
         return result
 
-    def about(self, places: Tensor) -> Self:
+    def centre(self, places: Tensor) -> Self:
         """Return it centred at places (n, D) [m].
 
         Raises:
@@ -143,7 +143,7 @@ class LearnedWeights(str):
     numbers: np.ndarray
 
     @classmethod
-    def of(cls, name: str, numbers: np.ndarray, rest: str = "") -> Self:
+    def from_numbers(cls, name: str, numbers: np.ndarray, rest: str = "") -> Self:
         """Put them into words."""
         said = ", ".join(f"{w:.3g} +- {d:.2g}" for w, d in numbers[:2].T)
         result = cls(f"{name}: {said}{rest}")
@@ -166,7 +166,7 @@ def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[Learne
     order = [kinds[: k + 1].count(kind) for k, kind in enumerate(kinds)]
     names = [f"{kind} {n}" if kinds.count(kind) > 1 else kind for kind, n in zip(kinds, order, strict=True)]
     return [
-        LearnedWeights.of(name, one.prior[1] * part + [[one.prior[0]], [0]] * 2)
+        LearnedWeights.from_numbers(name, one.prior[1] * part + [[one.prior[0]], [0]] * 2)
         for name, one, part in zip(names, own, parts, strict=True)
     ]
 
@@ -195,6 +195,6 @@ def over_stations(notes: Sequence[str]) -> dict[str, str]:
         rest = f" (of {len(same)} stations, which differ by {', '.join(f'{b:.2g}' for b in between)}"
         if len(same) >= POOLED_FROM and len(mean) == 1:
             rest += f"; prior_db=[{mean[0]:.3g}, {np.hypot(error, between)[0]:.2g}] tells each of the others"
-        numbers = np.stack([mean, error, before[0], wide[0]])
-        result |= dict.fromkeys(same, LearnedWeights.of(key[0], numbers, f"{rest})" * (len(same) > 1)))
+        one = np.stack([mean, error, before[0], wide[0]])
+        result |= dict.fromkeys(same, LearnedWeights.from_numbers(key[0], one, f"{rest})" * (len(same) > 1)))
     return result

@@ -110,14 +110,14 @@ def candidate_priors(
     found = sorted(
         (choose_candidate(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score
     )
-    return found if rows.silent.any() else [*found, _kriged(rows.draw(chosen_on, seed), trends[0][0])]
+    return found if rows.silent.any() else [*found, _kriged(rows.draw_subset(chosen_on, seed), trends[0][0])]
 
 
 def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    found = fit_variogram(rows.places, rows.regression_about(trend)[2].numpy())
-    sill = max(found.sill, LEAST_SILL * found.total)
-    kernel = Kernel.of_one(found.range, max(found.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
+    fit = fit_variogram(rows.places, rows.regression_about(trend)[2].numpy())
+    sill = max(fit.sill, LEAST_SILL * fit.variance)
+    kernel = Kernel.from_length(fit.range, max(fit.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
 
 
@@ -131,7 +131,7 @@ def mix_candidates(
     """
     if len(found) == 1:
         return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
-    part = rows.draw(chosen_on, seed)
+    part = rows.draw_subset(chosen_on, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in found]
     # Of all rows: drawn ones are farther apart than those that will answer.
     gram = _relative([_among_rows(rows.measured, one.prior, seed) for one in found])
@@ -181,9 +181,9 @@ def _settings(
     rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows.heard.draw(chosen_on, seed)
-    few = loud.draw(COMPARED_ON, seed)
-    weighed = rows.draw(min(WEIGHED_ON, chosen_on), seed)
+    loud = rows.heard.draw_subset(chosen_on, seed)
+    few = loud.draw_subset(COMPARED_ON, seed)
+    weighed = rows.draw_subset(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     scores = [one.score for one in candidates]
@@ -226,8 +226,8 @@ def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ..
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
-        return Candidate(0.0, trend, Kernel.of_one(scale, 1e-2, amplitude), cost, notes)
-    starts = [Kernel.of_one(scale * share, 0.1) for share in SHARES]
+        return Candidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
+    starts = [Kernel.from_length(scale * share, 0.1) for share in SHARES]
     value, kernel = fit_kernel_by_left_out(starts, distance, terms, values)
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
@@ -243,8 +243,8 @@ def _searched(
 def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
     scale = float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
-    near = [Kernel.matern((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
-    return near + [Kernel.matern((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
+    near = [Kernel.from_lengths((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
+    return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
 
 
 def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
@@ -252,11 +252,11 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     distance, terms, values = rows.regression_about(one.trend)
     gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
     silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
-    known = ConditionalGaussian.of(gram, values[:, 0], silent)
+    known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
     used = ~rows.silent
     used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
-    return rows.at(np.flatnonzero(used))
+    return rows.subset(np.flatnonzero(used))
 
 
 def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
@@ -270,12 +270,12 @@ def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
     last: list[PseudoValues] = []
 
     def objective(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * covariance_of(one.kernel.at(at[:-1]), distance, terms)
+        gram = at[-1].exp() * covariance_of(one.kernel.with_values(at[:-1]), distance, terms)
         return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
     best, value = start, float(objective(torch.from_numpy(start)))
     if looks:
         best, value = minimise(objective, [start], bounds, looks, EVIDENCE_SETTLED)
-    kernel = replace(one.kernel.at(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
+    kernel = replace(one.kernel.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
     return replace(one, score=-value * len(values) - one.cost, kernel=kernel)

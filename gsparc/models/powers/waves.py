@@ -81,9 +81,9 @@ def fit_wave_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.G
     weights /= math.sqrt(float((np.abs(columns @ weights) ** 2).mean()))
     scale, damping = SCALE_DB, 1e-2
     for hidden in HIDDEN:
-        now = _Misfit.of(columns, decibels, weights, hidden, scale)
+        now = _Misfit.from_waves(columns, decibels, weights, hidden, scale)
         scale = now.scale()
-        now = _Misfit.of(columns, decibels, weights, hidden, scale)
+        now = _Misfit.from_waves(columns, decibels, weights, hidden, scale)
         for _ in range(STEPS if hidden else 2 * STEPS):
             result = _step(columns, single, decibels, now, hidden, scale, damping)
             if result is None:
@@ -107,7 +107,7 @@ class _Misfit:
     value: float
 
     @classmethod
-    def of(
+    def from_waves(
         cls, columns: np.ndarray, decibels: np.ndarray, weights: np.ndarray, hidden: float, scale: float
     ) -> _Misfit:
         field = columns @ weights
@@ -144,13 +144,13 @@ def _step(
         damped = normal.copy()
         damped[diagonal] += damping * middle
         try:
-            factor = Factor.of(torch.from_numpy(damped), "raise")
+            factor = Factor.from_gram(torch.from_numpy(damped), "raise")
         except NotDefiniteError:  # rounding: more damping mends it
             damping *= DAMPED
             continue
         by = -factor.solve(torch.from_numpy(right)[:, None])[:, 0].numpy()
-        better = _Misfit.of(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
-        if better.value < now.value:
-            return better, max(damping / 3, 1e-5)
+        new = _Misfit.from_waves(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
+        if new.value < now.value:
+            return new, max(damping / 3, 1e-5)
         damping *= DAMPED
     return None

@@ -95,7 +95,7 @@ class ImageEmissions:
     outputs: Tensor
     attenuation: Tensor | None
 
-    def at(self, rows: np.ndarray) -> ImageEmissions:
+    def subset(self, rows: np.ndarray) -> ImageEmissions:
         """Return the emissions of some rows (m,) alone."""
         attenuation = None if self.attenuation is None else self.attenuation[rows]
         return ImageEmissions(self.weights, self.images[rows], self.outputs[rows], attenuation)
@@ -144,7 +144,7 @@ def solve_emissions(
     features = whitened_features(places, process.prior.length, process.prior.noise, "matern32", len(own))
     inverse = features.weigh.mT @ features.weigh
     if model.error is not None:
-        model.error.set(*_errors(first, inverse, process.prior.noise, mean))
+        model.error.set_error_law(*_errors(first, inverse, process.prior.noise, mean))
     return _left_out(first, inverse, data.moving[own], mean)
 
 
@@ -154,7 +154,7 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
     batch = data.batch(rows)
     images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
-    emission = Factor.of(gram + ridge).solve(weights.mT @ images.mT).mT
+    emission = Factor.from_gram(gram + ridge).solve(weights.mT @ images.mT).mT
     distance = model.distances(batch.tx)
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
@@ -187,9 +187,9 @@ def _left_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: T
     gaps = np.array(GAPS) * spacing
     about = (seen.outputs - mean).numpy()
     means, _ = predict_left_out(inverse.numpy(), about, distance, centres, gaps)
-    some = ImageEmissions(seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation).at(
-        centres
-    )
+    some = ImageEmissions(
+        seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation
+    ).subset(centres)
     predicted = [some.rendered(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
     images = seen.images[:, pixels].double().numpy()
     return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())

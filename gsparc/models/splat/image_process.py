@@ -114,7 +114,7 @@ class ImageProcess(LearnedField):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        if self._average is not None and not self.size():
+        if self._average is not None and not self.count_components():
             return self._average[0].predict(query)
         own = super().predict(query)
         if self._average is None:
@@ -130,7 +130,7 @@ class ImageProcess(LearnedField):
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
-        process_only = self._average is not None and not self.size()
+        process_only = self._average is not None and not self.count_components()
         return None if process_only else super().gradient_problem()
 
     def reduced(self, settings: Settings, measured: dict[str, Any]) -> Method:  # type: ignore[override]
@@ -144,9 +144,9 @@ class ImageProcess(LearnedField):
         process, weight = self._average
         return average_with_process(result, process, partial(mix_means, weight=weight, site=self.site))
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of Gaussians."""
-        return 0 if self._alone else super().size()
+        return 0 if self._alone else super().count_components()
 
     @property
     def made(self) -> str:
@@ -156,7 +156,7 @@ class ImageProcess(LearnedField):
 
     def without_process(self) -> Method | None:
         """See `Method.without_process`."""
-        if self._average is None or not super().size():
+        if self._average is None or not super().count_components():
             return None
         alone = copy.copy(self)
         alone._average, alone._doubled = None, None

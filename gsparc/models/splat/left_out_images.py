@@ -45,11 +45,11 @@ class LeftOut(Stored):
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
         # Left singular vectors times singular values are scores in an orthonormal basis.
         kernel = choose_left_out_kernel(self.positions, vectors * lengths, len(mean))
-        inverse = Factor.of(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
+        inverse = Factor.from_gram(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
         return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
 
-    def at(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def pairs_at_gap(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return predictions and targets (n, P) at one gap, of the samples that anything is left for."""
         seen = ~np.isnan(predicted[gap]).any(1)
         return predicted[gap][seen], self.images[self.centres][seen]

@@ -29,8 +29,9 @@ from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
+from gsparc.field.losses import LossSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
-from gsparc.field.module import GaussianModule, LossSettings, squared_error
+from gsparc.field.module import GaussianModule, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
@@ -156,7 +157,7 @@ class LearnedField(Method):
         stage (`refit`) takes as many on training and validation rows together, because the baselines learn
         from all of them, with the confidence of the first.
         """
-        origin = Origin.of(data, fold, context)
+        origin = Origin.from_fit(data, fold, context)
         left = None if context.resume is None else read_interrupted(context.resume)
         if left is not None:
             origin.require_same(left)
@@ -177,8 +178,8 @@ class LearnedField(Method):
                 trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
             self._end(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
         self.frozen = self._doubled = None
-        what = f"final, {self.steps} of {self.steps_taken} steps kept"
-        context.log_curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=self.size())
+        what, count = f"final, {self.steps} of {self.steps_taken} steps kept", self.count_components()
+        context.log_curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=count)
         return FitReport(budget.counted.wall, limited_by=self._limited_by)
 
     def _begin(self, data: Measurements, fold: Fold, marks: Mapping[str, Any]) -> None:
@@ -203,12 +204,12 @@ class LearnedField(Method):
         self._billed, self._limited_by = Spent(), marks.get("limited_by")
 
     def _stages(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, left: Stored | None
+        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, resumed: Stored | None
     ) -> Iterator[Stage]:
         """Yield one stage after the other, each decided by what came of those before.
 
         Args:
-            left: by an interrupted run.
+            resumed: by an interrupted run.
         """
         assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
@@ -220,9 +221,9 @@ class LearnedField(Method):
             "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
             "in closed form" if solved else f"from init={self.choices.init}",
         )  # fmt: skip
-        refits = left is not None and left.extra.get("stage") == "refit"
-        if left is not None and refits:
-            self.restore(data.site, left.state)
+        refits = resumed is not None and resumed.extra.get("stage") == "refit"
+        if resumed is not None and refits:
+            self.restore(data.site, resumed.state)
         else:
             watching = not self.keep_best or len(watched.val) > 0 or not solved
             if steps and watching:
@@ -375,7 +376,7 @@ class LearnedField(Method):
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
-            model.error.set(*fit_error_law(result.unknown.numpy(), error.double().numpy()))
+            model.error.set_error_law(*fit_error_law(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -447,19 +448,16 @@ class LearnedField(Method):
     @torch.no_grad()
     def gaussians(self, query: Query) -> GaussianCloud:
         """See `HasGaussians`; their attenuated emissions."""
-        if self.model is None or not self.size():
+        if self.model is None or not self.count_components():
             raise ValueError(f"{self.name}: nothing here is rendered from Gaussians")
-        model, square = self.model, torch.zeros(self.size())
+        model, square = self.model, torch.zeros(self.count_components())
         for one in query.split(1):  # features of all would be gigabytes
             square += model.features(one.tx, one.rx)[0].square().sum(1)
         return model.gaussians.cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
 
     # -- what it can do besides ----------------------------------------------------------------------
 
-    def reduction_settings(self) -> tuple[str, ...]:
-        """See `Method.reduced`."""
-        return reduce.reduction_settings(self.fitted())
-
+    reduction_settings = reduce.reduction_settings
     reduction_inputs = reduce.reduction_inputs
     reduced = reduce.reduced
 
@@ -488,7 +486,7 @@ class LearnedField(Method):
         self.model.load_state_dict(state["model"])
         self.frozen = self._doubled = None
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of Gaussians."""
         return len(self.fitted().gaussians)
 

@@ -40,7 +40,7 @@ def root_mean_power(channels: Tensor) -> Tensor:
 class UplinkMethod(Method):
     """A method that needs the snapshot's own uplink; a position alone is no question to it."""
 
-    def heard(self, query: Query) -> Tensor:
+    def query_uplinks(self, query: Query) -> Tensor:
         """Return the uplinks (B, U, L) of a query.
 
         Raises:
@@ -59,7 +59,7 @@ class UplinkMethod(Method):
         """See `Method.gradient_problem`."""
         return "predictions follow from an uplink, not from a position"
 
-    def own(self, uplink: Tensor) -> Tensor:
+    def select_antennas(self, uplink: Tensor) -> Tensor:
         """Return those of uplinks (B, U, L) that are heard by the antennas that answer, (B, A, L)."""
         assert self.site is not None
         return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]

@@ -69,7 +69,7 @@ class UplinkField(UplinkMethod):
         self._prepare(self.site, replace(self.settings, leakage=best))
         # The search is not fitted to training rows: their errors are unbiased.
         rows = rng.permutation(fold.train)[: self.teachers]
-        self.error_model = RelativeErrorRegression.of(*self._training_errors(data, rows, rng, PIECES))
+        self.error_model = RelativeErrorRegression.from_rows(*self._training_errors(data, rows, rng, PIECES))
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
         return FitReport(started.spent, (note,))
 
@@ -108,7 +108,7 @@ class UplinkField(UplinkMethod):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; of the uplink alone."""
-        return self._predict_at(self.heard(query), query.noise_variance, self._downlink)
+        return self._predict_at(self.query_uplinks(query), query.noise_variance, self._downlink)
 
     def from_uplink_at(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
@@ -170,6 +170,6 @@ class UplinkField(UplinkMethod):
         said = state["error_model"]
         self.error_model = None if said is None else RelativeErrorRegression.read(said)
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """Return the number of sources of a snapshot."""
         return self.settings.rounds * self.settings.picks

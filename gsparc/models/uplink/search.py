@@ -70,7 +70,7 @@ class Sources:
     def error_variance(self, aperture: Aperture) -> Tensor:
         """Return the expected squared error per entry (B,) of `response`, to first order in the places."""
         count = self.gain.shape[1]
-        gram = Columns.of(self.direction, self.delay, aperture).gram()
+        gram = Columns.from_sources(self.direction, self.delay, aperture).gram()
         own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
         # Derivatives by directions and delays: of the gains, and of the steering vectors times the gains.
         gains = repeat_per_coordinate(self.gain)
@@ -159,7 +159,7 @@ class SourceSearch:
     def _fit(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
         """Best gains of given sources, and the gradient by their directions and delays."""
         n = delay.shape[1]
-        columns = Columns.of(direction, delay, self.aperture)
+        columns = Columns.from_sources(direction, delay, self.aperture)
         gram, inner = columns.gram(), columns.inner(y)
         torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
         cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
@@ -176,7 +176,7 @@ class SourceSearch:
         """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on the residual of the best gains."""
         n = fit.gain.shape[1]
         reach = self._reach(n)
-        factor = Factor.of(self._scaled(fit, noise), "ignore")
+        factor = Factor.from_gram(self._scaled(fit, noise), "ignore")
         step = factor.solve((fit.slope * reach)[..., None])[..., 0] * reach
         step = step.clamp(-LARGEST * reach, LARGEST * reach)
         return step[:, : 2 * n].view(-1, 2, n).transpose(1, 2), step[:, 2 * n :]

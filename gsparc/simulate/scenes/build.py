@@ -132,17 +132,17 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
     tracer, town, allowed = _load(scene, sampling)
     for note in () if town is None else town.notes:
         log.info("%s: %s", scene.file, note)
-    area = _area(scene, tracer.box()[:, :2] if town is None else town.box)
+    area = _area(scene, tracer.bounding_box()[:, :2] if town is None else town.box)
     ground = _around(scene, tracer, area) if allowed is None else Ground(allowed)
     georeference, streets = (None, ()) if town is None else (town.georeference, town.streets)
     # Heights of masts count from the highest surface, a roof where there is one.
-    masts = _stated(scene, tracer.height, georeference) or [_in_the_middle(tracer, ground, area)]
+    masts = _stated(scene, tracer.surface_height, georeference) or [_in_the_middle(tracer, ground, area)]
     placed = place_receivers(
         layout_from_config(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed,
         ground, streets, georeference,
     )  # fmt: skip
     # Copies that share the scene, which is loaded once.
-    engines = [tracer.at(mast.position, mast.antenna) for mast in masts]
+    engines = [tracer.with_transmitter(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
 
 
@@ -193,10 +193,10 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
         ValueError, SimulatorMissing: see `build_survey`.
     """
     tracer, town, _ = _load(scene, sampling)
-    masts = _stated(scene, tracer.height, None if town is None else town.georeference) or []
+    masts = _stated(scene, tracer.surface_height, None if town is None else town.georeference) or []
     here = [mast for mast in masts if np.linalg.norm(mast.position - transmitter) < SAME_PLACE_M]
     called = [mast for mast in here if name.endswith(mast.name)]
-    return tracer.at(transmitter, next((mast.antenna for mast in called or here), ISOTROPIC))
+    return tracer.with_transmitter(transmitter, next((mast.antenna for mast in called or here), ISOTROPIC))
 
 
 def _shoebox(scene: SceneSettings) -> Survey:
@@ -204,7 +204,7 @@ def _shoebox(scene: SceneSettings) -> Survey:
     assert scene.room is not None
     boxes = np.array(scene.room.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
     reflection = np.array(scene.room.get("reflection", -0.7), dtype=np.complex128)
-    room = Room.uniform(scene.room["size_m"], reflection, occluders=boxes)
+    room = Room.from_size(scene.room["size_m"], reflection, occluders=boxes)
     area = _area(scene, np.stack([np.zeros(2), np.array(scene.room["size_m"][:2], dtype=np.float64)]))
     middle = np.append(area.mean(0), CEILING * float(scene.room["size_m"][2]))
     masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
@@ -237,7 +237,7 @@ def _load(
         source = BUILDERS[scene.builder](scene.seed)
         # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
         allowed = stands_clear_of(source)
-    # At the origin for the time being: `at` puts a copy at each transmitter.
+    # At the origin for the time being: `with_transmitter` puts a copy at each transmitter.
     return RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering), town, allowed
 
 
@@ -265,9 +265,9 @@ def _in_the_middle(tracer: RayTracer, ground: Ground, area: np.ndarray) -> Trans
     """A transmitter where nobody states one."""
     middle = area.mean(0)
     if ground.open_sky:
-        high = float(tracer.height(middle[None])[0]) + MAST_M
+        high = float(tracer.surface_height(middle[None])[0]) + MAST_M
     else:
-        low, top = tracer.box()[:, 2]
+        low, top = tracer.bounding_box()[:, 2]
         high = float(low + CEILING * (top - low))
     position = np.round(np.append(middle, high), 1)
     log.info("no scene.transmitter_m: %s m taken, in the middle", position.tolist())
@@ -283,12 +283,12 @@ def _around(scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> Ground
     def lift(points: np.ndarray) -> np.ndarray:
         if over == "zero":
             return points
-        return points + [0.0, 0.0, 1.0] * tracer.height(points[:, :2])[:, None]
+        return points + [0.0, 0.0, 1.0] * tracer.surface_height(points[:, :2])[:, None]
 
     def allowed(points: np.ndarray) -> np.ndarray:
         free = tracer.clear_of_surfaces(points, CLEARANCE)
         if over == "ground":
-            free &= tracer.surface(points[:, :2])[1]
+            free &= tracer.highest_surface(points[:, :2])[1]
         return free & tracer.under_open_sky(points) if open_sky else free
 
     return Ground(allowed, lift, open_sky)

@@ -85,7 +85,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     fault = find_invalid_coordinate(degrees[:, 1], degrees[:, 0])
     if fault is not None:
         raise ValueError(f"scene.file={path}: {fault[1]}")
-    origin = Georeference.about(degrees[:, 1], degrees[:, 0])
+    origin = Georeference.from_coordinates(degrees[:, 1], degrees[:, 0])
     guesses: Counter[str] = Counter()
     meshes: dict[str, list[Any]] = {}
     for shape, tags in shapes:

@@ -32,7 +32,7 @@ def test_a_hall_is_learned_also_from_two_rows(name):
     known, asked = hall(300, 0), hall(100, 1)
     place, each_ms, fit_s = locate_by_neighbours(name, known, asked)
     assert np.median(np.linalg.norm(place - asked.place, axis=1)) < 1.2 and each_ms > 0 and fit_s > 0
-    assert np.isfinite(locate_by_neighbours(name, known.at(np.arange(2)), asked)[0]).all()
+    assert np.isfinite(locate_by_neighbours(name, known.subset(np.arange(2)), asked)[0]).all()
     silent = heard(np.full((4, 8), np.nan), known.place[:4])
     with pytest.raises(ValueError, match="no row that could be learned from holds a value"):
         locate_by_neighbours(name, silent, asked)
@@ -54,6 +54,6 @@ def test_weighted_neighbours_do_as_published_on_a_floor():
     """1.5 m is known of five neighbours."""
     rows = read_fingerprints(real("locate/wifine-floor4.npz"))
     train, test = split_fingerprints(rows, "walks", share=0.25)
-    known, heard = (fingerprint_snapshots(rows.at(part)) for part in (train, test))
+    known, heard = (fingerprint_snapshots(rows.subset(part)) for part in (train, test))
     place, *_ = locate_by_neighbours("weighted_knn", known, heard)
     assert 0.9 < np.median(np.linalg.norm(place - rows.position[test], axis=1)) < 1.6

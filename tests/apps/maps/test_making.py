@@ -37,7 +37,7 @@ def test_cells_hold_what_the_model_predicts(predictor):
     place = [found.grid.x[3], found.grid.y[5], 1.5]
     for number, name in enumerate(found.stations):
         assert found.power_db[number, 5, 3] == pytest.approx(
-            float(predictor.at(name).rssi(rx=place)[0]), abs=1e-3
+            float(predictor.select_station(name).rssi(rx=place)[0]), abs=1e-3
         )
     assert (found.lower_db < found.power_db).all() and (found.power_db < found.upper_db).all()
     west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]

@@ -20,11 +20,11 @@ def test_a_fade_is_said_to_be_one():
 
 
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
-    spectrum = predict_answer(spectrum_view.viewed.predictor_of(None), spectrum_view.starts(None))
+    spectrum = predict_answer(spectrum_view.viewed.predictor_of(None), spectrum_view.initial_places(None))
     assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None
     assert set(spectrum.ends) == {"tx", "rx"}
     name = power_view.viewed.stations[1]
-    asked, at = power_view.viewed.predictor_of(name), power_view.starts(name)
+    asked, at = power_view.viewed.predictor_of(name), power_view.initial_places(name)
     power = predict_answer(asked, at)
     assert power.level_db == pytest.approx(float(asked.rssi(**at)[0]), abs=1e-3)
     assert power.spread_db > 0 and power.spectrum is None

@@ -3,7 +3,7 @@
 import pytest
 
 from gsparc.commands.shared.cli import _message_of
-from gsparc.commands.shared.continued import with_settings_of_run
+from gsparc.commands.shared.continued import add_settings_of_run
 
 
 def test_a_launcher_s_lost_job_is_said_with_what_to_do():
@@ -33,9 +33,9 @@ def test_a_run_to_go_on_from_brings_its_settings(tmp_path, of, words, kept):
     (notes / "overrides.yaml").write_text(told)
     (notes / "hydra.yaml").write_text(HYDRA.replace("WHERE", str(tmp_path)))  # where the run was started
     line = [f"ckpt_path={tmp_path / of}", *words]
-    assert with_settings_of_run(line) == [*(one.replace("DATA", str(data)) for one in kept), *line]
+    assert add_settings_of_run(line) == [*(one.replace("DATA", str(data)) for one in kept), *line]
 
 
 def test_a_command_line_without_a_run_to_go_on_from_stays(tmp_path):
     for line in (["model=gp"], ["ckpt_path=null"], [f"ckpt_path={tmp_path / 'gone.ckpt'}", "seed=1"]):
-        assert with_settings_of_run(line) == line
+        assert add_settings_of_run(line) == line

@@ -101,11 +101,11 @@ def test_splits_hold_out_whole_units():
 
 
 def test_columns_are_those_of_another_campaign():
-    rows = invented().at(np.arange(5)).of_access_points(np.array(["c", "z", "a"]))
+    rows = invented().subset(np.arange(5)).select_access_points(np.array(["c", "z", "a"]))
     np.testing.assert_array_equal(rows.level[:, [2, 0]], invented().level[:5][:, [0, 2]])
     assert np.isnan(rows.level[:, 1]).all() and rows.level.dtype == np.float32
     with pytest.raises(DataError, match="no access point of"):
-        rows.of_access_points(np.array(["y"]))
+        rows.select_access_points(np.array(["y"]))
 
 
 @pytest.mark.parametrize(

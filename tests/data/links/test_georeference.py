@@ -30,7 +30,7 @@ def test_known_lengths():
 
 
 def test_the_antimeridian_and_the_poles_are_places():
-    origin = Georeference.about([10.0, 10.0, 10.0], [179.999, -179.999, -179.998])
+    origin = Georeference.from_coordinates([10.0, 10.0, 10.0], [179.999, -179.999, -179.998])
     assert abs(origin.longitude) > 179.9
     xy = origin.from_degrees([10.0, 10.0], [179.999, -179.999])
     assert np.linalg.norm(xy[1] - xy[0]) == pytest.approx(219.2, abs=0.3)
@@ -42,7 +42,7 @@ def test_the_antimeridian_and_the_poles_are_places():
 
 
 def test_the_origin_is_the_rounded_median():
-    origin = Georeference.about([40.76521977, 40.7, 40.8], [-111.83475621, -111.0, -112.0])
+    origin = Georeference.from_coordinates([40.76521977, 40.7, 40.8], [-111.83475621, -111.0, -112.0])
     assert origin == Georeference(40.7652, -111.8348)
     assert pickle.loads(pickle.dumps(origin)) == origin
 
@@ -60,7 +60,7 @@ def test_what_is_not_on_earth_is_refused(latitude, longitude, said):
     with pytest.raises(DataError, match=said):
         Georeference(0, 0).from_degrees([latitude], [longitude])
     with pytest.raises(DataError, match=said):
-        Georeference.about([latitude], [longitude])
+        Georeference.from_coordinates([latitude], [longitude])
 
 
 def test_local_coordinates_that_are_none_are_refused():
@@ -68,4 +68,4 @@ def test_local_coordinates_that_are_none_are_refused():
         with pytest.raises(DataError, match="local coordinates"):
             Georeference(0, 0).to_degrees(np.asarray(xy))
     with pytest.raises(DataError, match="no places"):
-        Georeference.about(np.zeros(0), np.zeros(0))
+        Georeference.from_coordinates(np.zeros(0), np.zeros(0))

@@ -114,7 +114,7 @@ def of(file, *words) -> State:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
     begun = read_inputs(config)
-    return State.of(config, measurements_hash(begun.module.measurements), begun.split.sha256)
+    return State.from_config(config, measurements_hash(begun.module.measurements), begun.split.sha256)
 
 
 def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
@@ -180,7 +180,9 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     walls, states = tmp_path / "walls.yaml", []
     for text in ("[]", "[1]"):
         walls.write_text(text)
-        states.append(State.of(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)})))
+        states.append(
+            State.from_config(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)}))
+        )
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
 

@@ -17,7 +17,7 @@ def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, 
     def outcome():
         context = fold_contexts(FitContext(tmp_path), split)
         keep = lambda number, *unused: kept.append(number)  # noqa: E731
-        return fit_folds(method_class("gp")(), data, split, context, keep=keep).with_scores(data, split)
+        return fit_folds(method_class("gp")(), data, split, context, keep=keep).score_on(data, split)
 
     here = outcome()
     elsewhere("joblib")

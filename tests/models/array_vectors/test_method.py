@@ -82,7 +82,7 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     torch.testing.assert_close(seen, twins)
     mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
     mixed[::3] = twin_vectors(mixed[::3], partner)
-    kernel = Kernel.of_one(0.2, 1e-3, term=SmoothRough)
+    kernel = Kernel.from_length(0.2, 1e-3, term=SmoothRough)
     inverse = np.linalg.inv(kernel.gram(torch.from_numpy(data.tx)).numpy())
     vectors = align_by_likelihood(mixed, data.tx, partner, kernel)
     left_out = vectors - (inverse @ vectors) / np.diag(inverse)[:, None]
@@ -99,7 +99,7 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
 
     data, truth = known_campaign
     x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
-    kernel, at = Kernel.of_one(0.15, 0.01, term=SmoothRough), torch.from_numpy(x)
+    kernel, at = Kernel.from_length(0.15, 0.01, term=SmoothRough), torch.from_numpy(x)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
     samples = cross_validation._Samples(

@@ -70,7 +70,7 @@ def test_outliers_bend_little():
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_rows_give_a_usual_law(count):
-    law = fit_law(rows_of().at(np.arange(count)), STILL)
+    law = fit_law(rows_of().subset(np.arange(count)), STILL)
     assert EXPONENTS[0] <= law.exponent <= EXPONENTS[1] and np.isfinite([law.level, law_variance(law)]).all()
 
 

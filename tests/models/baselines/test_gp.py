@@ -26,7 +26,7 @@ def test_chosen_kernel_is_a_minimum(campaign):
     places = torch.from_numpy(data.moving)
     at = {
         step: LeftOutDensity.apply(
-            Kernel.of_one(kernel.length * step, kernel.noise).gram(places), scores, 288, False
+            Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores, 288, False
         )[0]
         for step in (0.8, 1.0, 1.25)
     }

@@ -40,7 +40,7 @@ def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind,
     again = method_class(name)()
     again.restore(data.site, method.state())
     assert torch.equal(again.predict(batch).mean, found.mean)
-    assert again.size() == len(fold.train) + len(fold.val)
+    assert again.count_components() == len(fold.train) + len(fold.val)
     for value in (found.confidence, found.variance):
         assert value is None or (value.shape == (len(batch),) and (value >= 0).all())
 

@@ -132,7 +132,7 @@ def test_runs_are_brought_together(dense, runs):
     )
     assert known < 1.5 * one < 0.5 * other, (one, known, other)
     assert notes[1].startswith("complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: ")
-    ratio = method.runs.of(torch.tensor([5, 6, 7])).numpy() / FACTORS
+    ratio = method.runs.look_up(torch.tensor([5, 6, 7])).numpy() / FACTORS
     assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
 
 

@@ -67,11 +67,11 @@ def _bare(data):
 def test_a_probe_gains_what_the_likelihood_rises():
     groups, prior = _bare(_data(*_site([WALL], ends=1)))
     group, level = groups[0], 0.2
-    probe = Probe.of(compress_groups(groups, prior)[0], prior)
+    probe = Probe.from_group(compress_groups(groups, prior)[0], prior)
     covariance = prior.of_groups(groups)[0] + prior.disturbance(group)
     waves = torch.randn(2, len(group), dtype=torch.complex128, generator=torch.manual_seed(0))
     for _ in range(2):  # alone, then beside the first
-        for wave, gain in zip(waves, probe.gain(waves, level), strict=True):
+        for wave, gain in zip(waves, probe.likelihood_gain(waves, level), strict=True):
             more = covariance + level * wave[:, None] * wave.conj()[None]
             fits = [
                 (group.target.mH @ torch.linalg.solve(c, group.target)).real.sum() for c in (covariance, more)
@@ -80,7 +80,7 @@ def test_a_probe_gains_what_the_likelihood_rises():
             rise = (fits[0] - fits[1]) / probe.scale + sizes[0] - sizes[1]
             torch.testing.assert_close(gain, rise, rtol=1e-4, atol=1e-3)
         covariance = covariance + level * waves[0][:, None] * waves[0].conj()[None]
-        probe = probe.with_wave(waves[0], level)
+        probe = probe.add_wave(waves[0], level)
 
 
 def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
@@ -105,7 +105,7 @@ def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
     plane = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 3.0]], dtype=torch.float64)
     (group, *_), prior = _bare(_data(*_site([WALL], ends=1)))
     frame, slot = replace(prior.frame, middle=torch.zeros(3).double()), replace(group.slot, end=plane[0, :3])
-    waves = Images.of(frame, plane).waves(replace(group, slot=slot))
+    waves = Images.from_planes(frame, plane).waves(replace(group, slot=slot))
     assert waves.abs().sum(1).bool().tolist() == [False, True]
 
 
@@ -115,8 +115,8 @@ def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
     wavenumber = 2 * np.pi * carrier / 299792458.0
     place = np.c_[rng.uniform(1.5, 4.5, 110), rng.uniform(1, 3, 110), rng.uniform(0.8, 1.1, 110)]
     end = np.c_[rng.uniform(0.4, 5.6, 12), rng.uniform(0.4, 3.6, 12), np.full(12, 2.3)]
-    mirror = mirror_images(Room.uniform(size, -0.6), 2)
-    away = np.linalg.norm(place[:, None, None] - mirror.of(end)[None], axis=-1)
+    mirror = mirror_images(Room.from_size(size, -0.6), 2)
+    away = np.linalg.norm(place[:, None, None] - mirror.mirror_points(end)[None], axis=-1)
     channel = (np.exp(-1j * wavenumber * away) / away) @ mirror.gain
     heard = np.arange(9)
     data = _data(end[heard], place, channel[:, heard], carrier)

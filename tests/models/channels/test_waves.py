@@ -77,7 +77,7 @@ def _whole(data, **terms):
 
 
 def _signal(prior, a, b):
-    return next(prior.together([a], [b]))
+    return next(prior.end_covariances([a], [b]))
 
 
 def test_isotropic_term_alone_is_the_plain_process():
@@ -98,7 +98,7 @@ def test_isotropic_term_alone_is_the_plain_process():
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
     torch.testing.assert_close(after.variance, before.variance * level, rtol=2e-3, atol=1e-6)
     torch.testing.assert_close(1 - after.unknown, before.confidence, rtol=2e-3, atol=1e-4)
-    left, _ = plain._fitted().residual()
+    left, _ = plain._fitted().left_out_residual()
     own = torch.from_numpy(data.target[field.rows]) - field.left_out().mean
     torch.testing.assert_close(own.flatten(), left.flatten().to(own.dtype), rtol=1e-3, atol=1e-4)
 
@@ -222,7 +222,7 @@ def test_variances_have_the_digits_they_need(noise, plain):
     white = torch.linalg.solve_triangular(known.given.factor.lower, cross.mH, upper=False)
     exact = white.abs().square().sum(0)
     assert known.root.dtype == (dtype if plain else dtype.to_complex())
-    assert (known.learned(cross) - exact).abs().max() < 2e-3 * noise + 1e-10
+    assert (known.explained_variance(cross) - exact).abs().max() < 2e-3 * noise + 1e-10
 
 
 def test_directions_in_blocks_are_those_at_once(monkeypatch):

@@ -85,7 +85,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
     term, slots = field.prior[Directions], [one.group.slot for one in field.weights]
     places = field.weights[0].group.places[:10]
     ends = [SlotPlaces(slot, places) for slot in slots]
-    powers, together = term.of(slots), list(term.together(ends, ends))
+    powers, together = term.powers_at_ends(slots), list(term.end_covariances(ends, ends))
     for number in (0, 3):
         alone = term.covariance(ends[number], ends[number])
         torch.testing.assert_close(together[number], alone)
@@ -148,7 +148,7 @@ def test_stations_together_are_asked_for_any_pair():
     for one in (method, again):
         asked = Predictor(one, data.site)
         own = asked.csi(tx=here, rx=places[1])
-        np.testing.assert_allclose(asked.at(1).csi(tx=here), own, rtol=1e-5)
+        np.testing.assert_allclose(asked.select_station(1).csi(tx=here), own, rtol=1e-5)
         elsewhere = asked.predict(tx=here[None].repeat(2, 0), rx=places[[1, 3]])
         assert elsewhere.confidence[0] > elsewhere.confidence[1] + 0.2
     batch = data.batch(rows[:40])

@@ -111,7 +111,7 @@ def test_visibility_is_predicted_without_the_receiver():
     rng = np.random.default_rng(0)
     places = torch.from_numpy(rng.uniform(0, 4, (30, 3)))
     seen = torch.stack([(places[:, 0] < 2).double(), torch.ones(30, dtype=torch.float64)], 1)
-    fitted = VisibilityGP.of(places, seen)
+    fitted = VisibilityGP.from_visibility(places, seen)
     assert torch.equal(fitted.left_out[:, 1], torch.ones(30, dtype=torch.float64))
     right = (fitted.left_out[:, 0].round() == seen[:, 0]).double().mean()
     assert float(right) > 0.85
@@ -162,7 +162,7 @@ def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
 def test_missing_and_spurious_rays_neither_add_nor_remove_sources():
     data, fold, _ = directed(60, pillar=True)
     method, note = fitted(add_direction_errors(data, 1.0, seed=1, missing=0.1, false=0.1), fold)
-    assert method.size() == 7 and " 0 visibility entries" not in note
+    assert method.count_components() == 7 and " 0 visibility entries" not in note
     assert error(method, data, fold.test) < 0.08  # rays alone: 0.17
 
 
@@ -178,7 +178,7 @@ def test_a_channel_restores_a_missed_ray():
     probability = torch.full((20, 4), 0.75)
     flip = entries_to_flip(rays, rates.odds(rays, probability), left, torch.full((20,), 1e-3), one)
     assert torch.equal(flip, (truth - rays).bool())
-    estimated = RayErrorRates.of(rays, truth)
+    estimated = RayErrorRates.from_visibility(rays, truth)
     assert abs(estimated.missed - 0.25) < 1e-6 and estimated.spurious == 1e-3
     # no neighbour sees it and the residual is zero: noise adds no visibility
     quiet = entries_to_flip(rays, rates.odds(rays, 0 * probability), 0 * left, torch.ones(20), one)
@@ -189,7 +189,7 @@ def test_a_channel_restores_a_missed_ray():
 def test_where_every_ray_was_wrong_the_odds_divided_by_zero(seen):
     """One channel of 80 dB too much hides all sources from all receivers: a share of one has no odds."""
     rays, truth = torch.full((4, 2), 1 - seen), torch.full((4, 2), seen)
-    assert torch.isfinite(RayErrorRates.of(rays, truth).odds(rays, 0.5 * torch.ones(4, 2))).all()
+    assert torch.isfinite(RayErrorRates.from_visibility(rays, truth).odds(rays, 0.5 * torch.ones(4, 2))).all()
 
 
 def test_sources_that_errors_blur_are_told_from_sharp_ones():

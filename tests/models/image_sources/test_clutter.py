@@ -76,7 +76,7 @@ def test_a_box_hides_what_the_exact_simulator_says():
     scene = _scene(_boxed(_box()), order=2)
     places = torch.from_numpy(told.rx.copy())
     seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes).T.numpy()
-    true = told.images.of(told.tx[0])
+    true = told.images.mirror_points(told.tx[0])
     at_noise_floor = 0.0
     for k, source in enumerate(scene.sources.numpy()):
         image = np.linalg.norm(true - source, axis=1).argmin()
@@ -113,14 +113,14 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
 
 def test_batched_queries_and_variance_include_clutter():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
-    scenes = [_scene(_boxed(_box())), _scene(Clutter.none())]
+    scenes = [_scene(_boxed(_box())), _scene(Clutter.empty())]
     members = [Posterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
     queries = _rows(6, seed=5).position
     tone = torch.tensor([2.4e9], dtype=torch.float64)
     means, variance, _ = EnsembleMeans(members).means(queries, tone)
     for member, mean in zip(members, means, strict=True):
         asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
-        waves = member.scene.with_other_sequences(member.scene.sequences).unobstructed_waves(asked)
+        waves = member.scene.replace_sequences(member.scene.sequences).unobstructed_waves(asked)
         expected = (waves[:, :, None] * gains(member, queries)).sum(1)
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
     bare = EnsembleMeans(members[1:]).means(queries, tone)[1]
@@ -166,7 +166,7 @@ def test_the_pillar_is_found_by_its_shadow():
 
 def _bare(sources: int = 7) -> Scene:
     """A shoebox of known phases without clutter."""
-    return phased(_scene(Clutter.none()), torch.zeros(sources))
+    return phased(_scene(Clutter.empty()), torch.zeros(sources))
 
 
 def _unexplained(rows: Rows, start: Scene) -> UnexplainedRows:
@@ -241,7 +241,7 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finite_mirrors, "_raster", nothing)
         patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
-        find_small_mirrors(replace(left, room=room, scene=left.scene.only([0, 1])), 3)
+        find_small_mirrors(replace(left, room=room, scene=left.scene.select_sources([0, 1])), 3)
     count = sum(planes for planes, _ in cells) * math.prod(
         finite_mirrors._cells(room, plane_tangents(WALLS[0]), cells[0][1])
     )
@@ -265,7 +265,7 @@ def test_an_infinite_mirror_becomes_finite():
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
     true = Scene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
     rows = _truth(true, _rows(250))
-    start = phased(replace(true, clutter=Clutter.none()), torch.zeros(10))
+    start = phased(replace(true, clutter=Clutter.empty()), torch.zeros(10))
     left = _unexplained(rows, start)
     patch, score = find_patch(left, 6)
     assert score > 10
@@ -280,7 +280,7 @@ def test_a_pillar_is_clutter_and_an_empty_room_has_none(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():
         monkeypatch.setattr(search, name, value)
-    for clutter, boxes in ((_boxed(_box()), True), (Clutter.none(), False)):
+    for clutter, boxes in ((_boxed(_box()), True), (Clutter.empty(), False)):
         rows = _truth(_scene(clutter), _rows(150))
         start = _bare()
         found = find_clutter(rows, start, generator)
@@ -291,12 +291,12 @@ def test_a_pillar_is_clutter_and_an_empty_room_has_none(monkeypatch):
 
 
 def test_walls_of_equal_phase_shift_give_a_phase_prior():
-    scene = _scene(Clutter.none())
+    scene = _scene(Clutter.empty())
     phase = torch.tensor([0.3, *[0.3 + np.pi] * 6]) + 0.1 * torch.tensor([0.0, 1, -1, 1, -1, 1, -1])
-    phase_prior = ReflectionPhasePrior.of(phased(scene, phase))
+    phase_prior = ReflectionPhasePrior.from_scene(phased(scene, phase))
     assert phase_prior.turn == pytest.approx(np.pi)
     assert phase_prior.concentration > 3
     expected = phase_prior.expected(phase[0], ((0, 1),))
     assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
     scattered = phased(scene, torch.arange(7.0) * 2.1)
-    assert ReflectionPhasePrior.of(scattered).concentration < phase_prior.concentration
+    assert ReflectionPhasePrior.from_scene(scattered).concentration < phase_prior.concentration

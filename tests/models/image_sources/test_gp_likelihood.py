@@ -55,8 +55,10 @@ def test_covariance_by_the_formula():
 
 
 def test_without_a_source_is_the_scene_less_that_source_and_its_plane():
-    rows, less = _rows(), _scene().only([0, 1])
-    assert Posterior(rows, _scene()).without(2) == pytest.approx(Posterior(rows, less).nll, rel=1e-5)
+    rows, less = _rows(), _scene().select_sources([0, 1])
+    assert Posterior(rows, _scene()).nll_without_source(2) == pytest.approx(
+        Posterior(rows, less).nll, rel=1e-5
+    )
     assert less.sequences == ((), (0,)) and len(less.planes) == 1
 
 

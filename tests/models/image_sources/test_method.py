@@ -35,7 +35,7 @@ def _predicted(method, data, index):
 
 def found_share(method, told, within=0.1, order=2):
     """Share of the true sources of at most `order` reflections that every search found."""
-    true = told.images.of(told.tx[0])[told.images.order <= order]
+    true = told.images.mirror_points(told.tx[0])[told.images.order <= order]
     shares = []
     for member in method.members:
         places = (member.scene.sources + method.frame.middle).numpy() + method.site.origin
@@ -53,7 +53,7 @@ def small(tmp_path_factory):
 
 def test_first_order_images_are_found_and_the_channel_extrapolates(small):
     told, data, fold, method, report = small
-    assert found_share(method, told, order=1) == 1.0 and method.size() >= 7
+    assert found_share(method, told, order=1) == 1.0 and method.count_components() >= 7
     assert "1 of 1 searches" in report.notes[0] and report.seconds > 0
     assert error(method, data, fold.test) < 0.01
 
@@ -95,7 +95,9 @@ def test_a_reflection_that_two_solutions_found_was_two_paths(small):
     model.site, model.members, model.weights = data.site, [method, other], (0.6, 0.4)
     predictor, world = Predictor(model, data.site), data.moving[fold.test[:5]] + data.site.origin
     channel, found = predictor.csi(rx=world), predictor.paths(rx=world)
-    assert found.direction.shape[1] == found.gain.shape[2] == found.delay_s.shape[2] == method.size()
+    assert (
+        found.direction.shape[1] == found.gain.shape[2] == found.delay_s.shape[2] == method.count_components()
+    )
     summed = found.channel(data.site.subcarriers_hz)
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
 
@@ -123,7 +125,7 @@ def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, m
     method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
     group, looks = fold.train[::3], []
     target = data.batch(group).target
-    another = Race.of(group, 1.1 * target, target, lambda *look: looks.append(look))
+    another = Race.from_mean(group, 1.1 * target, target, lambda *look: looks.append(look))
     with pytest.raises(FellBehind, match="of the energy of rows held out"):
         method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=another))
     assert looks and all(what.endswith("sources") and error > 0 for what, error in looks)
@@ -203,7 +205,7 @@ def test_scatterers_are_found_beside_images(tmp_path):
     data = from_arrays(arrays)
     method, _ = fitted(data, fold, tmp_path, clutter=False, search_rows=220, margin=4.0)
     places = (method.members[0].scene.sources + method.frame.middle).numpy() + data.site.origin
-    images = told.images.of(told.tx[0])[told.images.order == 1]
+    images = told.images.mirror_points(told.tx[0])[told.images.order == 1]
     for wanted, within in ((true, 0.1), (images, 0.3)):
         assert (np.linalg.norm(wanted[:, None] - places[None], axis=-1).min(1) < within * WAVELENGTH).all()
     assert error(method, data, fold.test) < 0.01

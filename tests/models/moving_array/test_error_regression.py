@@ -8,7 +8,7 @@ from distances import far
 from gsparc.models.moving_array.error_regression import ImageErrors, _variance, fit_errors
 from gsparc.processes.kernel import Kernel
 
-KERNEL, REACH, PRIOR = Kernel.of_one(1.0, 0.1), 2.0, 0.05
+KERNEL, REACH, PRIOR = Kernel.from_length(1.0, 0.1), 2.0, 0.05
 
 
 def fit(places, errors, observed):

@@ -71,7 +71,7 @@ def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
     posterior = field.predict(batch)
     explained, mean, energy, _ = field.query()(batch.places(data.site))
     torch.testing.assert_close(posterior.explained, explained.clamp(0, 1))
-    added = field.basis.of(mean - explained)
+    added = field.basis.project(mean - explained)
     torch.testing.assert_close(added.square().sum(1), energy, rtol=1e-3, atol=1e-6)
     whole = (explained + field.basis.images(added)).clamp(0, 1)
     torch.testing.assert_close(posterior.mean, whole, rtol=0, atol=1e-4)
@@ -104,9 +104,9 @@ def test_the_strong_images_are_found(data):
     space = SpectrumLags(site.array, site.grid, site.wavelength)
     power = torch.from_numpy(data.target[:60].astype(np.float32) / 255) ** 2
     receivers = torch.from_numpy(data.moving[:60]).float()
-    given = space.of(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, 0
+    given = space.to_lags(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, 0
     found = find_sources(*given, lambda: False)
-    mirrored = mirror_images(ROOM, 1).of(TRANSMITTER)
+    mirrored = mirror_images(ROOM, 1).mirror_points(TRANSMITTER)
     above = mirrored[mirrored[:, 2] > 0] - site.origin
     distance = np.linalg.norm(above[:, None] - found.numpy()[None], axis=-1).min(1)
     assert distance[0] < 0.1 and (distance < 0.25).sum() >= 3
@@ -124,7 +124,9 @@ def test_a_search_ends_with_its_seconds():
     looks = iter([False, False, True] + 9 * [True])
 
     def search(over):
-        return find_sources(space.of(power), receivers, None, torch.eye(3), space, grid, settings, 0, over)
+        return find_sources(
+            space.to_lags(power), receivers, None, torch.eye(3), space, grid, settings, 0, over
+        )
 
     assert len(search(lambda: next(looks))) == 12  # of three rounds, and no step of the refinement
     assert torch.isfinite(search(lambda: True)).all() and len(search(lambda: True)) == 4
@@ -134,7 +136,7 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     rival = GaussianProcess()
     rival.fit(data, split.folds[0], FitContext(tmp_path))
     ours, theirs = (score_methods((m,), data, split, "test") for m in (fitted, rival))
-    assert ours.figures()["psnr_db"] > theirs.figures()["psnr_db"] + 0.5 and fitted.size() > 5
+    assert ours.figures()["psnr_db"] > theirs.figures()["psnr_db"] + 0.5 and fitted.count_components() > 5
     assert 0.4 < ours.variance.mean() / ours.samples["mse"].mean() < 2.5
     assert ours.confidence.min() > 0 and ours.confidence.max() < 1
     near = data.batch(split.folds[0].train[:8])

@@ -5,7 +5,7 @@ from distances import far
 from gsparc.models.moving_array.residual import fit_residual, left_out_error, principal_axes
 from gsparc.processes.kernel import Kernel
 
-KERNEL = Kernel.of_one(2.0, 0.05)
+KERNEL = Kernel.from_length(2.0, 0.05)
 
 
 def rows(count=40, seed=0):
@@ -36,7 +36,7 @@ def test_axes_are_spared_that_predictions_do_not_need():
     assert missed < 0.2 * (values - values.mean(0)).square().sum()
     again = residual.coefficients(far(places, places))
     assert (again - values).square().mean() < missed / values.numel()
-    fewer = residual.first(2)
+    fewer = residual.keep_axes(2)
     assert fewer.axes.shape == (2, 30) and fewer.weights.shape == (40, 2)
 
 

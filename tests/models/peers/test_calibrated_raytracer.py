@@ -124,7 +124,7 @@ def test_gradients_are_the_powers_own(wall):
     at = {name: TRUE.logarithms() + 0.3 * number for number, name in enumerate(names)}
 
     def value(levels: dict[str, np.ndarray]) -> tuple[float, np.ndarray]:
-        return replay.decibels(levels, lambda db: (float(weights @ db), weights))
+        return replay.cost_and_gradient(levels, lambda db: (float(weights @ db), weights))
 
     slopes = value(at)[1]
     assert len(slopes) == 2 * len(names) and np.abs(slopes).max() > 0.1

@@ -146,7 +146,7 @@ def test_kriging_knows_how_far_shadows_reach(tmp_path):
     data, fold = shadowed()
     decibels = 10 * np.log10(data.target)
     law = fit_variogram(data.moving, decibels)
-    assert 0.5 < law.range / 2.0 < 2 and 0.5 < law.total / 36 < 2
+    assert 0.5 < law.range / 2.0 < 2 and 0.5 < law.variance / 36 < 2
     method = fitted("kriging", data, fold, tmp_path)
     batch = data.batch(fold.test)
     said = method.predict(batch)

@@ -55,8 +55,12 @@ def db(power: torch.Tensor) -> np.ndarray:
 
 def small_field(data: Measurements, two: bool = True) -> PowerField:
     """Invented settings."""
-    kernel = Kernel.matern((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel.of_one(5.0, 0.2, 9.0)
-    return PowerField.of(data.site, Prior(kernel, Trend(-70.0)))
+    kernel = (
+        Kernel.from_lengths((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel.from_length(5.0, 0.2, 9.0)
+    )
+    field = PowerField()
+    field.site, field.priors = data.site, ((1.0, Prior(kernel, Trend(-70.0))),)
+    return field
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])

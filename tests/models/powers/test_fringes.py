@@ -136,7 +136,7 @@ def test_what_is_sampled():
 
 def test_a_blend_goes_from_rows_to_groups_to_nothing():
     distance = torch.tensor([0.0, 0.15, 0.3, 1.5, 5.0])
-    share, factor = Blend((0.1, 0.2), (0.2, 0.6), (0.9, 0.7)).at(distance, 1.0)
+    share, factor = Blend((0.1, 0.2), (0.2, 0.6), (0.9, 0.7)).share_and_inflation(distance, 1.0)
     assert np.allclose(share, [0.2, 0.4, 0.6, 0.3, 0.0]) and np.allclose(factor, [0.9, 0.8, 0.7, 0.85, 1.0])
 
 

@@ -103,7 +103,7 @@ def test_a_mixture_is_the_mean_of_its_members(silent):
     left = field.left_out()
     assert torch.isfinite(left.mean).all() and (left.variance > 0).all()
     assert len(left.rows) == int((data.censored[:140] == 0).sum() if silent else 140)
-    assert process.exact().others == ()
+    assert process.with_exact_posterior().others == ()
 
 
 @pytest.mark.parametrize("nearest", [False, True])

@@ -54,7 +54,7 @@ def test_of_silent_rows_those_in_doubt_are_weighed():
     side = np.repeat([0, 1], [40, 101]).astype(np.int8)
     places = np.pad(np.r_[heard, silent][:, None], ((0, 0), (0, 2)))
     rows = PowerRows(places, np.where(side, -70.0, -60.0), side)
-    few = _in_doubt(rows, Candidate(0.0, Trend(-60.0), Kernel.of_one(100.0, 0.1, 16.0), 0.0))
+    few = _in_doubt(rows, Candidate(0.0, Trend(-60.0), Kernel.from_length(100.0, 0.1, 16.0), 0.0))
     assert (few.side == 0).sum() == 40 and few.silent.sum() == LEAST_SILENT
     # Beside strong ones a silent row contradicts what is known; 2 km away it says little.
     assert (few.places[few.silent, 0] <= 400).sum() == (silent <= 400).sum()
@@ -80,7 +80,7 @@ def test_the_mean_is_chosen_by_likelihood_and_by_name():
         (flat, "distance", "about a distance law"),
     ):
         assert said in fit(GaussianProcess(mean=about), data, 50)[1][0]
-    with pytest.raises(ValueError, match="mean='flat' is none of auto, constant, distance"):
+    with pytest.raises(ValueError, match="mean='flat': one of auto, constant, distance is needed"):
         GaussianProcess(mean="flat")
 
 

@@ -20,12 +20,12 @@ def test_rendered_pixels_stay_where_they_were(stride):
 def test_linear_images_are_filled_exactly_and_azimuth_wraps(stride, steady):
     grid = SphereGrid.hemisphere(90, 360)
     rows = torch.arange(90.0)[:, None].expand(90, 360)
-    filled = Interpolated(steady, grid, stride).fill(rows[None, ::stride, ::stride])
+    filled = Interpolated(steady, grid, stride).upsample(rows[None, ::stride, ::stride])
     last = (89 // stride) * stride  # rows beyond the last rendered one repeat it
     assert torch.allclose(filled[0], rows.clamp_max(last), atol=1e-4)
     seam = torch.zeros(1, 90, 360)
     seam[..., 0] = 1.0
-    filled = Interpolated(steady, grid, stride).fill(seam[:, ::stride, ::stride])
+    filled = Interpolated(steady, grid, stride).upsample(seam[:, ::stride, ::stride])
     assert torch.allclose(filled[0, :, -1], torch.full((90,), 1 - 1 / stride))
     assert torch.all(filled[..., 0] == 1)
 
@@ -34,7 +34,7 @@ def test_a_grid_that_does_not_close_ends(steady):
     grid = SphereGrid(4, 8, 0.0, 0.0, 0.1, 0.1)
     image = torch.zeros(1, 2, 4)
     image[..., 0] = 1.0
-    assert torch.all(Interpolated(steady, grid, 2).fill(image)[..., -1] == 0)
+    assert torch.all(Interpolated(steady, grid, 2).upsample(image)[..., -1] == 0)
 
 
 def test_columns_that_cannot_be_divided_are_refused():

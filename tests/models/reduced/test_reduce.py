@@ -132,7 +132,7 @@ def test_a_gaussian_process_spares_components_pixels_and_its_variance(process):
     assert process.away(whole) < 1e-8 and process.answer(whole).variance is None
     assert process.less(confidence=True) is process.method
     few = process.less(keep=0.2, stride=2)
-    assert few.size() < len(process.method.axes) and 0 < process.away(few) < 0.3
+    assert few.count_components() < len(process.method.axes) and 0 < process.away(few) < 0.3
 
 
 @pytest.fixture(scope="module")

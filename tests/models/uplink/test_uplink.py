@@ -181,7 +181,7 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
     step = 1e-6
     slopes = [(atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()]
     flat = torch.cat([atoms(torch.zeros(3).double()), *slopes])
-    columns = Columns.of(three.direction, three.delay, aperture)
+    columns = Columns.from_sources(three.direction, three.delay, aperture)
     assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
     snapshot = three.response(aperture)
     wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)

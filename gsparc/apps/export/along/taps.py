@@ -41,7 +41,7 @@ class Trajectory:
         """[m/s]."""
         return float((np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max())
 
-    def at(self, time_s: np.ndarray) -> np.ndarray:
+    def places_at(self, time_s: np.ndarray) -> np.ndarray:
         """Places (m, 3) at times (m,)."""
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place.T], 1)
 
@@ -104,7 +104,7 @@ def write_taps(
     line = fit_taps(predictor, way, settings["taps"], settings["rate_hz"], settings["antennas"])
     units = {"time_s": "s", f"{site.moving_end}_position": "m", "delay_s": "s", "doppler_hz": "Hz"}
     delay_s = (line.first + np.arange(line.gain.shape[2])) / line.rate_hz
-    known = (line.time_s, way.at(line.time_s), delay_s, line.doppler_hz())
+    known = (line.time_s, way.places_at(line.time_s), delay_s, line.doppler_hz())
     arrays = dict(zip(units, known, strict=True)) | {"gain": line.gain}
     about = {"rate_hz": line.rate_hz, "carrier_hz": line.carrier_hz, "residual": line.residual}
     write_raw(file, Raw(arrays, about, units))
@@ -141,7 +141,7 @@ def fit_taps(
     # The band where all tones are in use; with gaps it is too narrow, which is refused below.
     rate_hz, carrier = rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)), float(tones.mean())
     time_s = way.instants(LIGHT / carrier)
-    places = way.at(time_s)
+    places = way.places_at(time_s)
 
     def ask(place: np.ndarray) -> np.ndarray:
         tx, rx = (place if end == site.moving_end else None for end in ("tx", "rx"))

@@ -105,13 +105,13 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 def compile_exactly(method: Method, site: Site) -> Form | None:
     """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
-        return None if method.only is None else compile_exactly(method.only, site)
+        return None if method.single is None else compile_exactly(method.single, site)
     if isinstance(method, PowerField):
         if method.powers is None or method.fringes is not None:
             return None
         return compile_powers(method.powers, site.target_scale)
     if isinstance(method, ImageProcess) and method._average is not None:
-        return compile_exactly(method._average[0], site) if not method.size() else None
+        return compile_exactly(method._average[0], site) if not method.count_components() else None
     if isinstance(method, LearnedField):
         return _rendered(method, site)
     if isinstance(method, GaussianProcess):
@@ -165,7 +165,7 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
 
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
-    parts = method.parts() if isinstance(method, ClosedForm) else ()
+    parts = method.weighted_members() if isinstance(method, ClosedForm) else ()
     for _, one in sorted(parts, key=lambda part: -part[0]):
         if isinstance(one, ImageSourceGP):
             return one
@@ -179,7 +179,7 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     # Sources work in their own unit, in which rows' factors are divided out.
     data = replace(data, target=data.target * method.factors.numpy()[:, None])
     rows = method.frame.normalise(draw_rows(data, np.arange(len(data)), len(data), method.settings.seed))
-    scene = replace(member.scene, clutter=Clutter.none())
+    scene = replace(member.scene, clutter=Clutter.empty())
     # Without __init__: its sources are given, and searching is what would be repeated.
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))

@@ -67,7 +67,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             legends += more
         sphere, extent = view.sphere(name), view.extent(name)
         for place in walk_places(view, name, steps // len(names)):
-            answer = predict_answer(viewed.predictor_of(name), {**view.starts(name), moving: place})
+            answer = predict_answer(viewed.predictor_of(name), {**view.initial_places(name), moving: place})
             dot.position = scene.frame.to_drawn(place)
             label.text = (f"{name}: " if len(names) > 1 else "") + summarise_answer(answer, view.unit)
             parts: list[Part] = list(draw_rays(answer, extent) or ())

@@ -36,7 +36,7 @@ class Session:
         self.site = view.viewed.site
         self.station = self.chosen_station = view.viewed.stations[0]
         self.one = view.station(self.station)
-        self.places = {end: np.asarray(at, np.float64) for end, at in view.starts(self.station).items()}
+        self.places = {end: np.asarray(at, float) for end, at in view.initial_places(self.station).items()}
         self.answers = 0  # that were shown
         self.plane: Plane | None = None
         self.visited: list[np.ndarray] = []  # weak places of it, one after another
@@ -157,7 +157,7 @@ class Session:
 
     def _go(self, where: str) -> None:
         moving = self.view.viewed.moving[-1]
-        place = self.view.starts(self.station)[moving]
+        place = self.view.initial_places(self.station)[moving]
         if where == WEAKEST and self.plane is not None:
             weak_place = weakest_place(self.plane, self.visited)
             if weak_place is None:  # all were visited

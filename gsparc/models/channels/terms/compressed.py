@@ -101,7 +101,7 @@ class Basis:
     shared: Cache = field(default_factory=dict)
 
     @staticmethod
-    def of(
+    def from_matrix(
         key: tuple[Hashable, ...], places: Tensor, alike: Callable[[], Tensor], noise: float, shared: Cache
     ) -> Basis:
         """Return that of a correlation (n, n) float64 beside `noise`, its share."""

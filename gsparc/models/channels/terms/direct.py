@@ -34,7 +34,7 @@ class Direct(Spherical):
         return spherical_wave(between, torch.zeros_like(middle), wavenumber, away)[None]
 
     @property
-    def worth(self) -> int:
+    def count_learned(self) -> int:
         """Powers, the gain's length, and the offset where there is one."""
         offset = self.frame.offset
         return len(self.power) + 1 + len(offset) * bool(offset.any())

@@ -41,7 +41,7 @@ class Directions(ChannelTerm):
     concentration: float
     towards: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
 
-    def of(self, slots: Sequence[Slot]) -> Tensor:
+    def powers_at_ends(self, slots: Sequence[Slot]) -> Tensor:
         """Return powers (T, M) as ends have them; (1, M) where all have the same."""
         if not len(self.towards):
             return self.power[None]
@@ -72,11 +72,11 @@ class Directions(ChannelTerm):
 
     def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return `E sum_b p_b w_b V_b(d)` (n, m) complex128, see `Term`."""
-        return next(iter(self.together([a], [b])))
+        return next(iter(self.end_covariances([a], [b])))
 
-    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
+    def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances of ends whose correlations are computed once, see `ChannelTerm`."""
-        powers = self.of([one.slot for one in a]).to(torch.complex128)
+        powers = self.powers_at_ends([one.slot for one in a]).to(torch.complex128)
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
         for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
             each = torch.tensordot(powers, self.correlations(self.angles, wavenumber, part, other), 1)
@@ -85,10 +85,10 @@ class Directions(ChannelTerm):
         return whole if len(whole) == len(a) else repeat(whole[0], len(a))
 
     def variance(self, a: SlotPlaces) -> Tensor:
-        """Return the sum of powers (n,), see `Term`."""
-        return self.of([a.slot])[0].sum().expand(len(a.places))
+        """Return the sum of powers (n,), see `ChannelTerm`."""
+        return self.powers_at_ends([a.slot])[0].sum().expand(len(a.places))
 
-    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return one of M covariances, see `ChannelTerm`."""
         places, wavenumber = at.places, at.slot.wavenumber
 
@@ -108,7 +108,7 @@ class Directions(ChannelTerm):
         """Return logarithms of powers, then of factors (M + J,), see `Term`."""
         return torch.cat([self.power.log(), self.towards])
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """Return the term of other ones, see `Term`."""
         count = len(self.power)
         return replace(self, power=parameters[:count].exp(), towards=parameters[count:])

@@ -22,7 +22,7 @@ class Images(Spherical):
     planes: Tensor
 
     @classmethod
-    def of(cls, frame: Frame, planes: Tensor, level: float = 1.0) -> Self:
+    def from_planes(cls, frame: Frame, planes: Tensor, level: float = 1.0) -> Self:
         """Return images of equal powers."""
         return cls(frame, torch.full((2 * len(planes),), level, dtype=torch.float64), planes=planes)
 
@@ -46,6 +46,6 @@ class Images(Spherical):
         return super().waves(at) * (sides[:, :1] * sides[:, 1:] > 0)
 
     @property
-    def worth(self) -> int:
+    def count_learned(self) -> int:
         """Powers and planes."""
         return len(self.power) + self.planes[:, :-1].numel()

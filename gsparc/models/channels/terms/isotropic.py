@@ -29,10 +29,10 @@ class Isotropic(ChannelTerm):
         """Return `p E sinc(k d)` (n, m) float64, see `Term`."""
         return self.power * self.correlation(a, b)
 
-    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
+    def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return the same for each, see `ChannelTerm`."""
         return repeat(self.covariance(a[0], b[0]), len(a))
 
-    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
         return basis.dense("isotropic", lambda: [self.correlation(at, at)])

@@ -39,7 +39,7 @@ class Spherical(ChannelTerm):
     @property
     def gains(self) -> tuple[Tensor, Tensor]:
         """Powers (W,) of fixed gains, and of those that vary."""
-        # In the order of `pieces`: fixed gains of all waves, then varying ones.
+        # In the order of `covariances_in_basis`: fixed gains of all waves, then varying ones.
         fixed, varying = self.power.view(2, -1)
         return fixed, varying
 
@@ -52,10 +52,10 @@ class Spherical(ChannelTerm):
         )
 
     def variance(self, a: SlotPlaces) -> Tensor:
-        """Return that of all waves (n,), see `Term`."""
+        """Return that of all waves (n,), see `ChannelTerm`."""
         return self.power.view(2, -1).sum(0) @ self.waves(a).abs().square()
 
-    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return those of fixed gains, then of those that vary, see `ChannelTerm`."""
         waves, frame = self.waves(at), self.frame
         return basis.factored(frame.reach, waves) + basis.factored(frame.gain, waves)

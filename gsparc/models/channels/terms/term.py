@@ -54,7 +54,7 @@ class ChannelTerm(Term[SlotPlaces]):
     frame: Frame
     power: Tensor
 
-    def together(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
+    def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances (n, m) of several ends of one wavelength, one by one.
 
         Places of all `a` differ by one displacement at most, those of `b` by the same.
@@ -62,13 +62,13 @@ class ChannelTerm(Term[SlotPlaces]):
         return map(self.covariance, a, b)
 
     def variance(self, a: SlotPlaces) -> Tensor:
-        """Return the variance (n,), see `Term`."""
+        """Return the variance (n,) of values at `a`."""
         return self.power.sum().expand(len(a.places))
 
-    def pieces(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return covariances of unit power in a basis, as many in all as there are powers; here one."""
         # A logarithm of 0 is unit power.
-        return (Dense(basis.of_rows(self.at(self.power[:0].new_zeros(1)).covariance(at, at))[None]),)
+        return (Dense(basis.of_rows(self.with_values(self.power[:0].new_zeros(1)).covariance(at, at))[None]),)
 
     def design(self, slot: Slot) -> Tensor:
         """Return how logarithms of an end's own powers depend on `parameters` (p, q), linearly."""
@@ -78,7 +78,7 @@ class ChannelTerm(Term[SlotPlaces]):
         """Return logarithms of powers (p,), see `Term`."""
         return self.power.log()
 
-    def at(self, parameters: Tensor) -> Self:
+    def with_values(self, parameters: Tensor) -> Self:
         """Return the term of other logarithms, see `Term`."""
         return replace(self, power=parameters.exp())
 
@@ -91,6 +91,6 @@ class ChannelTerm(Term[SlotPlaces]):
         return torch.zeros((), dtype=torch.float64)
 
     @property
-    def worth(self) -> int:
+    def count_learned(self) -> int:
         """Numbers that are learned for it."""
         return len(self.parameters())

@@ -36,29 +36,29 @@ class Clutter:
     plane: tuple[int, ...]
 
     @staticmethod
-    def none() -> Clutter:
+    def empty() -> Clutter:
         """Return clutter of no boxes and infinite mirrors."""
         return Clutter(torch.zeros(0, BOX), torch.zeros(0, PATCH), ())
 
     def __len__(self) -> int:
         return len(self.boxes) + len(self.patches)
 
-    def with_box(self, box: Tensor) -> Clutter:
+    def add_box(self, box: Tensor) -> Clutter:
         """Return it with one more box (6,)."""
         return replace(self, boxes=torch.cat([self.boxes, box[None]]))
 
-    def with_patch(self, patch: Tensor, plane: int) -> Clutter:
+    def add_patch(self, patch: Tensor, plane: int) -> Clutter:
         """Return it with one more patch (4,)."""
         patches = torch.cat([self.patches, patch[None]])
         return replace(self, patches=patches, plane=(*self.plane, plane))
 
-    def without(self, number: int) -> Clutter:
+    def remove_piece(self, number: int) -> Clutter:
         """Return it with one piece less; boxes count before patches."""
         boxes = [i for i in range(len(self.boxes)) if i != number]
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
         return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
-    def with_planes_renumbered(self, new: dict[int, int]) -> Clutter:
+    def renumber_planes(self, new: dict[int, int]) -> Clutter:
         """Return it with planes of new indices; patches of planes without one are dropped."""
         patches = [i for i, plane in enumerate(self.plane) if plane in new]
         return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))

@@ -59,7 +59,7 @@ class ClutterLikelihood:
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
         varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
         across = stack_real_imag(scaled)[1]
-        return varying.summed.matrix, quadrature_variances(scene.quadrature)[1] * (across @ across.T)
+        return varying.source_gram.matrix, quadrature_variances(scene.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""
@@ -92,7 +92,7 @@ class ClutterLikelihood:
         covariance = (1 - constant) * varying + constant * across
         # Half of the variance in the real parts, half in the imaginary ones.
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
-        self._own = Factor.of(covariance)
+        self._own = Factor.from_gram(covariance)
         self._determinant = 0.5 * float(self._own.log_determinant)
 
     @staticmethod
@@ -115,7 +115,7 @@ class ClutterLikelihood:
         """Return a scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _inner(columns, self.white)
-        own = Factor.of(inner)
+        own = Factor.from_gram(inner)
         mean, projection = own.solve(seen[:, None])[:, 0].float(), own.whiten(columns.T.double()).float()
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
@@ -219,6 +219,6 @@ def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
 
 def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
     inner, seen = _inner(columns, white)
-    own = Factor.of(inner)
+    own = Factor.from_gram(inner)
     explained = white.double().square().sum() - own.whiten(seen[:, None]).square().sum()
     return determinant + 0.5 * (own.log_determinant + explained)

@@ -11,7 +11,7 @@ from functools import partial
 import torch
 
 from gsparc.models.image_sources.backprojection import select_separated
-from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, Clutter, visible_share
+from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, visible_share
 from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_occluding_box
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_patch, find_small_mirrors
 from gsparc.models.image_sources.clutter.refine import refine_with_clutter
@@ -84,10 +84,10 @@ class _ClutterSearcher:
         waves = self.waves * self.visible.T
         return UnexplainedRows(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
-    def _try(self, scene: Scene, parameters: int, exact: bool = False) -> bool:
+    def _try(self, scene: Scene, parameters: int, refactor: bool = False) -> bool:
         """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
 
-        Varying part and noise are those last factored; with `exact` they are the new scene's own, since the
+        Varying part and noise are those last factored; with `refactor` they are the new scene's, since the
         old ones would explain what the new scene occludes.
         """
         nll, least = self.nll, parameters * self.parameter_cost
@@ -95,7 +95,7 @@ class _ClutterSearcher:
         def change() -> None:
             self._set_scene(scene)
             self._descend(6)
-            if exact and self.nll < nll - least:
+            if refactor and self.nll < nll - least:
                 self._refactor(self.scene)
 
         return self._changed(change, least)
@@ -163,8 +163,10 @@ class _ClutterSearcher:
 
     def _add_mirror(self, mirror: SmallMirror) -> bool:
         scene, number = self.scene, len(self.scene.planes)
-        sequences = _sequences_over(number, scene.walls)
-        clutter = scene.clutter.with_patch(mirror.patch, number)
+        # Itself, after and before each wall.
+        sequences: list[Reflections] = [(number,)]
+        sequences += [(wall, number) for wall in scene.walls] + [(number, wall) for wall in scene.walls]
+        clutter = scene.clutter.add_patch(mirror.patch, number)
         trial = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter)
         return self._add(trial, sequences, 1.5, MIRROR, len(sequences))
 
@@ -175,7 +177,7 @@ class _ClutterSearcher:
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
-        new = scene.with_other_sequences(sequences)
+        new = scene.replace_sequences(sequences)
         paths = new.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
         scores, gains = scorer.gain_of_waves(new.unobstructed_waves(self.rows) * seen.T)
@@ -186,7 +188,7 @@ class _ClutterSearcher:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
         more = [sequences[i] for i in chosen]
-        return self._try(scene.with_sequences(more, strong, gains[chosen].angle()), parameters)
+        return self._try(scene.add_sequences(more, strong, gains[chosen].angle()), parameters)
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
@@ -200,16 +202,16 @@ class _ClutterSearcher:
             own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
             louder = self.scene.log_amplitude.clone()
             louder[own] = louder[own].clamp_min(float(louder.median()))
-            clutter = self.scene.clutter.with_patch(patch, number)
+            clutter = self.scene.clutter.add_patch(patch, number)
             trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
-            self._try(trial, PATCH, exact=True)
+            self._try(trial, PATCH, refactor=True)
 
     def _boxes(self) -> None:
         for _ in range(BOXES):
             box, score = find_occluding_box(self._left())
             if score < MIN_GAIN:
                 break
-            if not self._try(replace(self.scene, clutter=self.scene.clutter.with_box(box)), BOX):
+            if not self._try(replace(self.scene, clutter=self.scene.clutter.add_box(box)), BOX):
                 break
 
     def _sequences(self) -> None:
@@ -218,23 +220,15 @@ class _ClutterSearcher:
         if not sequences:
             return
         scores, _ = self._left().scorer.gain_of_waves(
-            scene.with_other_sequences(sequences).unobstructed_waves(self.rows)
+            scene.replace_sequences(sequences).unobstructed_waves(self.rows)
         )
         best = scores.topk(min(60, len(sequences))).indices.tolist()
         self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
-
-    def _set_clutter(self, clutter: Clutter) -> None:
-        self._set_scene(replace(self.scene, clutter=clutter))
 
     def _drop(self) -> None:
         """Remove clutter that the likelihood no longer supports."""
         number = 0
         while number < len(clutter := self.scene.clutter):
             parameters = BOX if number < len(clutter.boxes) else PATCH
-            less = partial(self._set_clutter, clutter.without(number))
-            number += not self._changed(less, -parameters * self.parameter_cost)
-
-
-def _sequences_over(number: int, known: list[int]) -> list[Reflections]:
-    """Words over a plane: itself, after and before each wall."""
-    return [(number,), *((wall, number) for wall in known), *((number, wall) for wall in known)]
+            less = replace(self.scene, clutter=clutter.remove_piece(number))
+            number += not self._changed(partial(self._set_scene, less), -parameters * self.parameter_cost)

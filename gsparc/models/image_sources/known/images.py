@@ -49,7 +49,7 @@ class Mirrors:
     left_out: int = 0
 
     @staticmethod
-    def of(walls: SceneWalls, origin: np.ndarray) -> Mirrors:
+    def from_walls(walls: SceneWalls, origin: np.ndarray) -> Mirrors:
         """Join faces of one plane; those that touch each other make one rectangle around them.
 
         Args:
@@ -173,7 +173,7 @@ class Mirrors:
 def walls_of_file(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
     """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
-    known = Mirrors.of(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
+    known = Mirrors.from_walls(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
     normal, offset = normal_form(planes)
     axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)

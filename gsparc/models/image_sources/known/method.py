@@ -73,7 +73,7 @@ class KnownWallsGP(ImageSourceGP):
         with end_when(budget.is_spent):
             scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, self.kernel)
-            prior = ReflectionPhasePrior.of(scene)
+            prior = ReflectionPhasePrior.from_scene(scene)
             scene = refine_scene(rows, scene, settings.final_steps, cost)
         error = left_out_nmse(rows, scene)
         log.info(
@@ -86,7 +86,7 @@ class KnownWallsGP(ImageSourceGP):
         """The static end and its images that some receiver sees, with amplitudes to start from."""
         assert self.site is not None
         transmitter = self._transmitter()
-        mirrors = Mirrors.of(self.walls, self.site.origin + self.frame.middle.numpy())
+        mirrors = Mirrors.from_walls(self.walls, self.site.origin + self.frame.middle.numpy())
         if mirrors.left_out:
             log.info(
                 "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
@@ -99,14 +99,14 @@ class KnownWallsGP(ImageSourceGP):
         hidden = settings.clutter and shares_occlusion(rows)
         ends = transmitter, rows.position
         sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
-        obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.none()
+        obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.empty()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
             transmitter, mirrors.planes, sequences, log_amplitudes(sequences, direct),
             math.log(NOISE), self.kernel, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide
-        return replace(bare, clutter=obstacles).only([*range(len(sequences))], obstacles.plane)
+        return replace(bare, clutter=obstacles).select_sources([*range(len(sequences))], obstacles.plane)
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class ReflectionPhasePrior:
     concentration: float
 
     @staticmethod
-    def of(scene: Scene) -> ReflectionPhasePrior:
+    def from_scene(scene: Scene) -> ReflectionPhasePrior:
         """Estimate from a scene's phases, weighted by power."""
         assert scene.phase is not None
         order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase

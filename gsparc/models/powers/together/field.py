@@ -21,9 +21,9 @@ from gsparc.data.errors import DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.method import Prediction
-from gsparc.models.per_station import SAME_PLACE_M
+from gsparc.models.method import JointLevels, Prediction
 from gsparc.models.powers.together.learning import (
     TRIED_EACH,
     StationPriors,
@@ -75,14 +75,6 @@ class JointPowerField(ClosedForm):
         self.rows: dict[int, Tensor] = {}  # of what was heard of each station
         self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
 
-    @classmethod
-    def of(cls, site: Site, places: np.ndarray, own: StationPriors, terms: SharedTerms) -> JointPowerField:
-        """Return one of known settings whose stations share `terms`, to be conditioned."""
-        result = cls()
-        result.site, result.places, result.own = site, places, own
-        result.heard = result.unheard = terms
-        return result
-
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Learn what stations share and their own processes, and condition on these rows.
 
@@ -103,21 +95,21 @@ class JointPowerField(ClosedForm):
         """Set the processes and what they share; what must be said of them."""
         assert data.site.stations is not None
         self.places, notes = station_places(data, rows)
-        every = rows_of_stations(data, rows, self.places)
+        used = rows_of_stations(data, rows, self.places)
         network = find_sectors(data, self.places)
         if network is None:
-            self.own, remarks = learn_station_priors(every, self.seed, budget)
+            self.own, remarks = learn_station_priors(used, self.seed, budget)
         else:
-            every = relabel_by_site(every, network)
-            prior, remarks = learn_network(every, network, data.site.stations.name, self.seed, budget)
+            used = relabel_by_site(used, network)
+            prior, remarks = learn_network(used, network, data.site.stations.name, self.seed, budget)
             self.own = StationPriors(prior, {})
-        most, largest = rows_per_station(len(every.stations)), int(np.bincount(every.station).max())
+        most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-        self.heard = self.unheard = SharedTerms.prior(every, self.own.never.known_trend, 1.0, 0, self.seed)
+        self.heard = self.unheard = SharedTerms.from_rows(used, self.own.never.known_trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
-        terms, self.inflation, gain = learn_shared_terms(every, self.own, self.seed, budget)
+        terms, self.inflation, gain = learn_shared_terms(used, self.own, self.seed, budget)
         if gain is None:
             remarks.append("no shared terms: too few stations to leave some out")
             return (*notes, *remarks)
@@ -127,7 +119,7 @@ class JointPowerField(ClosedForm):
             f"{after:.3g} dB with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
         )
         if terms.place_db:
-            self.unheard = terms.known_at(every, PLACES, self.seed)
+            self.unheard = terms.known_at(used, PLACES, self.seed)
         return (*notes, *remarks)
 
     @property
@@ -135,7 +127,7 @@ class JointPowerField(ClosedForm):
         """Sectors whose processes those of a site share; None: each station has its own."""
         return trend if isinstance(trend := self.own.never.trend, Sectors) else None
 
-    def size(self) -> int:
+    def count_components(self) -> int:
         """None: no Gaussians."""
         return 0
 
@@ -148,14 +140,14 @@ class JointPowerField(ClosedForm):
         """See `ClosedForm`; silent rows say that powers are below a level."""
         every = rows_of_stations(data, rows, self.places)
         every = every if self.network is None else relabel_by_site(every, self.network)
-        used = every.thinned(rows_per_station(len(every.stations)), self.seed)
+        used = every.thin_rows(rows_per_station(len(every.stations)), self.seed)
         self.posterior, self._reach = self.own.condition(used, self.heard, self.seed), None
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
-            elsewhere = self.own.condition(used.thinned(UNHEARD_EACH, self.seed), self.unheard, self.seed)
+            elsewhere = self.own.condition(used.thin_rows(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = self._elsewhere((elsewhere.factor, elsewhere.mean))
         self.whole = max(float(used.heard.decibels.var()), self.own.variance)
-        self.rows = {number: torch.from_numpy(used.of(number).measured.index) for number in used.stations}
+        self.rows = {n: torch.from_numpy(used.select_station(n).measured.index) for n in used.stations}
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; (B, 1) linear powers.
@@ -181,8 +173,8 @@ class JointPowerField(ClosedForm):
         return Prediction(power, entry_variance(spread, power, "rssi"), share)
 
     @torch.no_grad()
-    def predict_joint(self, moving: Tensor, stations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return levels (G, k) of measurements [dB], covariances (G, k, k) and noise (k,) [dB^2], float64.
+    def predict_joint(self, moving: Tensor, stations: Tensor) -> JointLevels:
+        """Return levels with the covariances of their errors, float64.
 
         Args:
             moving: (G, k, 3) places of the moving end [m].
@@ -203,7 +195,7 @@ class JointPowerField(ClosedForm):
             covariance[:, at[:, None], at] = inflation * left
             kernel = self.own.prior(one).kernel
             noise[at] = inflation * kernel.amplitude * kernel.noise
-        return mean, covariance, noise
+        return JointLevels(mean, covariance, noise)
 
     def left_out(self) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
@@ -258,7 +250,7 @@ class JointPowerField(ClosedForm):
         never = never if network is None else replace(never, trend=network.add_sectors(ROUND))
         return SharedTermsPosterior({}, never, self.unheard.columns, weights)
 
-    def with_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
+    def add_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
         """Return one that knows k further stations, of no rows, as its last.
 
         Args:

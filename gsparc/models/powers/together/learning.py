@@ -29,7 +29,7 @@ from gsparc.processes.trend import Trend
 from gsparc.processes.worker import end_when
 from gsparc.training.time_budget import TimeBudget
 
-START = Kernel.matern((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
+START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
 SETTLED = 1e-6  # of settings that all stations have alike
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
@@ -65,7 +65,7 @@ class StationPriors:
         """Return what rows say; pseudo-values of silent ones follow from their own station's."""
         result = {}
         for number in rows.stations:
-            prior, part = self.prior(number), rows.of(number)
+            prior, part = self.prior(number), rows.select_station(number)
             places, extra = torch.from_numpy(part.places), None
             values = torch.from_numpy(part.decibels)[:, None]
             if part.silent.any():
@@ -77,7 +77,7 @@ class StationPriors:
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
                 places, values, extra = known.rows[told], known.values()[told], known.extra[told]
-            result[number] = Exact.of(prior, places, values, extra)
+            result[number] = Exact.from_values(prior, places, values, extra)
         return SharedTermsPosterior(result, self.never, terms.columns)
 
     @property
@@ -102,7 +102,7 @@ def learn_station_priors(
         if budget is not None and budget.is_spent():
             numbers = []
         for number in numbers:
-            some = heard.of(number).thinned(ENDS_ON, seed)
+            some = heard.select_station(number).thin_rows(ENDS_ON, seed)
             _, own = fit_kernel_by_left_out([kernel], *some.regression_about(trend), tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
@@ -111,13 +111,13 @@ def learn_station_priors(
 
 def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     """The law of all stations, of their median level, and what must be said of it."""
-    few = rows.thinned(LEARNED_EACH, seed)
+    few = rows.thin_rows(LEARNED_EACH, seed)
     law = fit_law(few, None)
     residual = few.decibels - law.mean(torch.from_numpy(few.places)).numpy()
     residuals = [residual[few.station == number] for number in few.stations]
     levels, typical = np.array([[part.mean(), part.std()] for part in residuals]).T
     law = replace(law, level=law.level + float(np.median(levels)))  # that of one station may be far off
-    trend = Trend.about(law, torch.from_numpy(few.places))
+    trend = Trend.from_law(law, torch.from_numpy(few.places))
     by = f"law of exponent {law.exponent:.3g}, levels +- {levels.std():.2g} dB"
     spread = max(float(np.median(typical)), 0.1) / SLOPE_DB
     return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
@@ -125,16 +125,16 @@ def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 
 def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
-    few = heard.thinned(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
-    views = {number: few.of(number).regression_about(trend) for number in few.stations}
+    few = heard.thin_rows(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
+    views = {number: few.select_station(number).regression_about(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0
-    start = Kernel.matern([length * middle for length in START.lengths], START.shares, START.noise)
+    start = Kernel.from_lengths([length * middle for length in START.lengths], START.shares, START.noise)
 
     def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
         distance, columns, values = views[number]
-        return LeftOutDensity.apply(covariance_of(start.at(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
+        return LeftOutDensity.apply(covariance_of(start.with_values(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
 
     def objective(at: Tensor) -> Tensor:
         return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
@@ -144,7 +144,7 @@ def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kerne
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
     logs = (count * logs + ALIKE * mean) / (count + ALIKE)
-    kernel = replace(start.at(torch.from_numpy(best)), amplitude=math.exp(mean))
+    kernel = replace(start.with_values(torch.from_numpy(best)), amplitude=math.exp(mean))
     return kernel, {
         number: Prior(replace(kernel, amplitude=math.exp(log)), trend)
         for number, log in zip(views, logs, strict=True)
@@ -167,9 +167,9 @@ def learn_shared_terms(
         g gains at these, each after one constant, None if not tried.
     """
     heard = rows.heard
-    few = heard.thinned(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
+    few = heard.thin_rows(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(own.never.kernel.lengths)
-    bare = SharedTerms.prior(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
+    bare = SharedTerms.from_rows(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
     processes = own.condition(few, bare, seed).processes
@@ -194,7 +194,7 @@ def _left_out(processes: Mapping[int, Exact], terms: SharedTerms) -> tuple[np.nd
     Between them the mean square of errors without that constant over their predicted variances.
     """
     errors, ratios = [], []
-    blocks = [Block.of(process, terms.columns(process.rows)) for process in processes.values()]
+    blocks = [Block.from_process(process, terms.columns(process.rows)) for process in processes.values()]
     for error, variance in left_out_processes(blocks):
         ratios.append(float((error.square() / variance).mean()))
         errors.append((error - error.mean()).numpy())

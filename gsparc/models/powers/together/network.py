@@ -126,7 +126,7 @@ def learn_network(
         seed: of rows drawn.
         budget: searches end with what they have when it is over.
     """
-    few = rows.at(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
+    few = rows.subset(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
     loud = few.heard
     decades = law.decades(torch.from_numpy(loud.places))
@@ -183,7 +183,7 @@ def _rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
 
     def objective(at: Tensor) -> Tensor:
         shared, levels, scale, gains = at.split((len(SHARED), bands, 1, count))
-        mean = start.at(places, shared, levels) + gains[number]
+        mean = start.powers_at(places, shared, levels) + gains[number]
         return _misfit(mean, rows, scale.exp()).sum() + _off(shared) + 0.5 * (gains / GAIN_DB).square().sum()
 
     begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(2 * GAIN_DB), np.zeros(count)]
@@ -202,12 +202,12 @@ def _turned(
     """Azimuths that rows contradict turned to where they fit, and a note of each."""
     table, notes = trend.table.clone(), list[str]()
     for t in range(len(table)):
-        part = rows.at(np.flatnonzero(sector_of(rows.places) == t))
+        part = rows.subset(np.flatnonzero(sector_of(rows.places) == t))
         if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
             continue
         rest = torch.zeros(len(TURNS), len(OWN_SPREAD) - 2, dtype=torch.float64)  # as it is
         own = torch.cat([TURNS.double()[:, None], rest], 1)
-        mean = trend.at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
+        mean = trend.powers_at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
         levels = (gains[t] + GAINS)[:, None]
         likely = _misfit(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
         likely = (likely + 0.5 * (levels[:, 0] / GAIN_DB).square()).amin(1)
@@ -228,7 +228,7 @@ def _by_evidence(
 ) -> tuple[Sectors, Kernel]:
     """All settings of largest evidence of some rows of each site."""
     rows, bands = _whole(rows), len(rough.levels)
-    parts = [_stretches(rows.of(number), LEARNED_ON, seed) for number in rows.stations]
+    parts = [_stretches(rows.select_station(number), LEARNED_ON, seed) for number in rows.stations]
     places = [torch.from_numpy(part.places) for part in parts]
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
@@ -241,9 +241,9 @@ def _by_evidence(
 
     def objective(at: Tensor) -> Tensor:
         shared, levels, logs = at.split((len(SHARED), bands, len(usual)))
-        total, kernel = _off(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(), start.at(logs)
+        total, kernel = _off(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(), start.with_values(logs)
         for i, at_ in enumerate(places):
-            gram, rest = own[i] + kernel.gram(at_), values[i] - rough.at(at_, shared, levels)
+            gram, rest = own[i] + kernel.gram(at_), values[i] - rough.powers_at(at_, shared, levels)
             total = total + Evidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
         return total / count
 
@@ -252,15 +252,15 @@ def _by_evidence(
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
     best, _ = minimise(objective, [begin], bounds)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
-    learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.at(logs)
+    learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.with_values(logs)
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
     for i, at_ in enumerate(places):
         gram, quiet = own[i] + kernel.gram(at_), side[i] != 0
         if quiet.any():
             gram.diagonal()[quiet] += last[i][0].variance
-        columns = Factor.of(gram, "raise").whiten(learned.shared_columns(at_))
+        columns = Factor.from_gram(gram, "raise").whiten(learned.shared_columns(at_))
         precision += columns.T @ columns
-    doubt, kernel = Factor.of(precision, "raise").root.T, _relative(kernel)
+    doubt, kernel = Factor.from_gram(precision, "raise").root.T, _relative(kernel)
     return replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude)), kernel
 
 
@@ -286,7 +286,7 @@ def _whole(rows: StationRows) -> StationRows:
     sectors = np.unique(np.stack([place, sector_of(rows.places).astype(np.int64)], 1), axis=0)[:, 0]
     count = np.bincount(sectors)
     whole = count == count.max()
-    return rows.at(np.flatnonzero(whole[place])) if whole.sum() >= LEAST_WHOLE else rows
+    return rows.subset(np.flatnonzero(whole[place])) if whole.sum() >= LEAST_WHOLE else rows
 
 
 def _stretches(rows: StationRows, most: int, seed: int) -> StationRows:
@@ -299,4 +299,4 @@ def _stretches(rows: StationRows, most: int, seed: int) -> StationRows:
     np.minimum.at(first, place, rows.index)
     stretch = np.argsort(np.argsort(first)) // STRETCH
     rank = np.random.default_rng(seed).permutation(int(stretch.max()) + 1)[stretch[place]]
-    return rows.at(np.sort(np.argsort(rank, kind="stable")[:most]))
+    return rows.subset(np.sort(np.argsort(rank, kind="stable")[:most]))

@@ -46,11 +46,11 @@ class StationRows(PowerRows):
         """Numbers of the stations that have rows, ascending."""
         return [int(number) for number in np.unique(self.station)]
 
-    def of(self, number: int) -> StationRows:
+    def select_station(self, number: int) -> StationRows:
         """Return the rows of one station."""
-        return self.at(np.flatnonzero(self.station == number))
+        return self.subset(np.flatnonzero(self.station == number))
 
-    def thinned(self, each: int, seed: int) -> StationRows:
+    def thin_rows(self, each: int, seed: int) -> StationRows:
         """Return at most so many rows of each station, at places that they share where they do.
 
         Rows where something was heard come first where there are too many, up to half of them.
@@ -68,7 +68,7 @@ class StationRows(PowerRows):
                 share = max(round(each * len(loud) / len(own)), min(len(loud), each // 2))
                 own = np.concatenate([loud[:share], quiet[: each - share]])
             chosen.append(own)
-        return self.at(np.sort(np.concatenate(chosen)))
+        return self.subset(np.sort(np.concatenate(chosen)))
 
 
 def station_places(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -117,7 +117,7 @@ class SharedTerms(Columns):
     unit: float = 1.0
 
     @classmethod
-    def prior(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
+    def from_rows(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
         """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _decades(trend, torch.from_numpy(rows.places))
         bare = cls(trend, float(decades.min()), float(decades.max()), NO_PLACES, length)
@@ -148,7 +148,7 @@ class SharedTerms(Columns):
         gram = matern32(distances(self.inducing, self.inducing), self.length)
         # Places next to each other are alike to the last digit.
         gram.diagonal().add_(JITTER)
-        return Factor.of(gram, "raise")
+        return Factor.from_gram(gram, "raise")
 
 
 def _decades(trend: Trend, places: Tensor) -> Tensor:

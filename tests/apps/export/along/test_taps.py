@@ -69,14 +69,14 @@ def test_taps_sum_to_the_channel_at_any_time(with_paths):
     delay = (line.first + np.arange(48)) / line.rate_hz
     taps = CubicSpline(line.time_s, line.gain)(between)  # as a reader of the file has it
     summed = taps @ np.exp(-2j * np.pi * np.outer(delay, tones - line.carrier_hz))
-    true = model._paths(way.at(between)).channel(tones)
+    true = model._paths(way.places_at(between)).channel(tones)
     assert np.mean(np.abs(summed - true) ** 2) < 2e-3 * np.mean(np.abs(true) ** 2)
 
 
 def test_doppler_is_that_of_the_motion():
     model, way = Rays(TONES, True), drive()
     line = fit_taps(model, way, 16, 38.4e6)
-    middle = way.at(np.array([0.25]))[0]
+    middle = way.places_at(np.array([0.25]))[0]
     towards = (model.sources - middle) / np.linalg.norm(model.sources - middle, axis=1)[:, None]
     expected = CARRIER / LIGHT * 10 * towards[0, 0]
     loudest = np.abs(line.gain[:, 0]).mean(0).argmax()

@@ -19,7 +19,7 @@ ROOM = SceneWalls(tuple(box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5]))), PILL
 
 def scene(order: int, most: int = 200, walls: SceneWalls = ROOM, hidden: bool = True):
     told, _, _ = shoebox(80, pillar=True, max_order=order)
-    mirrors = Mirrors.of(walls, np.zeros(3))
+    mirrors = Mirrors.from_walls(walls, np.zeros(3))
     transmitter, places = torch.from_numpy(told.tx[0]), torch.from_numpy(told.rx)
     indices = mirrors.large_planes(0.25)
     return told, mirrors, mirrors.visible_sequences(indices, transmitter, places, order, most, hidden)
@@ -28,7 +28,10 @@ def scene(order: int, most: int = 200, walls: SceneWalls = ROOM, hidden: bool = 
 def test_all_images_are_the_simulators_and_as_visible():
     told, mirrors, sequences = scene(3)
     transmitter = torch.from_numpy(told.tx[0])
-    found, true = images(transmitter, mirrors.planes, sequences).numpy(), told.images.of(told.tx[0])
+    found, true = (
+        images(transmitter, mirrors.planes, sequences).numpy(),
+        told.images.mirror_points(told.tx[0]),
+    )
     apart = np.linalg.norm(found[:, None] - true[None], axis=-1)
     assert sequences[0] == () and (apart.min(1) < 1e-6).all() and len(set(apart.argmin(1))) == len(sequences)
     assert (
@@ -51,7 +54,7 @@ def test_a_wall_that_reflects_to_nobody_has_no_image_but_hides():
     told, _, _ = shoebox(80, max_order=1)
     plate = told.tx[0] + np.array([[0.3, -1, -1], [0.3, 1, -1], [0.3, 1, 1], [0.3, -1, 1.0]])
     walls = SceneWalls((plate,), PILLAR[:0])
-    mirrors = Mirrors.of(walls, np.zeros(3))
+    mirrors = Mirrors.from_walls(walls, np.zeros(3))
     far = torch.from_numpy(told.rx[told.rx[:, 0] > told.tx[0, 0] + 0.5])
     transmitter = torch.from_numpy(told.tx[0])
     sequences = mirrors.visible_sequences([0], transmitter, far, 2, 20, True)
@@ -70,7 +73,7 @@ def split(face: np.ndarray) -> list[np.ndarray]:
 
 def test_triangles_of_a_box_are_six_planes_with_a_rectangle_each():
     faces = [part for face in box_faces(np.zeros(3), np.array([4.0, 3.0, 2.5])) for part in split(face)]
-    whole = Mirrors.of(SceneWalls(tuple(faces), NOTHING), np.array([1.0, 1.0, 1.0]))
+    whole = Mirrors.from_walls(SceneWalls(tuple(faces), NOTHING), np.array([1.0, 1.0, 1.0]))
     assert len(whole.planes) == 6 and sorted(whole.clutter.plane) == [0, 1, 2, 3, 4, 5]
     assert sorted(whole.planes[:, 3].abs().tolist()) == pytest.approx([1, 1, 1, 1.5, 2, 3])
     sides = whole.clutter.patches[:, 2:] - whole.clutter.patches[:, :2]
@@ -80,7 +83,7 @@ def test_triangles_of_a_box_are_six_planes_with_a_rectangle_each():
 def test_walls_of_one_plane_that_do_not_touch_are_apart():
     one = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 2], [0, 0, 2.0]])
     moved = [np.array([3, 0, 0]), np.array([5, 0.005, 0])]
-    found = Mirrors.of(SceneWalls((one, one + moved[0], one[::-1] + moved[1]), NOTHING), np.zeros(3))
+    found = Mirrors.from_walls(SceneWalls((one, one + moved[0], one[::-1] + moved[1]), NOTHING), np.zeros(3))
     assert len(found.planes) == 1 and found.clutter.plane == (0, 0, 0)
     assert found.large_planes(0.5) == [0] and found.large_planes(1.5) == []
 
@@ -88,7 +91,7 @@ def test_walls_of_one_plane_that_do_not_touch_are_apart():
 def test_of_a_fine_mesh_the_smallest_are_left_out(monkeypatch):
     monkeypatch.setattr(known, "MOST_PATCHES", 2)
     faces = tuple(np.eye(3) * size + size * 10 for size in (1.0, 2.0, 3.0))
-    found = Mirrors.of(SceneWalls(faces, NOTHING), np.zeros(3))
+    found = Mirrors.from_walls(SceneWalls(faces, NOTHING), np.zeros(3))
     assert found.left_out == 1 and len(found.clutter.patches) == 2
     assert torch.isfinite(found.clutter.patches).all()
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from closed import fitted_to
+from known_fields import known_field
 from releases import real
 from scenes import fold_of
 
@@ -61,9 +62,9 @@ def smooth(places: np.ndarray, length: float, rng: np.random.Generator, count: i
 def prior_of(data: Measurements) -> tuple[StationPriors, SharedTerms]:
     """Invented settings with every term."""
     trend = Trend(0.0, Law(36.0, 2.5, 2.0, 6.0, None), 1.5, 0.8)
-    never = Prior(Kernel.matern((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
-    own = StationPriors(never, {1: Prior(Kernel.matern((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
-    terms = SharedTerms.prior(rows_of(data), trend, 8.0, 30, 0)
+    never = Prior(Kernel.from_lengths((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
+    own = StationPriors(never, {1: Prior(Kernel.from_lengths((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
+    terms = SharedTerms.from_rows(rows_of(data), trend, 8.0, 30, 0)
     return own, replace(terms, place_db=2.7)
 
 
@@ -95,8 +96,8 @@ def spread_db(found) -> np.ndarray:
 def test_it_is_the_dense_process():
     data = town(40)
     (own, terms), every = prior_of(data), rows_of(data)
-    known, asked = every.at(np.arange(0, 200)), every.at(np.arange(200, 240))
-    known = known.at(np.flatnonzero(known.station != 4))  # never heard
+    known, asked = every.subset(np.arange(0, 200)), every.subset(np.arange(200, 240))
+    known = known.subset(np.flatnonzero(known.station != 4))  # never heard
     posterior, count = own.condition(known, terms, 0), len(known.index)
     gram, values = dense(joined(known, asked), own, terms)
     inner = np.linalg.solve(gram[:count, :count], np.c_[values[:count], gram[:count, count:]])
@@ -104,7 +105,7 @@ def test_it_is_the_dense_process():
     variance = gram[count:, count:].diagonal() - (gram[count:, :count] * inner[:, 1:].T).sum(1)
     places = torch.from_numpy(asked.places)
     rounded = posterior.answer(places, torch.from_numpy(asked.station))
-    said = posterior.answer(places, torch.from_numpy(asked.station), exact=True)
+    said = posterior.answer(places, torch.from_numpy(asked.station), float64=True)
     assert np.allclose(rounded[0], said[0], atol=1e-4) and np.allclose(rounded[1], said[1], atol=1e-4)
     assert np.allclose(said[0].numpy(), asked.decibels - values[count:] + mean, atol=1e-8)
     assert np.allclose(said[1].numpy(), variance, atol=1e-8)
@@ -120,12 +121,12 @@ def test_all_stations_at_once_are_answered_as_one_by_one():
     (own, terms), every = prior_of(data), rows_of(data)
     own = replace(own, heard={})
     rng = np.random.default_rng(0)
-    known = every.at(np.flatnonzero(rng.random(240) < np.linspace(0.3, 0.9, 6)[every.station]))
+    known = every.subset(np.flatnonzero(rng.random(240) < np.linspace(0.3, 0.9, 6)[every.station]))
     posterior = own.condition(known, terms, 0)
     places, number = torch.from_numpy(every.places[:15]), torch.from_numpy(every.station[:15])
     mean, left = posterior.answer(places, number)
     for one in number.unique().tolist():
-        alone = posterior.answer(places[number == one], number[number == one], exact=True)
+        alone = posterior.answer(places[number == one], number[number == one], float64=True)
         assert torch.allclose(mean[number == one], alone[0], atol=1e-9)
         assert torch.allclose(left[number == one], alone[1], rtol=1e-5)
 
@@ -166,7 +167,7 @@ def test_settings_become_likelier():
     rows, densities = rows_of(town()), []
     learned, _ = learn_station_priors(rows, 0)
     begin = StationPriors(
-        replace(learned.never, kernel=Kernel.matern((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {}
+        replace(learned.never, kernel=Kernel.from_lengths((3.0, 30.0), (0.5, 0.5), 0.3, 20.0)), {}
     )
     for own in (begin, learned):
         posterior = own.condition(rows, prior_of(town())[1], 0)
@@ -230,7 +231,7 @@ def test_silent_rows_say_that_powers_are_low():
     (own, terms), rows = prior_of(data), np.arange(len(data))
     errors = []
     for used in (rows, rows[~quiet]):
-        field = JointPowerField.of(data.site, station_places(data, rows)[0], own, terms)
+        field = known_field(data.site, station_places(data, rows)[0], own, terms)
         field.condition(silent, used)
         batch = data.batch(np.flatnonzero(quiet))
         errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
@@ -252,7 +253,7 @@ def test_a_station_whose_place_nobody_gave():
 
 
 def test_rows_are_thinned_at_places_that_stations_share():
-    few = rows_of(town()).thinned(20, 0)
+    few = rows_of(town()).thin_rows(20, 0)
     assert np.array_equal(np.bincount(few.station), [20] * 6)
     assert len(np.unique(few.places[:, :3], axis=0)) == 20
     assert rows_per_station(1) == together.MOST_ROWS and 3_500 < rows_per_station(12) < together.MOST_ROWS
@@ -268,7 +269,7 @@ def test_what_it_refuses():
         choose(data, Gsparc(init=InitSettings(name="scene", file="walls.yaml")))
     own, terms = prior_of(data)
     with pytest.raises(ValueError, match="condition it first"):
-        JointPowerField.of(data.site, POSTS, own, terms).left_out()
+        known_field(data.site, POSTS, own, terms).left_out()
 
 
 def test_gsparc_learns_stations_together(tmp_path):
@@ -283,7 +284,7 @@ def test_gsparc_learns_stations_together(tmp_path):
     predictor = Predictor(method, data.site)
     place, number = data.tx[fold.test[0]] + data.site.origin, int(data.station[fold.test[0]])
     post = POSTS[number]
-    one = predictor.at(number).rssi(tx=place)
+    one = predictor.select_station(number).rssi(tx=place)
     assert np.allclose(one, db(said.mean[0] * data.site.target_scale), atol=4e-3)
     assert np.allclose(one, predictor.rssi(tx=place, rx=post), atol=4e-3)
     assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()  # no station
@@ -320,7 +321,7 @@ def test_halls_gain_over_a_process_of_each_sensor():
 def test_the_error_of_a_gain_is_that_of_stations():
     every = rows_of(town())
     own, _ = learn_station_priors(every, 0)
-    turned = every.at(np.argsort(every.station, kind="stable"))
+    turned = every.subset(np.argsort(every.station, kind="stable"))
     one, other = (learn_shared_terms(rows, own, 0)[2] for rows in (every, turned))
     assert one is not None and other is not None
     assert np.isclose(one.squares, other.squares, rtol=0.3) and np.isclose(one.error, other.error, rtol=0.5)

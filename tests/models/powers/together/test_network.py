@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from known_fields import known_field
 from networks import Network, judged, network, reference
 
 from gsparc.data.own import from_arrays
@@ -68,7 +69,7 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
     assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
-    more = every.joint_method().with_station(
+    more = every.joint_method().add_station(
         np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]])
     )
     around = torch.tensor([[500.0, 0, 1.5], [-500, 0, 1.5]])[:, None].expand(-1, 2, 3)
@@ -173,8 +174,8 @@ def given_settings() -> JointPowerField:
     known = find_sectors(data)
     trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
     own = StationPriors(Prior(shadowing(), trend), {})
-    terms = SharedTerms.prior(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
-    field = JointPowerField.of(data.site, data.site.stations.position, own, terms)
+    terms = SharedTerms.from_rows(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    field = known_field(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
     return field
 
@@ -209,6 +210,6 @@ def test_sectors_of_a_site_share_shadowing():
     assert float(kernel.between(here, there)) == pytest.approx(0.5)
     both = torch.cat([here, there, places(0, 200.0)])
     assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
-    for again in (restored(stored(kernel)), kernel.at(kernel.parameters())):
+    for again in (restored(stored(kernel)), kernel.with_values(kernel.parameters())):
         assert torch.allclose(again.gram(both), kernel.gram(both))
         assert again.amplitude == 20
