@@ -270,7 +270,9 @@ class ConfidenceMixin:
         if uplink is not None:
             from gsparc.prediction import channels
 
-            sure = self._confidence(channels.predict_from_uplink(self.method, self.site, uplink), None)
+            sure = self._confidence(
+                self.method.predict(channels.uplink_query(self.method, self.site, uplink)), None
+            )
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self.queries.query(tx, rx)

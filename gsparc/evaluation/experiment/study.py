@@ -51,15 +51,10 @@ class Condition:
         return self.what if self.what == "none" else f"{self.what} {self.amount:g}"
 
     @property
-    def changes_training(self) -> bool:
-        """Tell whether it changes what is learned from."""
-        return self.what not in ("none", "query")
-
-    @property
     def learned(self) -> Condition:
         """Return the condition whose training stands for this one's."""
         # A query's error changes nothing that is learned: one training serves all of them.
-        return self if self.changes_training else Condition()
+        return Condition() if self.what == "query" else self
 
     def model(self, folder: Path) -> Path:
         """Return where the model that was trained so is, in the folder of its cell."""
