@@ -110,4 +110,4 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
     assert "1 jobs failed" in done.stdout
     timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
     assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stdout)
-    assert (sweep / "sweep.csv").read_text().count("\n") == 2
+    assert (sweep / "sweep.csv").read_text().count("\n") == 3  # heads, the run, its baseline
