@@ -50,7 +50,7 @@ class ClosedForm(Method):
     forgets = False
 
     @property
-    def count(self) -> int:
+    def count_gaussians(self) -> int:
         """Number of Gaussians; 0 where a process is all there is."""
         return self.count_components()
 

@@ -59,7 +59,7 @@ class Frame:
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
 
-    def places(self, query: Query) -> tuple[Tensor, int]:
+    def places_and_count(self, query: Query) -> tuple[Tensor, int]:
         """Return antennas of the moving end (B E, 3) float64 in the frame, and B.
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
@@ -72,7 +72,7 @@ class Frame:
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
 
-    def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
+    def to_left_out_rows(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Turn normalised predictions (n, R) of the rows back; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
         # NaN: who needs a variance takes that of a prediction at the place.
@@ -96,14 +96,16 @@ class SourcesInFrame(ClosedForm):
     factors = torch.ones(1, dtype=torch.complex64)
 
     @abstractmethod
-    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(
+        self, places: Tensor, tones: Tensor, float64: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
 
         Normalised; the prior is the power that is expected without any rows.
         """
 
     @abstractmethod
-    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gains (m, R, N) at the carrier, normalised, ranges (m, N) and sources (N, 3) [m]."""
 
     def predict(self, query: Query) -> Prediction:
@@ -112,10 +114,10 @@ class SourcesInFrame(ClosedForm):
         The variance is of gains, noise, visibility and between searches; the confidence is the explained
         share of the expected power.
         """
-        frame = self._fitted()
-        places, count = frame.places(query)
+        frame = self._fitted_frame()
+        places, count = frame.places_and_count(query)
         tones = torch.from_numpy(frame.site.tones())
-        mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
+        mean, variance, prior = self._predict_normalised(places, tones, query.tx.dtype == torch.float64)
         mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
         # Targets were multiplied by the antennas' factors before the fit.
         mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
@@ -132,16 +134,16 @@ class SourcesInFrame(ClosedForm):
             vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
             the carrier [Hz].
         """
-        frame = self._fitted()
-        places, count = frame.places(query)
-        gain, away, sources = self._paths(places)
+        frame = self._fitted_frame()
+        places, count = frame.places_and_count(query)
+        gain, away, sources = self._normalised_paths(places)
         gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
         ends = moving_end(places)
         unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
         return *merge_equal_paths(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
 
-    def _fitted(self) -> Frame:
+    def _fitted_frame(self) -> Frame:
         if self.site is None or not self.count_components():
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.frame

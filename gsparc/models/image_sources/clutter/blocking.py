@@ -58,10 +58,12 @@ class Clutter:
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
         return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
-    def renumber_planes(self, new: dict[int, int]) -> Clutter:
+    def renumber_planes(self, numbers: dict[int, int]) -> Clutter:
         """Return it with planes of new indices; patches of planes without one are dropped."""
-        patches = [i for i, plane in enumerate(self.plane) if plane in new]
-        return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
+        patches = [i for i, plane in enumerate(self.plane) if plane in numbers]
+        return replace(
+            self, patches=self.patches[patches], plane=tuple(numbers[self.plane[i]] for i in patches)
+        )
 
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor) -> Tensor:
@@ -96,10 +98,10 @@ class Obstacles:
         if len(self.boxes):
             seen = seen * share_past_boxes(paths, self.boxes).prod(0)
         if len(self.patches):
-            seen = seen * self._past_patches(paths)
+            seen = seen * self._share_past_patches(paths)
         return seen
 
-    def _past_patches(self, paths: Paths) -> Tensor:
+    def _share_past_patches(self, paths: Paths) -> Tensor:
         turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
         height, *place = turned.unflatten(0, self.axes.shape[:2])  # each (Q, K, n, L + 1)
         height = height - self.offset
@@ -108,7 +110,7 @@ class Obstacles:
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [each[..., :-1] + share * each.diff() for each in place]
-        outside = 1 - _inside(met, self.patches) * ((crosses | ends_here) & paths.valid[..., None])
+        outside = 1 - _share_inside(met, self.patches) * ((crosses | ends_here) & paths.valid[..., None])
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.plane]
@@ -135,10 +137,10 @@ def share_past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
 
 def share_inside_patches(points: Tensor, patches: Tensor) -> Tensor:
     """Return the soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
-    return _inside([points[None, ..., 0], points[None, ..., 1]], patches)
+    return _share_inside([points[None, ..., 0], points[None, ..., 1]], patches)
 
 
-def _inside(place: list[Tensor], patches: Tensor) -> Tensor:
+def _share_inside(place: list[Tensor], patches: Tensor) -> Tensor:
     """Patches (Q, 4) against coordinates (1, ...), or (Q, ...), each against its own."""
     u, v = place
     low_u, low_v, high_u, high_v = (each.reshape(-1, *[1] * (u.dim() - 1)) for each in patches.T)
