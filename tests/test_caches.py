@@ -36,7 +36,7 @@ def _keys(data, monkeypatch) -> dict[str, str]:
     def asked(key):
         raise Asked(key)
 
-    monkeypatch.setattr(vector_cache, "_rows_solved_before", asked)
+    monkeypatch.setattr(vector_cache, "_solved_rows", asked)
     found = {}
     rows = np.arange(len(data))
     with pytest.raises(Asked) as key_of_vectors:

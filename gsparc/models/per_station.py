@@ -57,9 +57,7 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
     return factory
 
 
-def trained_and_unheard(
-    method: MethodFactory, data: Measurements, fold: Fold
-) -> tuple[np.ndarray, np.ndarray]:
+def known_and_unheard(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return stations (T,) bool with training rows enough for `method`, and those of test rows without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
@@ -201,7 +199,7 @@ class PerStation(Method):
         self._shared = together and joint
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
-        known, unheard = trained_and_unheard(self.factory, data, fold)
+        known, unheard = known_and_unheard(self.factory, data, fold)
         names = list_first([stations.name[t] for t in np.flatnonzero(unheard)])
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
         if not together and unheard.any():
@@ -319,9 +317,7 @@ class PerStation(Method):
     def objects(self) -> SiteObjects:
         """Return those of all copies: what stands in a site stands there for all its stations."""
         return reduce(
-            SiteObjects.joined,
-            (copy.objects() for copy in self._copies.values()),
-            SiteObjects.from_arrays(),
+            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.from_arrays()
         )
 
     def count_components(self) -> int:

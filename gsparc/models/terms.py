@@ -60,12 +60,7 @@ class Terms:
 
 
 def resolve_terms(
-    switches: EffectSettings,
-    init: InitSettings,
-    data: Measurements,
-    hidden: int,
-    count: int,
-    falls: bool,
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, falls: bool
 ) -> Terms:
     """Return the terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
 
@@ -111,7 +106,7 @@ def resolve_terms(
 
 def _refuse_scene(
     data: Measurements, switches: EffectSettings, obstacles: dict[str, str | None], on: dict[str, bool],
-    count: int,
+    count: int
 ) -> None:  # fmt: skip
     """`ValueError` where known walls explain nothing."""
     site, why = data.site, None

@@ -13,7 +13,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory, Reconditions
-from gsparc.models.per_station import PerStation, trained_and_unheard, wrap_per_station
+from gsparc.models.per_station import PerStation, known_and_unheard, wrap_per_station
 from gsparc.training.context import FitContext
 
 
@@ -67,6 +67,6 @@ class Learned:
         if not isinstance(self.method, PerStation):
             return fold
         # A station that was fitted on all rows may have too few of them in a fold.
-        known, _ = trained_and_unheard(self.method.factory, self.data, fold)
+        known, _ = known_and_unheard(self.method.factory, self.data, fold)
         assert self.data.station is not None
         return replace(fold, test=fold.test[known[self.data.station[fold.test]]])

@@ -24,12 +24,12 @@ NAMED = 8  # suspect images named in a log line
 
 
 @lru_cache(maxsize=1)
-def _rows_solved_before(key: str) -> dict[int, tuple[Any, ...]]:
+def _solved_rows(key: str) -> dict[int, tuple[Any, ...]]:
     """By row of the data last asked for what is known of it: its parts of `RecoveredVectors`, and seconds."""
     return {}
 
 
-forget_vectors = _rows_solved_before.cache_clear  # before what is to pay for its own work
+forget_vectors = _solved_rows.cache_clear  # before what is to pay for its own work
 
 
 def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[RecoveredVectors, Spent]:
@@ -44,7 +44,7 @@ def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple
         seed: of the random starts.
     """
     known, names = (
-        _rows_solved_before(f"{identity_hash(data)} {seed}"),
+        _solved_rows(f"{identity_hash(data)} {seed}"),
         [one.name for one in fields(RecoveredVectors)],
     )
     missing = np.array([row for row in rows.tolist() if row not in known], np.int64)

@@ -98,12 +98,12 @@ def fit_level_and_exponent(loss: np.ndarray, rows: PowerRows, start: np.ndarray)
     `loss` (n,) [dB] is that of exponent 1.
     """
 
-    def negative_log_posterior(p: np.ndarray) -> tuple[float, np.ndarray]:
+    def neg_log_posterior(p: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes, _ = _posterior(p, loss, rows)
         return value, np.array(slopes)
 
     bounds = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB))]
-    result = minimize(negative_log_posterior, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    result = minimize(neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=bounds)
     return float(result.fun), result.x
 
 
@@ -116,18 +116,14 @@ def _initial_parameters(loss: np.ndarray, rows: PowerRows) -> np.ndarray:
     return np.array([middle, USUAL, math.log(min(max(scale, 1.0), SPREADS_DB[1] / 2))])
 
 
-def fit_law(rows: PowerRows, static_place: np.ndarray | None) -> Law:
+def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
     """Return the law of largest likelihood; the floor is chosen by it too.
 
     Args:
         rows: at least one.
-        static_place: (3,) of the still end [m]; None where `rows.places` are of both ends.
+        end: (3,) of the still end [m]; None where `rows.places` are of both ends.
     """
-    at = (
-        None
-        if static_place is None
-        else (float(static_place[0]), float(static_place[1]), float(static_place[2]))
-    )
+    at = None if end is None else (float(end[0]), float(end[1]), float(end[2]))
     law = Law(0.0, USUAL, 0.0, 1.0, at)
     places = torch.from_numpy(np.ascontiguousarray(rows.places, np.float64))
     far = law.distance(places).numpy()
@@ -161,7 +157,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, len(low))))
     tiny = (1e-3 * size) ** 2  # a row on the very place must not decide alone
 
-    def negative_log_posterior(p: np.ndarray) -> tuple[float, np.ndarray]:
+    def neg_log_posterior(p: np.ndarray) -> tuple[float, np.ndarray]:
         towards = (p[PARAMETERS:] * size) - rows.places
         squared = (towards**2).sum(1) + tiny
         value, slopes, slope = _posterior(p, to_decibels(squared) / 2, rows)
@@ -176,12 +172,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
         start = np.concatenate([_initial_parameters(loss, rows), place / size])
         result.append(
             minimize(
-                negative_log_posterior,
-                start,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=limits,
-                callback=stop_when_late,
+                neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late
             )
         )
     return min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size

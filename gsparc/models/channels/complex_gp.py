@@ -74,7 +74,7 @@ class ComplexGP(ClosedForm):
     @property
     def kernel(self) -> Kernel:
         """Its length, noise and power."""
-        return self._require_fitted().prior.kernel
+        return self._posterior().prior.kernel
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
@@ -169,24 +169,20 @@ class ComplexGP(ClosedForm):
         """See `Method.predict`."""
         assert self.site is not None
         dtype, kernel = query.tx.dtype, self.kernel
-        posterior = self._require_fitted().answer(query.places(self.site), dtype == torch.float64)
+        posterior = self._posterior().answer(query.places(self.site), dtype == torch.float64)
         share = posterior.variance / (1 + kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
         told = Prediction(mean, (kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
         return self.runs.apply_factors(told, query.run)
 
-    def _require_fitted(self) -> Posterior:
+    def _posterior(self) -> Posterior:
         if self.posterior is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
         return self.posterior
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {
-            "posterior": stored(self._require_fitted()),
-            "runs": stored(self.runs),
-            "shape": list(self.shape),
-        }
+        return {"posterior": stored(self._posterior()), "runs": stored(self.runs), "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

@@ -53,14 +53,14 @@ class _Searcher:
         self,
         probes: Probes,
         planes: Tensor,
-        wave_precision: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
+        precision: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
     ) -> Tensor:
         """Rise of the log likelihood (W, levels) of each plane alone."""
 
         def image_waves(probe: Probe, chunk: Tensor) -> Tensor:
             return Images.from_planes(self.frame, planes[chunk]).waves(probe.group)
 
-        return likelihood_gains(probes, len(planes), image_waves, LEVELS, wave_precision)
+        return likelihood_gains(probes, len(planes), image_waves, LEVELS, precision)
 
     def add_plane(self, plane: Tensor, level: float, gain: float) -> None:
         """One more plane (4,)."""

@@ -148,10 +148,7 @@ class SightedSources:
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
         power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, TINY)), self.kernel
-        coherent, correlation = (
-            self._coherence(),
-            {each: self._gain_correlation(each) for each in KERNELS},
-        )
+        coherent, correlation = (self._coherence(), {each: self._gain_correlation(each) for each in KERNELS})
         for _ in range(ROUNDS):
             covariance = self._cross_covariance(self.waves, coherent, power)
             tried = {

@@ -105,10 +105,7 @@ def fit_errors(
     near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
     regression = RelativeErrorRegression.from_rows(columns, relative_error)
-    precision, farthest = (
-        _precision(kernel, known[near]),
-        max(float(distance[:, 0].max()), LEAST_M),
-    )
+    precision, farthest = (_precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M))
     return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 
 

@@ -246,11 +246,7 @@ def _fit_one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str
 
 
 def _search_kernel(
-    rows: PowerRows,
-    base: Candidate,
-    starts: list[Kernel],
-    cost: float = 0.0,
-    limit: int = LOOKS,
+    rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
     value, kernel = fit_kernel_by_left_out(starts, *rows.regression_about(base.trend), looks=limit)

@@ -102,9 +102,8 @@ class LearnedField(Method):
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
-    _is_process_alone = (
-        False  # whether a process beside it has all the weight: another stage is worth no seconds
-    )
+    # Whether a process beside it has all the weight: another stage is worth no seconds.
+    _is_process_alone = False
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None

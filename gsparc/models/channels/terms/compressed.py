@@ -102,14 +102,10 @@ class Basis:
 
     @staticmethod
     def from_matrix(
-        key: tuple[Hashable, ...],
-        places: Tensor,
-        correlation: Callable[[], Tensor],
-        noise: float,
-        shared: Cache,
+        key: tuple[Hashable, ...], places: Tensor, gram: Callable[[], Tensor], noise: float, shared: Cache
     ) -> Basis:
         """Return that of a correlation (n, n) float64 beside `noise`, its share."""
-        size, vectors = torch.linalg.eigh(correlation())
+        size, vectors = torch.linalg.eigh(gram())
         mask = size > FLOOR * noise
         whole = int(mask.sum()) > WORTH * len(places)
         columns = torch.eye(len(places), dtype=torch.float64) if whole else vectors[:, mask]

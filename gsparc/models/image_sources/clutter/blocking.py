@@ -58,12 +58,10 @@ class Clutter:
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
         return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
 
-    def renumber_planes(self, numbers: dict[int, int]) -> Clutter:
+    def renumber_planes(self, new: dict[int, int]) -> Clutter:
         """Return it with planes of new indices; patches of planes without one are dropped."""
-        patches = [i for i, plane in enumerate(self.plane) if plane in numbers]
-        return replace(
-            self, patches=self.patches[patches], plane=tuple(numbers[self.plane[i]] for i in patches)
-        )
+        patches = [i for i, plane in enumerate(self.plane) if plane in new]
+        return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
 
 
 def visible_share(paths: Paths, clutter: Clutter, planes: Tensor) -> Tensor:

@@ -140,13 +140,7 @@ class _ClutterSearcher:
 
     def _run_round(self) -> None:
         """One round of everything; what each step leaves is `whole`."""
-        for step in (
-            self._try_mirrors,
-            self._try_patches,
-            self._try_boxes,
-            self._try_sequences,
-            self._prune,
-        ):
+        for step in (self._try_mirrors, self._try_patches, self._try_boxes, self._try_sequences, self._prune):
             step()
             self.whole = self.nll, self.scene
 
