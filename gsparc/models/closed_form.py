@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 from torch import Tensor
@@ -36,6 +36,20 @@ class LeftOutRows:
     rows: np.ndarray
     mean: Tensor
     variance: Tensor
+
+
+class Moments(NamedTuple):
+    """Means of what is predicted, and variances (m,) after and before rows were learned from.
+
+    Attributes:
+        mean: any shape.
+        variance: of the prediction.
+        prior: the variance, or power, that is expected without any rows.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    prior: Tensor
 
 
 class ClosedForm(Method):

@@ -349,11 +349,27 @@ class HasJoint(Protocol):
         ...
 
 
+class QueryPaths(NamedTuple):
+    """Paths to B places and A antennas of the moving end.
+
+    Attributes:
+        gain: (B, A, N) complex64 at the carrier, in stored units.
+        delay: (B, A, N) float64 [s].
+        unit: (B, N, 3) from the middle of the antennas to where a path comes from.
+        carrier_hz: of the gains [Hz].
+    """
+
+    gain: Tensor
+    delay: Tensor
+    unit: Tensor
+    carrier_hz: float
+
+
 @runtime_checkable
 class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> QueryPaths:
         """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival, the carrier [Hz].
 
         Raises:

@@ -12,6 +12,7 @@ from gsparc.models.channels.columns import Group, Slot, SlotPlaces
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
 from gsparc.models.channels.terms.spherical import Spherical
+from gsparc.models.closed_form import Moments
 from gsparc.processes.density import TINY
 
 
@@ -51,13 +52,13 @@ class SharedGains:
         reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
         return SharedGains(gain * reliability, explained, sum(levels) / count)
 
-    def predict(self, prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
+    def predict(self, prior: ChannelPrior, at: SlotPlaces) -> Moments:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
         before = self.level / _distance_to_middle(prior, at.slot) ** 2 * prior.variance(at)
         waves, _, away = _waves_and_powers(prior, at)
         waves = waves / away[:, None]
         after = before - self.explained @ waves.abs().square()
-        return self.gain @ waves, after.clamp_min(0), before
+        return Moments(self.gain @ waves, after.clamp_min(0), before)
 
 
 def _waves_and_powers(prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:

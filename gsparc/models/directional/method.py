@@ -17,12 +17,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
+from gsparc.models.closed_form import LeftOutRows, Moments, from_containers, to_containers
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
 from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
-from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_static_phase
+from gsparc.models.image_sources.frame import Frame, SourcePaths, SourcesInFrame, require_static_phase
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import wave, wave_over_band
@@ -154,22 +154,20 @@ class DirectionalGP(SourcesInFrame):
         return self.posterior.positions.points + self._fitted_frame().middle, self.posterior.power.sqrt()
 
     # ---- answers ----
-    def _predict_normalised(
-        self, places: Tensor, tones: Tensor, float64: bool
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`."""
         process = self.posterior.in_float64 if float64 else self.posterior
         at = process.arrival_at(places, torch.tensor(self.frame.carrier_hz))
         gains = at.probability[:, :, None] * process.mean_gains(at)
         mean = gains.mT @ wave_over_band(at.away, tones, process.power.dtype)
-        return mean, *process.error_and_power(at, self.frame.carrier_hz)
+        return Moments(mean, *process.error_and_power(at, self.frame.carrier_hz))
 
-    def _normalised_paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """See `SourcesInFrame`."""
         at = self.posterior.arrival_at(places, torch.tensor(self.frame.carrier_hz))
         gain = at.probability * wave(at.away, self.frame.carrier_hz)
         gain = self.posterior.mean_gains(at) * gain[:, :, None]
-        return gain.mT, at.away, self.posterior.positions.points
+        return SourcePaths(gain.mT, at.away, self.posterior.positions.points)
 
     def left_out(self) -> LeftOutRows:
         """Return receivers, each predicted from all others; its own visibility is left out, too."""

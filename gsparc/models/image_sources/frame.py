@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,9 +14,9 @@ from torch.nn.functional import normalize
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows, Moments
 from gsparc.models.image_sources.rows import Rows, channel_places, moving_end, static_array
-from gsparc.models.method import Prediction
+from gsparc.models.method import Prediction, QueryPaths
 from gsparc.physics.waves import LIGHT
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
@@ -84,6 +84,20 @@ class Frame:
         return {name: value for name, value in vars(self).items() if name != "site"}
 
 
+class SourcePaths(NamedTuple):
+    """Paths from N sources to m places.
+
+    Attributes:
+        gain: (m, R, N) complex at the carrier, normalised.
+        away: (m, N) [m], their lengths.
+        sources: (N, 3) [m].
+    """
+
+    gain: Tensor
+    away: Tensor
+    sources: Tensor
+
+
 class SourcesInFrame(ClosedForm):
     """Channels as sums of sources that a search proposes.
 
@@ -96,16 +110,14 @@ class SourcesInFrame(ClosedForm):
     factors = torch.ones(1, dtype=torch.complex64)
 
     @abstractmethod
-    def _predict_normalised(
-        self, places: Tensor, tones: Tensor, float64: bool
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
 
         Normalised; the prior is the power that is expected without any rows.
         """
 
     @abstractmethod
-    def _normalised_paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """Gains (m, R, N) at the carrier, normalised, ranges (m, N) and sources (N, 3) [m]."""
 
     def predict(self, query: Query) -> Prediction:
@@ -126,7 +138,7 @@ class SourcesInFrame(ClosedForm):
         variance, prior = (part.view(count, each).mean(1) for part in (variance, prior))
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> QueryPaths:
         """Return the paths that `predict` sums, one per source, which several searches may have found.
 
         Returns:
@@ -141,7 +153,7 @@ class SourcesInFrame(ClosedForm):
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
         ends = moving_end(places)
         unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
-        return *merge_equal_paths(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
+        return merge_equal_paths(QueryPaths(gain, delay, unit, frame.carrier_hz))
 
     def _fitted_frame(self) -> Frame:
         if self.site is None or not self.count_components():
@@ -149,25 +161,17 @@ class SourcesInFrame(ClosedForm):
         return self.frame
 
 
-def merge_equal_paths(
-    gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first.
-
-    Args:
-        gain: (B, A, N) complex.
-        delay: (B, A, N) [s].
-        unit: (B, N, 3) towards the sources.
-        carrier_hz: of the gains [Hz].
-    """
+def merge_equal_paths(paths: QueryPaths) -> QueryPaths:
+    """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first."""
+    gain, delay, unit, carrier_hz = paths
     if not len(gain):
-        return gain, delay, unit
+        return paths
     # A source is where the first query sees it: it stands still.
     places = unit[:1] * (LIGHT * delay[:1].mean(1))[..., None]
     first = (torch.cdist(places, places) < LIGHT / carrier_hz / 2).int().argmax(2).flatten()
     kept, number = first.unique(return_inverse=True)
     summed = gain.new_zeros(*gain.shape[:2], len(kept)).index_add_(2, number, gain)
-    return summed, delay[..., kept], unit[:, kept]
+    return QueryPaths(summed, delay[..., kept], unit[:, kept], carrier_hz)
 
 
 def require_static_phase(site: Site, name: str) -> None:

@@ -17,12 +17,13 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.field.initial import Snapshot
-from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
+from gsparc.models.closed_form import LeftOutRows, Moments, from_containers, to_containers
 from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path_scene, find_element_factors
 from gsparc.models.image_sources.ensemble import Look, Member
 from gsparc.models.image_sources.frame import (
     Frame,
+    SourcePaths,
     SourcesInFrame,
     require_fixed_rotation,
     require_static_phase,
@@ -259,22 +260,21 @@ class ImageSourceGP(SourcesInFrame):
         target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)
 
-    def _predict_normalised(
-        self, places: Tensor, tones: Tensor, float64: bool
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""
         stack, variance, prior = (self.query.in_float64 if float64 else self.query).predict(places, tones)
         weight = self.weights[:, None, None, None]
         mean = (weight * stack).sum(0)  # of (members, B E, R, K)
-        return mean, variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1), prior
+        spread = (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
+        return Moments(mean, variance + spread, prior)
 
-    def _normalised_paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """See `SourcesInFrame`."""
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
         away = self.query.ranges(places)
         gain = self.query.gains(places) * weight[:, None, None]
         gain = gain * wave(away, self.frame.carrier_hz).T[..., None]
-        return gain.movedim(0, -1), away, self.query.sources
+        return SourcePaths(gain.movedim(0, -1), away, self.query.sources)
 
     def left_out(self) -> LeftOutRows:
         """Return receivers, each predicted from all others."""

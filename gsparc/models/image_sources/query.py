@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gsparc.models.closed_form import Moments
 from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances
 from gsparc.models.image_sources.rows import moving_end, ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
@@ -96,7 +97,7 @@ class EnsembleMeans:
         """The same in float64."""
         return to_double(self)
 
-    def predict(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def predict(self, queries: Tensor, tones: Tensor) -> Moments:
         """Return means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,).
 
         Variance and the power expected without any rows hold at the middle of the band; 0 and 1 where no
@@ -106,20 +107,20 @@ class EnsembleMeans:
         if len(parts) == 1:
             return parts[0]
         means, variances, priors = zip(*parts, strict=True)
-        return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
+        return Moments(torch.cat(means, 1), torch.cat(variances), torch.cat(priors))
 
-    def _predict_part(self, part: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_part(self, part: Tensor, tones: Tensor) -> Moments:
         gains, varying, seen = self._gains_and_shares(part)
         waves = wave_over_band(self.ranges(part), tones, varying.dtype)  # (m, K, F)
         split = zip(gains.permute(1, 2, 0).split(self.counts, 2), waves.split(self.counts, 1), strict=True)
         means = torch.stack([gain @ each for gain, each in split])
         if self.variance is None:
-            return means, torch.zeros(len(part)), torch.ones(len(part))
+            return Moments(means, torch.zeros(len(part)), torch.ones(len(part)))
         first = self.counts[0]
         arriving = waves[:, :first, len(tones) // 2]
         if seen is not None:
             arriving = arriving * seen[:first].T
-        return means, *self.variance(arriving, varying[:first])
+        return Moments(means, *self.variance(arriving, varying[:first]))
 
     def gains(self, queries: Tensor) -> Tensor:
         """Return complex gains (K, m, R) of the sources of all processes at queries."""

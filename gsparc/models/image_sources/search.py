@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
-from gsparc.field.initial import Snapshot
+from gsparc.field.initial import InitSettings, Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import (
     find_sources_in_box,
@@ -66,10 +66,10 @@ class SearchSettings(Checked):
     """
 
     searches: int = setting(6, whole(1))
-    search_rows: int = setting(700, whole(LEAST_ROWS))
-    rows: int = setting(3000, whole(LEAST_ROWS))
-    margin: float = setting(8.0, POSITIVE)
-    max_sources: int = setting(60, whole(1))
+    search_rows: int = setting(InitSettings.search_rows, whole(LEAST_ROWS))
+    rows: int = setting(InitSettings.rows, whole(LEAST_ROWS))
+    margin: float = setting(InitSettings.margin, POSITIVE)
+    max_sources: int = setting(InitSettings.max_sources, whole(1))
     order: int = setting(orders.ORDER, whole(0))
     offsets: Snapshot = setting("none", choice(*get_args(Snapshot)))
     clutter: bool = setting(True, switch())

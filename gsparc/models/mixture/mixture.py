@@ -26,7 +26,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
-from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
+from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, QueryPaths
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
@@ -246,7 +246,7 @@ class Mixture(LearnsTogether, ClosedForm):
         """See `HasProcess`."""
         return self.member.process() if isinstance(self.member, HasProcess) else None
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> QueryPaths:
         """See `HasPaths`; of solutions that are made of paths each source once, by their weights in the mean.
 
         What other solutions and the residual add to channels is in no path.
@@ -257,7 +257,7 @@ class Mixture(LearnsTogether, ClosedForm):
         gains, delays, units, carriers = zip(*(method.paths(query) for _, method in made), strict=True)
         gain = torch.cat([weight * own for (weight, _), own in zip(made, gains, strict=True)], dim=2)
         delay, unit, carrier = torch.cat(delays, dim=2), torch.cat(units, dim=1), carriers[0]
-        return *merge_equal_paths(gain, delay, unit, carrier), carrier
+        return merge_equal_paths(QueryPaths(gain, delay, unit, carrier))
 
     # -- what it is made of --------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ process.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,13 @@ from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, fit_fringes, nearest_distances, resolves_wavelength
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, describe_weights, subtract_means
-from gsparc.models.powers.settings import LAW_NEEDS, candidate_priors, choose_candidate, mix_candidates
+from gsparc.models.powers.settings import (
+    LAW_NEEDS,
+    MeanLaw,
+    candidate_priors,
+    choose_candidate,
+    mix_candidates,
+)
 from gsparc.models.target_rows import power_rows, to_entry_variance, to_targets
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
@@ -39,6 +45,22 @@ from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
+
+
+class DecibelMoments(NamedTuple):
+    """What is said of b places.
+
+    Attributes:
+        mean: (b,) [dB].
+        variance: (b,) [dB^2].
+        unknown: (b,), share of the prior variance.
+        explained: (b,) [dB], the part of the mean that coherent waves explain, or all of it.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    unknown: Tensor
+    explained: Tensor
 
 
 class PowerField(ClosedForm):
@@ -96,7 +118,7 @@ class PowerField(ClosedForm):
             rest = subtract_means(seen, own)
             law, notes = fit_site_law(rest, site) if told else (None, ())
             trend = add_terms_to_trend(rest, replace(trend_about_rows(rest, law), more=(walls,)), own)
-            best = choose_candidate(seen, [(trend, 0.0, ())], self.seed, chosen_on)
+            best = choose_candidate(seen, [MeanLaw(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"
             note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
@@ -168,10 +190,8 @@ class PowerField(ClosedForm):
         """
         process, places = self._require_process(), query.places(self.site)
         parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
-        mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
-        mean, spread, share, explained = (
-            part.to(query.tx.dtype) for part in (mean, spread, share, explained)
-        )
+        joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
+        mean, spread, share, explained = joined
         power = self._to_powers(mean)
         explained_power = self._to_powers(explained) if self.count_components() else None
         return Prediction(power, to_entry_variance(spread, power, "rssi"), share, explained_power)
@@ -216,13 +236,13 @@ class PowerField(ClosedForm):
         self.priors, self.powers, self.fringes = parts
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
 
-    def _decibel_moments(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
-        """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
+    def _decibel_moments(self, process: PowerProcess, places: Tensor) -> DecibelMoments:
         mean, spread, share = process.answer(places)
         if self.fringes is None:
-            return mean, spread, share, mean
+            return DecibelMoments(mean, spread, share, mean)
         mean, factor = self.fringes.blend_solutions(mean, places, self._nearest_distance(places))
-        return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)
+        explained = self.fringes.solution_powers(places).mean(1)
+        return DecibelMoments(mean, spread * factor, share, explained)
 
     def _nearest_distance(self, places: Tensor) -> Tensor:
         """From the nearest known row (B,) [m]."""

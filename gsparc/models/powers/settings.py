@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -72,6 +72,14 @@ def process_and_notes(
     return process, (best.description, *best.notes, *more)
 
 
+class MeanLaw(NamedTuple):
+    """A prior mean, what it costs [nats], and what must be said of it."""
+
+    trend: Trend
+    cost: float
+    notes: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Candidate:
     """A prior, its log likelihood less `cost` for fitted parameters, and what must be said of it."""
@@ -109,15 +117,15 @@ def candidate_priors(
     """
     rest = subtract_means(rows, terms)
     laws = _candidate_laws(rest, site, "auto")
-    trends = [(add_terms_to_trend(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
+    trends = [MeanLaw(add_terms_to_trend(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
     found = sorted(
         (choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda one: -one.score
     )
-    return (
-        found if rows.silent.any() else [*found, _fit_kriging(rows.draw_subset(max_rows, seed), trends[0][0])]
-    )
+    if rows.silent.any():
+        return found
+    return [*found, _fit_kriging(rows.draw_subset(max_rows, seed), trends[0].trend)]
 
 
 def _fit_kriging(rows: PowerRows, trend: Trend) -> Candidate:
@@ -172,9 +180,7 @@ def _errors_among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
     return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
-def choose_candidate(
-    rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, max_rows: int
-) -> Candidate:
+def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     best = _choose_on_part(rows, trends, seed, min(max_rows, COMPARED_ON) if many else max_rows)
@@ -184,15 +190,13 @@ def choose_candidate(
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
-def _choose_on_part(
-    rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, max_rows: int
-) -> Candidate:
+def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows.heard.draw_subset(max_rows, seed)
     few = loud.draw_subset(COMPARED_ON, seed)
     weighed = rows.draw_subset(min(WEIGHED_ON, max_rows), seed)
     both = weighed.silent.any() and not weighed.silent.all()
-    candidates = [_fit_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
+    candidates = [_fit_one_length(few, *law) for law in trends]
     scores = [one.score for one in candidates]
     if both and not out_of_time():
         weighed = _select_doubtful(weighed, candidates[-1])
@@ -216,21 +220,19 @@ def _choose_on_part(
     return best
 
 
-def _candidate_laws(
-    rows: PowerRows, site: Site, mean: MeanName
-) -> list[tuple[Trend, float, tuple[str, ...]]]:
+def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw]:
     """Candidate means, their cost, and notes.
 
     The cost is the number of parameters that the covariance leaves out, less the prior odds of a
     law: near the rows both predict alike, and far from them powers fall.
     """
-    constant: tuple[Trend, float, tuple[str, ...]] = (trend_about_rows(rows, None), 0.0, ())
+    constant = MeanLaw(trend_about_rows(rows, None), 0.0, ())
     if mean == "constant" or (mean == "auto" and int((~rows.silent).sum()) < LAW_NEEDS):
         return [constant]
     law, notes = fit_site_law(rows, site)
     trend = trend_about_rows(rows, law)
     odds = LAW_ODDS if law.exponent >= LEAST_FALL else 0.0
-    by_distance = trend, 4 if notes else 1 - odds, notes  # its floor, and a place that was sought
+    by_distance = MeanLaw(trend, 4 if notes else 1 - odds, notes)  # its floor, and a place that was sought
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 

@@ -14,7 +14,7 @@ from scenes import error, fold_of
 
 from gsparc.data.own import from_arrays
 from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
-from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _negative_log_likelihood
+from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
 from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
@@ -191,7 +191,7 @@ def test_the_inner_matrix_of_hardly_any_noise_has_a_factor():
     columns = torch.cat([one, one * (1 + 1e-7)], 1)
     single = columns.T @ columns + torch.eye(2)
     assert torch.linalg.cholesky_ex(single)[1] > 0
-    assert torch.isfinite(_negative_log_likelihood(columns, one[:, 0], 0.0))
+    assert torch.isfinite(_nll(columns, one[:, 0], 0.0))
 
 
 def test_clutter_is_looked_for_without_noise():
