@@ -195,7 +195,7 @@ class Method(MethodFactory):
         return None
 
     def reduction_settings(self) -> tuple[str, ...]:
-        """Return names of the settings of `reduced` that mean something to what was fitted; here none."""
+        """Return names of the settings of `reduce` that mean something to what was fitted; here none."""
         return () if self.reducible is None else self.reducible.reduction_settings()
 
     def reduction_inputs(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:

@@ -268,17 +268,15 @@ class _Search:
     def _measure(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
         """With what left-out rows say."""
         errors = np.mean([_left_out_squares(part, prior).mean(1) for part in parts], axis=0)
-        return Candidate(prior, negative_log_evidence(parts, prior) + self._parameter_cost(prior), errors)
+        numbers = sum(2 * group.target.numel() for group in self.groups)
+        # What the terms beside the isotropic field must gain [nats].
+        worth = 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
+        return Candidate(prior, negative_log_evidence(parts, prior) + worth, errors)
 
     def _refit(self, prior: ChannelPrior) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compress(prior)
         return self._measure(fit_powers(parts, prior, SHRINKAGE)[0], parts)
-
-    def _parameter_cost(self, prior: ChannelPrior) -> float:
-        """What the terms beside the isotropic field must gain [nats]."""
-        numbers = sum(2 * group.target.numel() for group in self.groups)
-        return 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
 
     @property
     def has_static_end(self) -> bool:

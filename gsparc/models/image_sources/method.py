@@ -289,7 +289,7 @@ class ImageSourceGP(SourcesInFrame):
 
     @torch.no_grad()
     def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Method.reduced`: `searches` of largest weight, no variance; no source can be spared."""
+        """See `Method.reduce`: `searches` of largest weight, no variance; no source can be spared."""
         twin = copy.copy(self)
         count = min(int(settings.get("searches", len(self.members))), len(self.members))
         chosen = self.weights.topk(count).indices.sort().values

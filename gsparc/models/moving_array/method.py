@@ -116,10 +116,10 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def reduction_settings(self) -> tuple[str, ...]:
-        """See `Method.reduced`."""
+        """See `Method.reduce`."""
         return ("keep", "stride", "confidence")
 
-    reduced = reduce_moving_array
+    reduce = reduce_moving_array
 
     # -- learning ----------------------------------------------------------------------------------
 

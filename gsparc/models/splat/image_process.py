@@ -134,7 +134,7 @@ class ImageProcess(LearnedField):
         return None if process_only else super().gradient_problem()
 
     def reduce(self, settings: Settings, measured: dict[str, Any]) -> Method:  # type: ignore[override]
-        """See `Method.reduced`."""
+        """See `Method.reduce`."""
         twin = copy.copy(self)
         twin._average = None
         result = LearnedField.reduce(twin, settings, measured)
