@@ -127,7 +127,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     stored = ("mean", "axes", "lost", "scores", "powers")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
-    count = 0  # type: ignore[assignment]
+    count_gaussians = 0  # type: ignore[assignment]
     powers: PowerProcess | None = None  # None: not powers
     scores: Posterior | None = None  # of what is not
 

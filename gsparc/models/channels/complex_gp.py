@@ -60,7 +60,7 @@ class ComplexGP(ClosedForm):
 
     name = "complex_gp"
     both_ends = True
-    count = 0  # type: ignore[assignment]
+    count_gaussians = 0  # type: ignore[assignment]
 
     def __init__(self) -> None:
         self.site: Site | None = None
