@@ -70,7 +70,7 @@ def test_a_probe_gains_what_the_likelihood_rises():
     groups, prior = _bare(_data(*_site([WALL], ends=1)))
     group, level = groups[0], 0.2
     probe = Probe.from_group(compress_groups(groups, prior)[0], prior)
-    covariance = prior.of_groups(groups)[0] + prior.disturbance(group)
+    covariance = prior.signal_covariances(groups)[0] + prior.disturbance(group)
     waves = torch.randn(2, len(group), dtype=torch.complex128, generator=torch.manual_seed(0))
     for _ in range(2):  # alone, then beside the first
         for wave, gain in zip(waves, probe.likelihood_gain(waves, level), strict=True):
