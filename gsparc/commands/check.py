@@ -61,7 +61,9 @@ def check(
     if stations is not None and stations.sector is not None and (abs(stations.sector[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
-    for topic, sentence in [*topics, *(("warning", warning) for warning in group_warnings(warnings))]:
+    topics += [("warning", warning) for warning in group_warnings(warnings)]
+    doubts = sum(topic in ("warning", "units?", "outliers?") for topic, _ in topics)
+    for topic, sentence in topics:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
@@ -78,7 +80,8 @@ def check(
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
         return False
-    _line(console, f"{path}: good")
+    verdict = f"readable, but see its {doubts} warning{'s' * (doubts > 1)}" if doubts else "good"
+    _line(console, f"{path}: {verdict}")
     return True
 
 

@@ -67,7 +67,7 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     usual = max(5 * float(np.median(counts)), 3 * counts[1])
     if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, usual):
         share = f"{counts[0]} of {len(values)} levels are exactly {least}"
-        warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
+        warnings.append(f"{share}, the least: not heard? then say dataset.not_heard=[{least}]")
         values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
     if low < 0 and high > HIGHEST_DBM:
