@@ -92,7 +92,7 @@ def sensitivity_levels(data: Measurements) -> np.ndarray | None:
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """RMSE [dB] of all rows, silent ones by what predictions exceed their level; empty where none is.
+    """RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number, if any.
 
     That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
     """
@@ -104,7 +104,8 @@ def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | No
     floor = level[level > 0].min() if (level > 0).any() else np.finfo(np.float64).tiny
     beyond = side * 10 * np.log10(np.where(prediction > 0, prediction, floor) / np.maximum(level, floor))
     error = np.where(side == 0, scores.samples["error_db"], np.maximum(beyond, 0.0))
-    return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
+    rmse = float(np.sqrt(np.nanmean(error**2)))
+    return {"rmse_db_with_silent": rmse, "silent_samples": int((side > 0).sum())}
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
