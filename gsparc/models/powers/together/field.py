@@ -101,7 +101,7 @@ class JointPowerField(ClosedForm):
             self.own, remarks = learn_station_priors(used, self.seed, budget)
         else:
             used = relabel_by_site(used, network)
-            prior, remarks = learn_network(used, network, data.site.stations.name, self.seed, budget)
+            prior, remarks = learn_network(used, network, data.site.stations.shown, self.seed, budget)
             self.own = StationPriors(prior, {})
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
