@@ -60,9 +60,10 @@ def joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> Clos
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
-def bearings(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
-    """Return sources where bearings cross."""
-    return MovingArrayField(replace(SearchSettings(), sources=init.max_sources), seed=context.seed)
+def bearings(init: InitSettings, clutter: bool, context: FitContext, **more: int) -> ClosedForm:
+    """Return sources where bearings cross; `more` is of `MovingArrayField`."""
+    search = replace(SearchSettings(), sources=init.max_sources)
+    return MovingArrayField(search, seed=context.seed, **more)
 
 
 def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[st
 CANDIDATES: dict[str, Candidate] = {
     "sources": sources,
     "scene": scene,
-    "rays": lambda init, clutter, context: DirectionalGP(init.rows, context.seed),
+    "rays": lambda init, clutter, context: DirectionalGP(init.rows, context.seed, clutter),
     "diffuse": lambda *unused: ChannelField(),
     "powers": powers,
     "joint_powers": joint_powers,
