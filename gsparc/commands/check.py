@@ -61,7 +61,8 @@ def check(
     if stations is not None and stations.sector is not None and (abs(stations.sector[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
-    for topic, sentence in [*topics, *(("warning", warning) for warning in group_warnings(warnings))]:
+    doubts = [("warning", warning) for warning in group_warnings(warnings)]
+    for topic, sentence in [*topics, *doubts]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
@@ -78,7 +79,7 @@ def check(
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
         return False
-    _line(console, f"{path}: good")
+    _line(console, f"{path}: good" + (f", {len(doubts)} doubt{'s' * (len(doubts) > 1)}" if doubts else ""))
     return True
 
 

@@ -23,8 +23,9 @@ class EffectSettings(Checked):
         moving_array: the same of a receiver that moves, in powers: sources seen through the array's lags.
         phase: carrier phase from places of sources, for channels.
         power: distance law in decibels and known walls along the path, for received powers.
-        visibility: what hides: occluding boxes and finite mirrors of sources, known walls of powers and, of
-            several stations, shadowing of a place; rasterized Gaussians always occlude each other.
+        visibility: what hides: occluding boxes and finite mirrors of sources, which receivers measured
+            directions point to, known walls of powers and, of stations never heard, shadowing of a place;
+            rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 

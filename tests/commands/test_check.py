@@ -145,3 +145,15 @@ def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
 def test_a_setting_with_dots_or_a_unit_was_a_number(text, value):
     """`dataset.root=./x` ended in a traceback, `2.4GHz` was 2.4."""
     assert _value(text) == value
+
+
+def test_a_file_in_radians_ended_in_good(tmp_path):
+    """Arrays have no heads to say so in, and the doubt was a note among others."""
+    rng = np.random.default_rng(0)
+    places = {name: np.radians(rng.uniform(48, 48.1, 50)) for name in ("latitude", "longitude")}
+    arrays = {**places, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
+    np.savez(tmp_path / "a.npz", **arrays)
+    good, text = _said(tmp_path / "a.npz")
+    assert good and "a.npz: good, 1 doubt\n" in text
+    assert "warning     the places lie in the Gulf of Guinea" in text
+    assert "radians? write degrees, or [rad] in the heads of a table" in text

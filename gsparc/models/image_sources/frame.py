@@ -94,6 +94,7 @@ class SourcesInFrame(ClosedForm):
 
     frame: Frame
     factors = torch.ones(1, dtype=torch.complex64)
+    asks_visibility = True
 
     @abstractmethod
     def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:

@@ -177,6 +177,7 @@ class ImageSourceGP(SourcesInFrame):
     ) -> list[Member]:  # fmt: skip
         """What `run_searches` finds about the static end, best first."""
         still, floor = self._transmitter(), self.noise_floor
+        self.asks_visibility = ensemble.shares_occlusion(row_sets[0])
         return ensemble.run_searches(row_sets, still, settings, floor, budget, look, start)
 
     def _looked(
