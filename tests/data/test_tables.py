@@ -371,8 +371,8 @@ LOSSES = "u_cm,v_cm,loss_dB\n100,200,67\n150,250,71\n"
 def test_a_table_without_levels_and_coordinates_said_so_one_at_a_time(write):
     with pytest.raises(DataError) as refused:
         parse_table(write(LOSSES))
-    assert [words in str(refused.value) for words in ("no column of levels", "no coordinates")] == [True] * 2
-    assert len(refused.value.problems) == 2
+    levels, coordinates = refused.value.problems
+    assert "no column of levels" in levels and "no coordinates among" in coordinates
 
 
 def test_a_factor_and_the_unit_of_a_head_turned_centimetres_twice(write):

@@ -166,13 +166,13 @@ class Mixture(LearnsTogether, ClosedForm):
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
         self.site, self.init_s = data.site, budget.counted.wall
+        self.explained = self._explained(data, fold, several)
+        if several or self.explained is not None:  # else it is of these rows already
+            self.condition(data, known)
         log.info(
             "%s of %d Gaussians from init=%s, terms %s", type(self).__name__, self.count,
             self.started, ", ".join(self.terms) or "none",
         )  # fmt: skip
-        self.explained = self._explained(data, fold, several)
-        if several or self.explained is not None:  # else it is of these rows already
-            self.condition(data, known)
         seconds = budget.counted.wall
         if several:
             context.log_curve(seconds, "final")
