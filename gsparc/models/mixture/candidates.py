@@ -60,7 +60,7 @@ def joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> Clos
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
-def bearings(init: InitSettings, clutter: bool, context: FitContext, **more: int) -> ClosedForm:
+def bearings(init: InitSettings, clutter: bool, context: FitContext, **more: Any) -> ClosedForm:
     """Return sources where bearings cross; `more` is of `MovingArrayField`."""
     search = replace(SearchSettings(), sources=init.max_sources)
     return MovingArrayField(search, seed=context.seed, **more)
