@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 import lightning.pytorch as L
@@ -27,18 +27,6 @@ class CostLedger(L.Callback):
         self.seconds = 0.0
         self._rows: list[dict[str, Any]] = []
         self._running_since: float | None = None
-
-    @staticmethod
-    def pause_ledger(trainer: L.Trainer) -> AbstractContextManager[None]:
-        """Pause the trainer's ledger, if it has one, for work that is not training."""
-        ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
-        return ledgers[0].paused() if ledgers else nullcontext()
-
-    @staticmethod
-    def training_seconds(trainer: L.Trainer) -> float | None:
-        """Return seconds on the trainer's ledger [s]; None when it keeps none."""
-        ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
-        return ledgers[0].elapsed() if ledgers else None
 
     @contextmanager
     def paused(self) -> Iterator[None]:

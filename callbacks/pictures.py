@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,11 +47,12 @@ class Pictures(Checked, L.Callback):
             return
         # The same rows at every step, so that pictures can be compared.
         rows = candidates[np.linspace(0, len(candidates) - 1, min(self.count, len(candidates))).astype(int)]
-        with CostLedger.pause_ledger(trainer), torch.no_grad():
+        ledger = next((one for one in trainer.callbacks if isinstance(one, CostLedger)), None)  # type: ignore[attr-defined]
+        with nullcontext() if ledger is None else ledger.paused(), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)
             predicted = module.mean(batch)
-            seconds = CostLedger.training_seconds(trainer)
-            title = f"validation, step {step}" + ("" if seconds is None else f", {seconds:.0f} s of training")
+            title = f"validation, step {step}"
+            title += "" if ledger is None else f", {ledger.elapsed():.0f} s of training"
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
             true, result = batch.target.cpu().numpy(), predicted.cpu().numpy()
             draw_spectra(true, result, rows, title, path, edges=module.site.grid.edges())

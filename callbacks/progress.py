@@ -33,17 +33,16 @@ class StepProgress(L.Callback):
         )
         self._bar.start()
         stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
-        step, total = _progress(trainer, module)
-        self._bar.add_task(stage, total=total, completed=step, figures="")
+        self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Advance; metrics are read every 20 steps: reading waits for the device."""
         if self._bar is None:
             return
         task = self._bar.task_ids[0]
-        step, total = _progress(trainer, module)
+        step = trainer.global_step
         self._bar.update(task, completed=step)
-        if trainer.global_step % 20 == 0 or step == total:
+        if step % 20 == 0 or step == trainer.max_steps:
             result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
             figures = [form.format(float(value)) for form, value in result.items() if value is not None]
             figures += [] if module.count is None else [f"{module.count} Gaussians"]
@@ -56,8 +55,3 @@ class StepProgress(L.Callback):
             self._bar = None
 
     on_exception = on_train_end
-
-
-def _progress(trainer: L.Trainer, module: Any) -> tuple[int, int]:
-    """Steps done and in all."""
-    return trainer.global_step, trainer.max_steps

@@ -137,8 +137,7 @@ def _by_gaussian(features: Tensor, poses: int) -> Tensor:
 def _zero(gradients: Gaussians) -> None:
     """Gradients where no kernel runs: of no Gaussians, or over no poses."""
     for gradient in gradients:
-        if gradient is not None:
-            gradient.zero_()
+        gradient.zero_()
 
 
 @register_kernel("composite", "cuda")

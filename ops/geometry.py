@@ -18,14 +18,12 @@ class Gaussians(NamedTuple):
         quats: (N, 4) w x y z, any length; the zero quaternion means no rotation.
         scales: (N, 3) standard deviations [m].
         opacities: (N,) in [0, 1].
-        extinctions: (N,) in [0, 1], what occludes, or None where that is the opacity.
     """
 
     means: Tensor
     quats: Tensor
     scales: Tensor
     opacities: Tensor
-    extinctions: Tensor | None
 
 
 @dataclass(frozen=True)

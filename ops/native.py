@@ -68,9 +68,8 @@ def rasterize(
     image, transmittance = means.new_empty(samples, channels, *size), means.new_empty(poses, *size)
     means2d, radii = means.new_empty(poses, n, 2), means.new_empty(poses, n)
     visible = means.new_empty(poses, n, dtype=torch.bool)
-    strongest = validation.strongest_opacity(gaussians).opacities
     inputs = contiguous((*gaussians, pose.position, pose.rotation, features))
-    tensors = (*NO_PLAN, *inputs, image, transmittance, *contiguous((strongest, ids)))
+    tensors = (*NO_PLAN, *inputs, image, transmittance, *contiguous((ids,)))
     # The kernel counts the entries, and refuses more than the bound before it allocates them.
     sizes, bound = (poses, n, samples, channels), (operators.MEMORY_BOUND,)
     screen = means2d, radii, visible

@@ -109,7 +109,7 @@ def differentiable(
     operator: Callable[..., Any],
     gradient: Callable[..., Any],
     fixed: Any,
-    *tensors: Tensor | None,
+    *tensors: Tensor,
     reads_outputs: bool = False,
 ) -> Any:
     """Call `operator(fixed, *tensors)`; `gradient(fixed, *slopes, *tensors)` is its derivative.
@@ -129,8 +129,8 @@ def count_strips(height: int) -> int:
 
 
 def empty_like(tensors: Any) -> Any:
-    """Return the named tuple of contiguous empty tensors shaped as those of `tensors`; None stays."""
-    return type(tensors)(*(None if t is None else t.new_empty(t.shape) for t in tensors))
+    """Return the named tuple of contiguous empty tensors shaped as those of `tensors`."""
+    return type(tensors)(*(t.new_empty(t.shape) for t in tensors))
 
 
 def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
@@ -139,7 +139,7 @@ def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
 
 
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
-    """Project, cull, order and bin; opacities are the larger of opacity and extinction."""
+    """Project, cull, order and bin."""
     means, poses, n = gaussians.means, len(pose), len(gaussians.means)
     buffers = Buffers(
         records=means.new_empty(poses, n, calls.kernels().RECORD),

@@ -30,7 +30,6 @@ def make_plan(
     compensate: bool = True,
     near: float = 0.01,
     cutoff: Cutoff = IMAGE_CUTOFF,
-    extinctions: Tensor | None = None,
     ids: Tensor | None = None,
     backend: str | None = None,
 ) -> Plan:
@@ -44,7 +43,6 @@ def make_plan(
         pose: one pose for a whole batch, or P of them.
         grid: directions of the pixels.
         projection, low_pass, compensate, near, cutoff: see `Optics`.
-        extinctions: (N,) in [0, 1], what occludes; `opacities` by default.
         ids: (N,) int64, permanent ids that break ties of distance; the row number by default.
         backend: "reference", "cpu" or "cuda"; by default the one of the tensors' device.
 
@@ -52,7 +50,7 @@ def make_plan(
         ValueError, TypeError: for invalid shapes, dtypes, devices or values.
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
-    gaussians = validation.check_gaussians(means, quats, scales, opacities, extinctions, ids)
+    gaussians = validation.check_gaussians(means, quats, scales, opacities, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
     return _plan(gaussians, ids, pose, grid, optics, backend)
 
@@ -74,11 +72,11 @@ def _plan(
         # Order and visibility are choices without a derivative: neither autograd nor `torch.func` sees them.
         still = Gaussians._make(map(detached, gaussians))
         poses = validation.check_poses(Pose(detached(pose.position), detached(pose.rotation)), still.means)
-        plan = chosen.make_plan(validation.strongest_opacity(still), detached(ids), poses, grid, optics)
+        plan = chosen.make_plan(still, detached(ids), poses, grid, optics)
     return replace(plan, pose_trained=True) if pose_trained else plan
 
 
-def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
+def _planned(plan: Plan, *parameters: Tensor) -> Gaussians:
     """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
     gaussians = validation.check_gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
     validation.check_transforms(gaussians, plan.pose, plan.pose_trained)
@@ -89,9 +87,9 @@ def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
     return gaussians
 
 
-def _trained(plan: Plan, *tensors: Tensor | None) -> bool:
+def _trained(plan: Plan, *tensors: Tensor) -> bool:
     """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
-    requires_grad = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    requires_grad = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     # Tensors of inference mode can never become part of a graph.
     if requires_grad and plan.means2d.is_inference():
         raise RuntimeError(
@@ -108,8 +106,6 @@ def composite(
     scales: Tensor,
     opacities: Tensor,
     features: Tensor,
-    *,
-    extinctions: Tensor | None = None,
 ) -> Raster:
     """Blend features front to back over a plan made from the same Gaussians; differentiable in every tensor.
 
@@ -120,7 +116,7 @@ def composite(
         ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
         RuntimeError: gradients over a plan that was made in `torch.inference_mode`.
     """
-    gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    gaussians = _planned(plan, means, quats, scales, opacities)
     values = validation.features_per_pose(features, means, plan.pose)
     validation.check_features(features)
     # Kernels have first derivatives in reverse mode alone.
@@ -147,7 +143,6 @@ def rasterize(
     compensate: bool = True,
     near: float = 0.01,
     cutoff: Cutoff = IMAGE_CUTOFF,
-    extinctions: Tensor | None = None,
     ids: Tensor | None = None,
     backend: str | None = None,
 ) -> Raster:
@@ -166,8 +161,8 @@ def rasterize(
     """
     chosen = backends.choose_backend(backend, means.device)
     at_once = getattr(chosen, "rasterize", None)
-    inputs = (means, quats, scales, opacities, extinctions, features, pose.position, pose.rotation)
-    gaussians = validation.check_gaussians(means, quats, scales, opacities, extinctions, ids)
+    inputs = (means, quats, scales, opacities, features, pose.position, pose.rotation)
+    gaussians = validation.check_gaussians(means, quats, scales, opacities, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
     # Only without gradients: one call keeps no plan that a backward pass could read.
     if at_once is not None and not is_differentiated(*inputs):
@@ -175,7 +170,7 @@ def rasterize(
         values = validation.features_per_pose(features, means, poses)
         return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))
     plan = _plan(gaussians, ids, pose, grid, optics, backend)
-    return composite(plan, means, quats, scales, opacities, features, extinctions=extinctions)
+    return composite(plan, means, quats, scales, opacities, features)
 
 
 def mean_weights(
@@ -184,15 +179,13 @@ def mean_weights(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    *,
-    extinctions: Tensor | None = None,
 ) -> Weights:
     """Return each Gaussian's visible weight for each pose, by a plan of the same ones; differentiable.
 
     Raises:
         ValueError, TypeError, RuntimeError: as `composite`.
     """
-    gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    gaussians = _planned(plan, means, quats, scales, opacities)
     # Called for its refusal of plans that were made in inference mode.
     _trained(plan, *gaussians)
     backend = reference_by_rows if needs_reference(*gaussians) else backends.backend_named(plan.backend)
@@ -208,7 +201,6 @@ def freeze(
     opacities: Tensor,
     *,
     version: int,
-    extinctions: Tensor | None = None,
 ) -> FrozenPlan:
     """Store one static receiver's weights as a sparse pixel x Gaussian matrix, valid for `version`.
 
@@ -221,7 +213,7 @@ def freeze(
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
-    gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    gaussians = _planned(plan, means, quats, scales, opacities)
     # To `torch.func` a frozen view would be a constant, its derivative 0 without a word.
     if needs_reference(*gaussians):
         raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")

@@ -166,42 +166,36 @@ def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
     return by_id[torch.argsort(seen.distance.detach()[by_id], stable=True)]
 
 
-def layers(
-    seen: Projected, shapes: Tensor, opacities: Tensor, extinctions: Tensor, optics: Optics
-) -> tuple[Tensor, Tensor]:
-    """Return opacity alpha and extinction gamma of each layer at each pixel (N, H W), before occlusion."""
-    emits, hides = (seen.gain * opacities)[:, None] * shapes, (seen.gain * extinctions)[:, None] * shapes
-    strongest = torch.maximum(emits, hides)
-    strength = shapes if optics.cutoff.relative else strongest
+def layers(seen: Projected, shapes: Tensor, opacities: Tensor, optics: Optics) -> Tensor:
+    """Return the opacity alpha of each layer at each pixel (N, H W), before occlusion."""
+    alpha = (seen.gain * opacities)[:, None] * shapes
+    strength = shapes if optics.cutoff.relative else alpha
     # Whether a layer counts is a choice without a derivative.
-    counts = ((strength >= optics.cutoff.alpha) & (strongest > 0)).detach()
-    return (
-        torch.where(counts, emits, 0.0).clamp(max=ALPHA_MAX),
-        torch.where(counts, hides, 0.0).clamp(max=ALPHA_MAX),
-    )
+    counts = ((strength >= optics.cutoff.alpha) & (alpha > 0)).detach()
+    return torch.where(counts, alpha, 0.0).clamp(max=ALPHA_MAX)
 
 
-def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+def transmittances(alpha: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Return transmittance before each layer (N, H W), 0 once below `floor`, and behind all layers (H W,).
 
     >>> before, behind = transmittances(torch.tensor([[0.5], [0.5]]), 0.0)
     >>> before[:, 0].tolist(), behind.tolist()
     ([1.0, 0.5], [0.25])
     """
-    clear = gamma.new_ones(1, gamma.shape[1])
+    clear = alpha.new_ones(1, alpha.shape[1])
     with torch.no_grad():
-        lit = torch.cumprod(torch.cat([clear, 1 - gamma]), 0)[:-1] >= floor
+        lit = torch.cumprod(torch.cat([clear, 1 - alpha]), 0)[:-1] >= floor
     # Layers that the floor cuts off neither emit nor hide; a product of factors up to 1 never rises again.
-    light = torch.cumprod(torch.cat([clear, 1 - torch.where(lit, gamma, 0.0)]), 0)
+    light = torch.cumprod(torch.cat([clear, 1 - torch.where(lit, alpha, 0.0)]), 0)
     return torch.where(lit, light[:-1], 0.0), light[-1]
 
 
-def radii(seen: Projected, strongest: Tensor, optics: Optics) -> Tensor:
-    """Return long half axes (N,) [px] at the cut-off of opacities (or extinctions) `strongest`."""
+def radii(seen: Projected, opacities: Tensor, optics: Optics) -> Tensor:
+    """Return long half axes (N,) [px] at the cut-off."""
     k11, k12, k22 = seen.covariance.unbind(-1)
     # The larger eigenvalue of a symmetric 2 x 2 matrix; `hypot` does not overflow where squares would.
     largest = (k11 + k22) / 2 + torch.hypot((k11 - k22) / 2, k12)
-    peak = torch.ones_like(strongest) if optics.cutoff.relative else seen.gain * strongest
+    peak = torch.ones_like(opacities) if optics.cutoff.relative else seen.gain * opacities
     # The half axis r at which peak exp(-r^2 / (2 eigenvalue)) has fallen to the cut-off.
     reach = 2 * torch.log(torch.where(seen.present, peak, 0.0) / optics.cutoff.alpha)
     return (reach.clamp(min=0) * largest).sqrt()

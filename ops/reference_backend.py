@@ -19,12 +19,12 @@ from gsparc.ops.transforms import full_precision
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Find depth order and radii; compositing evaluates the footprints again, differentiably."""
     validation.check_finite(gaussians, pose)
-    means, quats, scales, strongest, _ = gaussians
+    means, quats, scales, opacities = gaussians
     orders, centers, radii, visible = [], [], [], []
     for index in range(len(pose)):
         seen = reference.project(means, quats, scales, pose[index], grid, optics)
         shapes = reference.footprints(seen, grid, optics, torch.zeros_like(means[:, :2]))
-        alpha, _ = reference.layers(seen, shapes, strongest, strongest, optics)
+        alpha = reference.layers(seen, shapes, opacities, optics)
         orders.append(reference.depth_order(seen, ids))
         # An absent Gaussian, such as one at the receiver, has no centre that may be read.
         centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
@@ -34,7 +34,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
             ranks = orders[-1][visible[-1][orders[-1]]]
             if bool(((seen.distance[ranks].diff() == 0) & (ids[ranks].diff() == 0)).any()):
                 validation.raise_for_ids()
-        radii.append(torch.where(visible[-1], reference.radii(seen, strongest, optics), 0.0))
+        radii.append(torch.where(visible[-1], reference.radii(seen, opacities, optics), 0.0))
     return Plan(
         *(pose, grid, optics, "reference"),
         means2d=_stacked(centers, means.new_empty(0, len(means), 2)),
@@ -106,20 +106,19 @@ def _stacked(parts: list[Tensor], none: Tensor) -> Tensor:
     return torch.stack(parts) if parts else none
 
 
-def _nothing(*tensors: Tensor | None) -> Tensor:
+def _nothing(*tensors: Tensor) -> Tensor:
     """0, a function of the tensors: their gradient is 0 rather than absent."""
-    return torch.stack([t[:0].sum() for t in tensors if t is not None]).sum()
+    return torch.stack([t[:0].sum() for t in tensors]).sum()
 
 
 def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """For a pose and the Gaussians in depth order: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
     order = plan.buffers[0][index]
-    near = Gaussians._make(None if t is None else t[order] for t in gaussians)
+    near = Gaussians._make(t[order] for t in gaussians)
     seen = reference.project(near.means, near.quats, near.scales, plan.pose[index], plan.grid, plan.optics)
     # Zero in value, with the slope of the centres on the screen.
     shift = (means2d[index] - means2d[index].detach())[order]
     shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
-    hides = near.opacities if near.extinctions is None else near.extinctions
-    alpha, gamma = reference.layers(seen, shapes, near.opacities, hides, plan.optics)
-    before, transmittance = reference.transmittances(gamma, plan.optics.cutoff.transmittance)
+    alpha = reference.layers(seen, shapes, near.opacities, plan.optics)
+    before, transmittance = reference.transmittances(alpha, plan.optics.cutoff.transmittance)
     return alpha * before, alpha, transmittance

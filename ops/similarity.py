@@ -26,8 +26,7 @@ def similarity_op(
 ) -> tuple[Tensor, Tensor]:
     """Return the similarity (B,) of float32 images (B, H, W), and its gradient (empty unless `slope`).
 
-    `taps` is one axis of a separable, symmetric window of odd length, `stability` the constants C1 and C2.
-    A GPU takes no window that is not symmetric or too wide (ValueError).
+    `taps` (2 `RADIUS` + 1,) are one axis of a separable, symmetric window, `stability` constants C1 and C2.
     """
     out = prediction.new_empty(prediction.shape[0]), prediction.new_empty(prediction.shape if slope else 0)
     return run_kernel("similarity", prediction, out, prediction, target, taps, stability, slope)
@@ -45,8 +44,7 @@ def _cpu(
     value, slopes = out
     window, images = torch.tensor(taps, dtype=torch.float32), (prediction.contiguous(), target.contiguous())
     tensors = (window, *images, value, slopes if slope else None)
-    sizes = (*prediction.shape, len(taps) // 2)
-    calls.run("similarity", prediction, *tensors, sizes=sizes, numbers=stability)
+    calls.run("similarity", prediction, *tensors, sizes=prediction.shape, numbers=stability)
 
 
 @register_kernel("similarity", "cuda")
@@ -58,19 +56,16 @@ def _cuda(
     stability: Sequence[float],
     slope: bool,
 ) -> tuple[Tensor, Tensor]:
-    # A symmetric window is passed up to its middle.
-    half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
-    radius, known = len(half) - 1, calls.kernels()
-    if radius > known.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
-        most = 2 * known.MOST_RADIUS + 1
-        raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
+    known, (samples, height, width) = calls.kernels(), prediction.shape
     # Only windows that lie inside the image count.
-    rows, columns = height - 2 * radius, width - 2 * radius
+    rows, columns = height - 2 * known.RADIUS, width - 2 * known.RADIUS
     blocks = -(-rows // known.SIMILARITY_HEIGHT) * -(-columns // known.SIMILARITY_WIDTH)
     # A sum for each block of pixels, added up in a fixed order below.
     sums = prediction.new_empty(samples, blocks)
     inputs = (prediction.contiguous(), target.contiguous(), target.mean(dim=(-2, -1)))
     if samples:
-        tensors, sizes = (*inputs, sums, out[1] if slope else None), (samples, height, width, radius)
-        calls.run("similarity", prediction, *tensors, sizes=sizes, numbers=(*stability, *half))
+        tensors = *inputs, sums, out[1] if slope else None
+        # A symmetric window is passed up to its middle.
+        numbers = *stability, *taps[: known.RADIUS + 1]
+        calls.run("similarity", prediction, *tensors, sizes=prediction.shape, numbers=numbers)
     return sums.sum(1) / (rows * columns), out[1]

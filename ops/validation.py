@@ -37,17 +37,14 @@ def check_gaussians(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    extinctions: Tensor | None,
     ids: Tensor | None,
 ) -> Gaussians:
     """Return Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
     # A tensor without axes has no length; its shape is refused below.
     n = means.shape[0] if means.dim() else 0
-    result = Gaussians(means, quats, scales, opacities, extinctions)
-    expected = ((n, 3), (n, 4), (n, 3), (n,), (n,))
+    result = Gaussians(means, quats, scales, opacities)
+    expected = ((n, 3), (n, 4), (n, 3), (n,))
     for name, tensor, shape in zip(Gaussians._fields, result, expected, strict=True):
-        if tensor is None:
-            continue
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must be {shape} for {n} means, got {tuple(tensor.shape)}")
         _check_dtype_and_device(name, tensor, means)
@@ -77,13 +74,13 @@ def check_finite(gaussians: Gaussians, pose: Pose) -> None:
     """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
     if not bool((_wrongness(pose) <= 1).all()):  # NaN is not either
         raise_for_pose(pose)
-    means, quats, scales, strongest, _ = gaussians
+    means, quats, scales, opacities = gaussians
     # NaN fails every comparison, so that these find it too.
     valid = {
         "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
         "scales": ((scales >= 0) & (scales <= WIDEST)).all(-1),
-        "opacities": (strongest >= 0) & (strongest <= 1),
+        "opacities": (opacities >= 0) & (opacities <= 1),
     }
     for name, ok in valid.items():
         if not bool(ok.all()):
@@ -99,16 +96,6 @@ def _wrongness(pose: Pose) -> Tensor:
     products = (rotation.mT @ rotation - still).abs().flatten(1).amax(1) / SKEW
     across = torch.linalg.cross(rotation[:, 1], rotation[:, 2]) - rotation[:, 0]  # a mirror's is not 0
     return torch.stack([far, products, across.abs().amax(1) / (2 * SKEW)]).amax(0)
-
-
-def strongest_opacity(gaussians: Gaussians) -> Gaussians:
-    """Take max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
-    opacities, extinctions = gaussians.opacities, gaussians.extinctions
-    if extinctions is None:
-        return gaussians
-    smaller = torch.minimum(opacities, extinctions)
-    larger = torch.where(smaller < 0, smaller, torch.maximum(opacities, extinctions))
-    return gaussians._replace(opacities=larger, extinctions=None)
 
 
 def raise_for_status(status: int, pose: Pose) -> None:
@@ -127,7 +114,7 @@ def raise_for(name: str, index: int) -> None:
     expected = {
         "means": f"finite and within {FARTHEST:.0e} m",
         "scales": f"finite and from 0 to {WIDEST:.0e} m",
-        "opacities": "in [0, 1], extinctions included",
+        "opacities": "in [0, 1]",
     }.get(name, "finite")
     raise UnsoundGaussian(
         f"Gaussian {index} has {name} that are not {expected}; find where they come from", index

@@ -29,9 +29,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     settings = to_dict(config)
     evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
-    # Refused here, before hundreds of draws would fail in the same way.
-    if config.confidence != "auto" and config.confidence not in evidence.scores:
-        raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
     divisions = [run_trials(evidence, promise, "random", *draws)]
@@ -49,7 +46,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
-        how = promise, config.confidence, bool(config.spatial), int(config.seed)
+        how = promise, config.confidence, bool(config.spatial), int(config.seed), float(config.apart_m)
         for path in paths:
             stored, bound = calibrate_and_store(path, settings["dataset"], settings["split"], *how)
             # An infinite threshold accepts nobody, and JSON has no infinity.

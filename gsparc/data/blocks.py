@@ -14,15 +14,11 @@ import numpy as np
 
 BIG = 2**28  # bytes of a measurement that stays on disk
 BLOCK = 2**24  # bytes that are in memory at a time
-MEMORY = 2.0**32  # bytes of a machine that does not say it
 
 
 def machine_memory() -> float:
     """Return the memory of the machine [bytes]."""
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return MEMORY
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
 
 
 def is_big(array: Any) -> bool:
@@ -82,7 +78,7 @@ def allocate_on_disk(shape: tuple[int, ...], dtype: Any) -> OnDisk:
     """
     file = tempfile.TemporaryFile(prefix="gsparc-")  # noqa: SIM115 (the array keeps it)
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size and hasattr(os, "posix_fallocate"):  # a full disk would end the process at the first write
+    if size:  # a full disk would end the process at the first write
         os.posix_fallocate(file.fileno(), 0, size)
     return OnDisk.from_file(file, dtype, "w+", shape)
 

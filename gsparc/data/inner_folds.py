@@ -127,9 +127,9 @@ def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitS
     whole: dict[str, object] = {"thin": 1.0, "train_count": None, "spacing_m": None, "redraw": False}
     if split.name != "stations":
         whole["leave_out"] = ()
-    if split.name == "none":  # nothing was held out that could be followed
-        whole["name"] = "random"
-    if split.name == "sparse":  # as dense as what is learned from: thinned again it would be another task
+    # Nothing was held out that could be followed; or as dense as what is learned from: thinned again it would
+    # be another task.
+    if split.name in ("none", "sparse"):
         whole["name"] = "random"
     if split.name == "blocks" and split.side_m is None:
         whole["side_m"] = max(spacing.tenth_of_extent(positions[:, :2]), np.finfo(float).tiny)

@@ -322,7 +322,4 @@ def is_rotation(matrix: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
     # Products of huge or missing numbers are refused below, so that NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-    good = np.isfinite(matrix).all(axis=(-1, -2)) & (error <= tolerance)
-    # det only where finite: LAPACK complains about NaN
-    determinant = np.linalg.det(np.where(good[..., None, None], matrix, np.eye(3)))
-    return good & (determinant > 0)
+        return (error <= tolerance) & (np.linalg.det(matrix) > 0)

@@ -132,8 +132,6 @@ def rows_far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, d
     >>> rows_far_from(line, np.array([0, 1, 2]), np.array([4]), distance=2.5)
     array([0, 1])
     """
-    if len(rows) == 0 or len(others) == 0:
-        return rows
     return rows[cKDTree(positions[others]).query(positions[rows])[0] > distance]
 
 

@@ -256,15 +256,6 @@ METRICS: dict[Scored, type[SampleMetric]] = {
 }  # fmt: skip
 
 
-def metrics_for(kind: Scored, scale: float = 1.0) -> SampleMetric:
-    """Return the metrics of what a site is scored by (`Site.scored`); `scale` is `Site.target_scale`.
-
-    >>> type(metrics_for("csi")).__name__
-    'ChannelMetrics'
-    """
-    return METRICS[kind](scale)
-
-
 def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return per-sample values whose means are the flat figures, so that their differences can be paired.
 

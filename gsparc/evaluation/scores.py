@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.metrics import metrics_for
+from gsparc.evaluation.metrics import METRICS
 from gsparc.models.method import Method, predict_in_batches
 
 SUBSETS = ("train", "val", "test")
@@ -42,7 +42,7 @@ class Scores:
 
     def figures(self) -> dict[str, float | None]:
         """Flat figures over all folds together."""
-        return type(metrics_for(self.kind)).summary(self.samples)
+        return METRICS[self.kind].summary(self.samples)
 
     def squared_errors(self) -> np.ndarray:
         """Squared errors (S,), of powers in decibels; NaN where nothing was measured."""
@@ -150,7 +150,7 @@ def score_methods(
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
         turn = best_phase_of_runs(method, data, rows, runs) if len(runs) else None
-        metric = metrics_for(data.site.scored, data.site.target_scale)
+        metric = METRICS[data.site.scored](data.site.target_scale)
         outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
         order = []
         for chosen, batch, prediction in predict_in_batches(method, data, rows, CHUNK):

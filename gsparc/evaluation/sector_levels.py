@@ -19,12 +19,12 @@ MOST, ACROSS = 12, 4  # sectors drawn, those with most rows; beside each other
 LEAST = 10  # rows that were heard of a sector
 
 
-def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, path: Path) -> bool:
-    """Draw rows (n,) of sectors, less the law of distance; returns whether there were patterns."""
+def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, path: Path) -> None:
+    """Draw rows (n,) of sectors, less the law of distance, where there are patterns."""
     every = method.all_stations() if isinstance(method, PerStation) else None
     field = None if every is None else every.joint_method()
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
-        return False
+        return
     trend = field.own.never.trend
     assert isinstance(trend, Sectors)
     heard = rows_of_stations(data, rows, field.places).measured
@@ -33,7 +33,7 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
     count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0
     chosen = [int(t) for t in np.argsort(-count, kind="stable")[:MOST] if count[t] >= LEAST]
     if not chosen:
-        return False
+        return
     down = -(-len(chosen) // ACROSS)
     figure, axes = panels(9, 2.0 * down + 0.8, down, ACROSS, sharex=True, sharey=True)
     for axis, t in zip(axes.flat, chosen, strict=False):
@@ -57,7 +57,6 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
     figure.supxlabel("angle from the azimuth that is used [deg]")
     figure.supylabel("level less the law of distance [dB]")
     save(figure, path)
-    return True
 
 
 def _about(places: torch.Tensor, azimuth: float) -> tuple[np.ndarray, np.ndarray]:

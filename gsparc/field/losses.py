@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Protocol
+from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
 from gsparc.field.initial import Snapshot
 from gsparc.ops.similarity import has_similarity_kernel, similarity_op
@@ -20,6 +22,21 @@ WINDOW_RADIUS = 5
 
 DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in the gradient
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
+
+
+@dataclass(frozen=True)
+class LossSettings(Checked):
+    """Task loss.
+
+    Attributes:
+        ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone, as do images
+            smaller than 11 x 11.
+        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
+            not look at it.
+    """
+
+    ssim_weight: float = setting(0.2, number(0, 1))
+    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
 def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
@@ -111,24 +128,7 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
     return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
 
 
-class LossOptions(Protocol):
-    """What `task_loss` reads, each where targets call for it.
-
-    Attributes:
-        ssim_weight: see `spectrum_loss`.
-        snapshot: see `channel_loss`; powers have no phase.
-    """
-
-    @property
-    def ssim_weight(self) -> float:
-        """Share of SSIM in the loss of spectra."""
-
-    @property
-    def snapshot(self) -> Snapshot:
-        """Unknown offset of each row of channels."""
-
-
-def task_loss(prediction: Tensor, batch: Batch, settings: LossOptions) -> Tensor:
+def task_loss(prediction: Tensor, batch: Batch, settings: LossSettings) -> Tensor:
     """Return the loss (B,) of spectra, channels or powers; what was not measured counts as met.
 
     Args:

@@ -3,41 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn, get_args
+from typing import Any, NoReturn
 
 import lightning.pytorch as L
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
 from gsparc.data.schema import Site
 from gsparc.field import edit
 from gsparc.field.confidence import weighted_loss
 from gsparc.field.distributed import process_count
-from gsparc.field.initial import Snapshot
-from gsparc.field.losses import fits_ssim_window, ssim, task_loss
+from gsparc.field.losses import LossSettings, fits_ssim_window, ssim, task_loss
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
 from gsparc.ops import UnsoundGaussian
-
-
-@dataclass(frozen=True)
-class LossSettings(Checked):
-    """Task loss.
-
-    Attributes:
-        ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone, as do images
-            smaller than 11 x 11.
-        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
-            not look at it.
-    """
-
-    ssim_weight: float = setting(0.2, number(0, 1))
-    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
 class NonFiniteLoss(RuntimeError):

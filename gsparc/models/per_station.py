@@ -28,6 +28,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
+from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
@@ -40,7 +41,6 @@ from gsparc.training.time_budget import Spent, less_repeatable
 
 log = logging.getLogger(__name__)
 
-SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 

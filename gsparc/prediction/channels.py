@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
-from gsparc.models.method import HasPaths, Method, Prediction
+from gsparc.models.method import HasPaths, Method
 from gsparc.models.uplink.interface import SeparatesPaths, UplinkMethod
 from gsparc.ops import Pose
 
@@ -126,18 +126,13 @@ class Paths:
         return (np.stack(summed, axis=-1) * self.reference_hz / tones).astype(np.complex64)
 
 
-def predict_from_uplink(method: Method, site: Site, uplink: Any) -> Prediction:
-    """Return channels of the measured tones in stored units with what else is said of them; see `_heard`."""
-    return method.predict(_heard(method, site, uplink))
-
-
 def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
     """Return channels (B, A, K) in physical units from uplinks (B, U, L) in physical units.
 
     Raises:
         ValueError: the model reads no uplink, or one of another shape.
     """
-    query = _heard(method, site, uplink)
+    query = uplink_query(method, site, uplink)
     if frequency_hz is None:
         return method.predict(query).mean * site.target_scale
     wanted = torch.from_numpy(np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64)))
@@ -146,8 +141,8 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
 
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
-    """Return the sources of uplinks (B, U, L), physical units; see `_heard`."""
-    query = _heard(method, site, uplink)
+    """Return the sources of uplinks (B, U, L), physical units; see `uplink_query`."""
+    query = uplink_query(method, site, uplink)
     assert query.uplink is not None and site.uplink_hz is not None
     sources = _separator(method).sources(query.uplink)
     # Delays of sources are in turns per tone: over the spacing they are seconds.
@@ -199,7 +194,7 @@ def _separator(method: Method) -> SeparatesPaths:
     return method
 
 
-def _heard(method: Method, site: Site, uplink: Any) -> Query:
+def uplink_query(method: Method, site: Site, uplink: Any) -> Query:
     """Uplinks (B, U, L) or (U, L) in physical units, from places that nobody says."""
     if not isinstance(method, UplinkMethod):
         raise ValueError(f"uplink=: {method.name} reads no uplink; give tx= or rx=")

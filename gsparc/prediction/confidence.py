@@ -105,7 +105,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
-    return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean))
+    return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean), 1)
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -270,7 +270,9 @@ class ConfidenceMixin:
         if uplink is not None:
             from gsparc.prediction import channels
 
-            sure = self._confidence(channels.predict_from_uplink(self.method, self.site, uplink), None)
+            sure = self._confidence(
+                self.method.predict(channels.uplink_query(self.method, self.site, uplink)), None
+            )
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self.queries.query(tx, rx)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import platform
 import resource
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -138,12 +137,11 @@ def reference_copy() -> Call:
 
 def machine_facts() -> dict[str, float | int | str | None]:
     """Return `machine/*`: threads, cores, 1-minute load per core, processor and accelerator."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    load = os.getloadavg()[0] / cores if hasattr(os, "getloadavg") else None
+    cores = len(os.sched_getaffinity(0))
     return {
         "machine/threads": torch.get_num_threads(),
         "machine/cores": cores,
-        "machine/load": load,
+        "machine/load": os.getloadavg()[0] / cores,
         "machine/cpu": _processor(),
         "machine/gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
@@ -151,9 +149,8 @@ def machine_facts() -> dict[str, float | int | str | None]:
 
 def peak_memory() -> dict[str, float]:
     """Return `memory/peak_mb`, the largest resident set so far [MB]; `memory/gpu_peak_mb` with CUDA."""
-    # In bytes on macOS, in KiB on Linux.
-    unit = 1 if sys.platform == "darwin" else 1024
-    facts = {"memory/peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6}
+    # Linux says it in KiB.
+    facts = {"memory/peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6}
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         facts["memory/gpu_peak_mb"] = torch.cuda.max_memory_allocated() / 1e6
     return facts

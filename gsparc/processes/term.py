@@ -6,7 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, Generic, Self, TypeVar
 
-import torch
 from torch import Tensor
 
 from gsparc.processes.stored import Stored
@@ -26,24 +25,20 @@ class Term(Stored, ABC, Generic[Rows]):
     def covariance(self, a: Rows, b: Rows) -> Tensor:
         """Return the covariance (n, m) of values at rows `a` (n) and `b` (m), real or complex."""
 
-    def variance(self, a: Rows) -> Tensor:
-        """Return the variance (n,) of values at rows `a`."""
-        return self.covariance(a, a).diagonal().real
-
+    @abstractmethod
     def parameters(self) -> Tensor:
         """Return what is learned of it (p,) float64, unbounded: logarithms of powers and lengths."""
-        return torch.zeros(0, dtype=torch.float64)
 
+    @abstractmethod
     def bounds(self, scale: float) -> list[tuple[float, float]]:
         """Return bounds of each parameter, for rows whose distances are about `scale` [m]."""
-        return []
 
+    @abstractmethod
     def with_values(self, parameters: Tensor) -> Self:
         """Return the term with other parameters (p,), through which gradients flow."""
-        return self
 
 
-class Columns(Term[Tensor]):
+class Columns(Stored, ABC):
     """A term of places (n, D) [m] that is linear in weights, of unit variance times the prior's deviation.
 
     Attributes:
@@ -60,11 +55,3 @@ class Columns(Term[Tensor]):
     def mean(self, places: Tensor) -> Tensor:
         """Return the mean (n,) at places (n, D) [m], before any row."""
         return places.new_zeros(len(places))
-
-    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
-        """See `Term`."""
-        return self.columns(a) @ self.columns(b).mT
-
-    def variance(self, a: Tensor) -> Tensor:
-        """See `Term`."""
-        return self.columns(a).square().sum(-1)

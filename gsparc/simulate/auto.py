@@ -61,10 +61,6 @@ class AutoSettings:
         """The requirement."""
         return Deliverable.parse(self.deliverable, self.quantile)
 
-    def allowed_failures(self, heard: int) -> int:
-        """Call `allowed_failures` for so many receivers."""
-        return allowed_failures(heard, self.quantile, self.confidence)
-
 
 @dataclass(frozen=True)
 class EffectRow:
@@ -153,7 +149,7 @@ def choose_effects(probe: Probe, settings: AutoSettings) -> Choice:
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
-    most = settings.allowed_failures(heard)
+    most = allowed_failures(heard, settings.quantile, settings.confidence)
     rows = [_row(name, probe, less, required) for name, less in list_removals(full).items()]
 
     def holds(effects: Effects) -> bool:
@@ -189,7 +185,8 @@ def choose_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Pa
         traced: the probe's receivers with the choice's effects and these samples.
     """
     row = _row(f"rays > {samples}", probe, traced, settings.required)
-    enough = row.failures <= settings.allowed_failures(int(probe.reached.sum()))
+    heard = int(probe.reached.sum())
+    enough = row.failures <= allowed_failures(heard, settings.quantile, settings.confidence)
     table = (*choice.table, replace(row, kept=not enough))
     return replace(choice, table=table, samples=samples if enough else None)
 

@@ -126,8 +126,6 @@ def visible_images(room: Room, images: Images, source: np.ndarray, observer: np.
     """
     source, observer = np.broadcast_arrays(np.atleast_2d(source), np.atleast_2d(observer))
     seen = np.ones((len(observer), len(images.cell)), dtype=bool)
-    if len(room.occluders) == 0:
-        return seen
     places = images.mirror_points(source)
     for i, cell in enumerate(images.cell):
         # The cells between the room and the image: a straight line to it stays within them.

@@ -1,5 +1,5 @@
 // Gradients, front to back with the forward's own recurrence: what lies behind a layer is the total less what
-// came before it, so nothing is divided but 1 / (1 - gamma) <= 100. Each strip leaves its sums in slots of its
+// came before it, so nothing is divided but 1 / (1 - alpha) <= 100. Each strip leaves its sums in slots of its
 // own; they are added per Gaussian in strip order, whoever computed them.
 #pragma once
 #include "forward.h"
@@ -10,22 +10,22 @@ namespace GSPARC_ISA {
 
 template <class S> struct CompositeBackwardArgs : CompositeArgs<S> {
     const S *grad_image, *grad_transmittance;    // as above; the second may be null
-    S *means, *quats, *scales, *opacities, *extinctions, *grad_features, *screen;  // gradients; screen (P, N, 2)
+    S *means, *quats, *scales, *opacities, *grad_features, *screen;  // gradients; screen (P, N, 2)
     CompositeBackwardArgs(const Call& call, Reader& in) : CompositeArgs<S>(call, in) {
-        in.read(grad_image, grad_transmittance, means, quats, scales, opacities, extinctions, grad_features, screen);
+        in.read(grad_image, grad_transmittance, means, quats, scales, opacities, grad_features, screen);
     }
 };
 
 template <class S> struct WeightBackwardArgs : ViewArgs<S> {
     const S *grad_visible_sum, *grad_total;      // (P, N)
-    S *means, *quats, *scales, *opacities, *extinctions;
+    S *means, *quats, *scales, *opacities;
     WeightBackwardArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) {
-        in.read(grad_visible_sum, grad_total, means, quats, scales, opacities, extinctions);
+        in.read(grad_visible_sum, grad_total, means, quats, scales, opacities);
     }
 };
 
 // A cell holds what one tile needs: transmittance, what is still to come, upstream gradient per channel.
-template <class P, class S, bool kHides, int kChannels>
+template <class P, class S, int kChannels>
 void composite_backward_strip(const CompositeBackwardArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch,
                               S* cells, S* moments, S* feature_slots) {
     constexpr int n = Lanes<S>::n;
@@ -49,17 +49,17 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& a, const Lines<S>&
     });
     const Lights<S> lights = {cells, cell, floor};
     const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
-        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        const Vec<S> opacity = splat(line[kOpacity]);
         Vec<S> feature[kChannels ? kChannels : 1], local[kChannels ? kChannels : 1];
         for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]), local[k] = splat(S(0));
         if (!kChannels) fill(sums_memory, int64_t(k_count) * n, S(0));
-        MomentSums<S, P, kHides> sums;
+        MomentSums<S, P> sums;
         for (; hit < end; ++hit) {
             S* mine = cells + int64_t(*hit) * cell;
             typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(mine);
             const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
-            const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
+            const Layer<S> layer(seen.form, counts, opacity, alpha_max);
             const Vec<S> weight = light * layer.alpha;
             Vec<S> gain = splat(S(0));
             for (int k = 0; k < k_count; ++k) {
@@ -70,11 +70,11 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& a, const Lines<S>&
             }
             const Vec<S> behind = load(mine + n) - weight * gain;
             store(mine + n, behind);
-            store(mine, layer.behind(light, weight));
-            const Vec<S> d_gamma = -behind * reciprocal(S(1) - layer.gamma);
+            store(mine, light - weight);
+            const Vec<S> d_alpha = fma(light, gain, -behind * reciprocal(S(1) - layer.alpha));
             Vec<S> t1, t2;
             shape.slopes(seen, t1, t2);
-            sums.add(layer, counts, kHides ? light * gain : fma(light, gain, d_gamma), d_gamma, t1, t2, seen.form, alpha_max);
+            sums.add(layer, counts, d_alpha, t1, t2, seen.form, alpha_max);
         }
         const int64_t slot = strip.slot(rank);
         sums.write(moments + slot * kMoments, S(kOffset));
@@ -101,10 +101,9 @@ template <class P, class S, class Args> void chain(const Args& a, const S* momen
         for (int64_t i = int64_t(task) * chunk; i < end; i += n) {
             const int some = end - i < n ? int(end - i) : n;
             const Gaussian<Pack<S>> g = gaussians(model, i, some);
-            Pack<S> opacity, extinction = S(0);
+            Pack<S> opacity;
             gather_rows(model.opacities + i, 1, some, &opacity);
-            if (model.extinctions) gather_rows(model.extinctions + i, 1, some, &extinction);
-            Pack<S> total[12];  // mean, quat, scale, opacity, extinction
+            Pack<S> total[11];  // mean, quat, scale, opacity
             for (Pack<S>& t : total) t = S(0);
             for (int pose = 0; pose < plan.poses; ++pose) {
                 S sums[kMoments][n] = {}, seen[n] = {};
@@ -124,13 +123,12 @@ template <class P, class S, class Args> void chain(const Args& a, const S* momen
                     const Footprint<Pack<S>> f = project<P>(g, stand.position, stand.rotation, wide);
                     Pack<S> m[kMoments];
                     for (int c = 0; c < kMoments; ++c) m[c] = load(sums[c]);
-                    const Gradients<Pack<S>> one = project_backward<P, Pack<S>>(f, {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]},
-                                                                             opacity, extinction, stand.rotation, wide);
+                    const Gradients<Pack<S>> one = project_backward<P, Pack<S>>(f, {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7]}, opacity, stand.rotation, wide);
                     const Which<S> counts = Pack<S>(load(seen)) > 0;
                     const Pack<S> none = S(0);
                     for (int k = 0; k < 3; ++k) total[k] += pick(counts, one.mean[k], none), total[7 + k] += pick(counts, one.scale[k], none);
                     for (int k = 0; k < 4; ++k) total[3 + k] += pick(counts, one.quat[k], none);
-                    total[10] += pick(counts, one.opacity, none), total[11] += pick(counts, one.extinction, none);
+                    total[10] += pick(counts, one.opacity, none);
                     for (int k = 0; k < 2; ++k) shift[k] = pick(counts, one.screen[k], none);
                 }
                 if (screen) scatter_rows(shift, 2, some, screen + 2 * (int64_t(pose) * plan.count + i));
@@ -139,7 +137,6 @@ template <class P, class S, class Args> void chain(const Args& a, const S* momen
             scatter_rows(total + 3, 4, some, a.quats + 4 * i);
             scatter_rows(total + 7, 3, some, a.scales + 3 * i);
             scatter_rows(total + 10, 1, some, a.opacities + i);
-            if (a.extinctions) scatter_rows(total + 11, 1, some, a.extinctions + i);
         }
     };
     parallel_for((plan.count + chunk - 1) / chunk, a.threads, run);
@@ -152,8 +149,8 @@ template <class S> int64_t composite_backward(const Call& call) {
     const int k_count = channels_of(a);
     const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
     Buffer<S> moments(entries * kMoments), feature_slots(entries * k_count);
-    each_strip<S>(a, a.features, a.samples, a.channels, 2 + k_count, [&](auto projection, auto hides, auto channels, auto&&... strip) {
-        composite_backward_strip<decltype(projection), S, hides.value, channels.value>(a, strip..., moments.data, feature_slots.data);
+    each_strip<S>(a, a.features, a.samples, a.channels, 2 + k_count, [&](auto projection, auto channels, auto&&... strip) {
+        composite_backward_strip<decltype(projection), S, channels.value>(a, strip..., moments.data, feature_slots.data);
     });
 
     constexpr int chunk = 256;
@@ -176,7 +173,7 @@ template <class S> int64_t composite_backward(const Call& call) {
     return 0;
 }
 
-template <class P, class S, bool kHides>
+template <class P, class S>
 void weigh_backward_strip(const WeightBackwardArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells,
                           S* moments) {
     constexpr int n = Lanes<S>::n;
@@ -186,27 +183,27 @@ void weigh_backward_strip(const WeightBackwardArgs<S>& a, const Lines<S>& lines,
     for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
         for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
         const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
-            const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+            const Vec<S> opacity = splat(line[kOpacity]);
             const Vec<S> per_seen = splat(line[kFeatures]), per_alpha = splat(line[kFeatures + 1]);
-            MomentSums<S, P, kHides> sums;
+            MomentSums<S, P> sums;
             for (; hit < end; ++hit) {
                 S* mine = cells + int64_t(*hit) * 2 * n;
                 typename Shape<S, P>::Seen seen;
                 const Vec<S> light = load(mine);
                 const Mask<S> inside = shape.look(*hit, seen), lit = at_most(floor, light);
-                const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
+                const Layer<S> layer(seen.form, inside, opacity, alpha_max);
                 const Vec<S> gain = select(lit, per_seen, none), weight = light * layer.alpha, part = weight * gain;
-                store(mine, select(lit, layer.behind(light, weight), light));
+                store(mine, select(lit, light - weight, light));
                 if (pass == 0) {
                     store(mine + n, load(mine + n) + part);
                     continue;
                 }
                 const Vec<S> rest = load(mine + n) - part;
                 store(mine + n, rest);
-                const Vec<S> d_alpha = fma(light, gain, per_alpha), d_gamma = select(lit, -rest * reciprocal(S(1) - layer.gamma), none);
+                const Vec<S> d_alpha = fma(light, gain, per_alpha) + select(lit, -rest * reciprocal(S(1) - layer.alpha), none);
                 Vec<S> t1, t2;
                 shape.slopes(seen, t1, t2);
-                sums.add(layer, inside, kHides ? d_alpha : d_alpha + d_gamma, d_gamma, t1, t2, seen.form, alpha_max);
+                sums.add(layer, inside, d_alpha, t1, t2, seen.form, alpha_max);
             }
             if (pass == 1) sums.write(moments + strip.slot(rank) * kMoments, S(kOffset));
         };
@@ -222,8 +219,8 @@ template <class S> int64_t weights_backward(const Call& call) {
     Buffer<S> upstream(2 * all, false);
     for (int64_t i = 0; i < all; ++i) upstream[2 * i] = a.grad_visible_sum[i], upstream[2 * i + 1] = a.grad_total[i];
     Buffer<S> moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
-    each_strip<S>(a, upstream.data, 1, 2, 2, [&](auto projection, auto hides, auto, auto&&... strip) {
-        weigh_backward_strip<decltype(projection), S, hides.value>(a, strip..., moments.data);
+    each_strip<S>(a, upstream.data, 1, 2, 2, [&](auto projection, auto, auto&&... strip) {
+        weigh_backward_strip<decltype(projection), S>(a, strip..., moments.data);
     });
     with_projection(a.settings.projection, [&](auto projection) { chain<decltype(projection)>(a, moments.data, static_cast<S*>(nullptr)); });
     return 0;

@@ -38,7 +38,7 @@ NB_MODULE(_native, module) {
     module.attr("TILE_HEIGHT") = kTileHeight;
     module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;
     module.attr("SIMILARITY_HEIGHT") = kSimilarityHeight;
-    module.attr("MOST_RADIUS") = kMostRadius;
+    module.attr("RADIUS") = kRadius;
     module.attr("MOST_INPUTS") = kMostInputs;
     module.attr("MOST_OUTPUTS") = kMostOutputs;
     define(module, "plan", plan);

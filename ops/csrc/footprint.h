@@ -156,17 +156,17 @@ template <class P, class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g,
 // Sums over pixels of E = dL/d(exponent) times powers of the standardised offsets; h = tau1^2 + tau2^2.
 template <class S> struct Moments {
     S tau1, tau2, h_tau1, h_tau2, tau11, tau12, tau22;
-    S emits, hides;  // sums of dL/d(alpha) G and dL/d(gamma) G
+    S emits;  // sum of dL/d(alpha) G
 };
 
 template <class S> struct Gradients {
-    S mean[3], quat[4], scale[3], opacity, extinction, screen[2];
+    S mean[3], quat[4], scale[3], opacity, screen[2];
 };
 
 template <class P, class S> GSPARC_HD Gradients<S> project_backward(
-    const Footprint<S>& f, const Moments<S>& m, S opacity, S extinction, const S* rotation, const KernelSettings<S>& settings) {
+    const Footprint<S>& f, const Moments<S>& m, S opacity, const S* rotation, const KernelSettings<S>& settings) {
     Gradients<S> out;
-    out.opacity = f.gain * m.emits, out.extinction = f.gain * m.hides;
+    out.opacity = f.gain * m.emits;
     const Truth<S> smooth = P::smooth(f);
 
     // Slopes by p and q, then by the displacement (d1, d2) of n along (e1, e2) [rad].
@@ -175,7 +175,7 @@ template <class P, class S> GSPARC_HD Gradients<S> project_backward(
     P::displace(f, m, dp, dq, smooth, settings, g1, g2, out.screen);
 
     // (A, B, rho) and the gain -> (k11, k12, k22, area), written so that no square of det appears.
-    const S g_gain = opacity * m.emits + extinction * m.hides;
+    const S g_gain = opacity * m.emits;
     const S b = f.root_b * f.root_b, g_rho = m.tau12 * f.root_a / f.root_b;
     const S g_k12 = g_rho * b;
     S g_det = m.tau11 / (2 * f.det), g_area = 0;
@@ -231,8 +231,8 @@ template <class P, class S> GSPARC_HD Gradients<S> project_backward(
 }
 
 // Squared reach of the footprint in standardised offsets, or negative if it reaches nothing.
-template <class S> GSPARC_HD S reach2(const Footprint<S>& f, S strongest, const KernelSettings<S>& settings) {
-    const S strength = f.gain * strongest, peak = settings.relative ? pick(strength > 0, S(1), S(0)) : strength;
+template <class S> GSPARC_HD S reach2(const Footprint<S>& f, S opacity, const KernelSettings<S>& settings) {
+    const S strength = f.gain * opacity, peak = settings.relative ? pick(strength > 0, S(1), S(0)) : strength;
     return pick((peak >= settings.alpha_min) & (peak > 0), 2 * logarithm(peak / settings.alpha_min), S(-1));
 }
 

@@ -25,37 +25,36 @@ template <class S> struct WeightArgs : ViewArgs<S> {
 };
 
 // No std::integral_constant: nothing of the standard library is compiled per instruction set.
-template <class T, T kValue> struct Constant {
-    static constexpr T value = kValue;
+template <int kValue> struct Constant {
+    static constexpr int value = kValue;
 };
 
-// Calls run(P, kHides, kChannels) with the switches as constants; kChannels 0 stands for any number.
-template <class F> inline void with_switches(int projection, bool hides, int channels, F run) {
-    const auto most = [&](auto p, auto h) {
-        if (channels == 1) run(p, h, Constant<int, 1>());
-        else if (channels == 2) run(p, h, Constant<int, 2>());
-        else run(p, h, Constant<int, 0>());
-    };
-    with_projection(projection, [&](auto p) { hides ? most(p, Constant<bool, true>()) : most(p, Constant<bool, false>()); });
+// Calls run(P, kChannels) with both as constants; kChannels 0 stands for any number.
+template <class F> inline void with_switches(int projection, int channels, F run) {
+    with_projection(projection, [&](auto p) {
+        if (channels == 1) run(p, Constant<1>());
+        else if (channels == 2) run(p, Constant<2>());
+        else run(p, Constant<0>());
+    });
 }
 
-// Calls run(P, kHides, kChannels, lines, stage, task, batch, memory) for every strip of a plan, in parallel. The memory is
+// Calls run(P, kChannels, lines, stage, task, batch, memory) for every strip of a plan, in parallel. The memory is
 // uninitialised: so many `vectors` for each tile, and for one tile more.
 template <class S, class F>
 void each_strip(const ViewArgs<S>& a, const S* features, int samples, int channels, int vectors, F run) {
-    with_switches(a.settings.projection, a.model.extinctions, Lines<S>::per_pose(a.plan, samples, channels), [&](auto projection, auto hides, auto constant) {
+    with_switches(a.settings.projection, Lines<S>::per_pose(a.plan, samples, channels), [&](auto projection, auto constant) {
         const Rises<S> stage(projection, a.settings);
         const Lines<S> lines(projection, a.plan, a.model, stage, features, samples, channels, a.threads);
         const int64_t each = int64_t(stage.tiles + 1) * Lanes<S>::n * vectors;
         Buffer<S> memory(each * a.threads, false);
         Workers<Batch> batches(a.threads, stage.tiles);
-        auto strip = [&](int task, int worker) { run(projection, hides, constant, lines, stage, task, batches[worker], memory.data + worker * each); };
+        auto strip = [&](int task, int worker) { run(projection, constant, lines, stage, task, batches[worker], memory.data + worker * each); };
         parallel_for(a.plan.poses * a.plan.strips, a.threads, strip);
     });
 }
 
 // A cell holds what one tile accumulates: transmittance, then the channels, Lanes<S>::n numbers each.
-template <class P, class S, bool kHides, int kChannels>
+template <class P, class S, int kChannels>
 void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
@@ -65,7 +64,7 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
     for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
     const Lights<S> lights = {cells, cell, floor};
     const auto visit = [&](const S* line, int, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
-        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        const Vec<S> opacity = splat(line[kOpacity]);
         Vec<S> feature[kChannels ? kChannels : 1];
         for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]);
         for (; hit < end; ++hit) {
@@ -73,9 +72,9 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
             typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(mine);
             const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
-            const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
+            const Layer<S> layer(seen.form, counts, opacity, alpha_max);
             const Vec<S> weight = light * layer.alpha;
-            store(mine, layer.behind(light, weight));
+            store(mine, light - weight);
             for (int k = 0; k < k_count; ++k) {
                 mine += n;
                 store(mine, fma(kChannels ? feature[k] : splat(line[kFeatures + k]), weight, load(mine)));
@@ -95,30 +94,30 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
 template <class S> int64_t composite(const Call& call) {
     Reader in(call);
     const CompositeArgs<S> a(call, in);
-    each_strip<S>(a, a.features, a.samples, a.channels, 1 + channels_of(a), [&](auto projection, auto hides, auto channels, auto&&... strip) {
-        composite_strip<decltype(projection), S, hides.value, channels.value>(a, strip...);
+    each_strip<S>(a, a.features, a.samples, a.channels, 1 + channels_of(a), [&](auto projection, auto channels, auto&&... strip) {
+        composite_strip<decltype(projection), S, channels.value>(a, strip...);
     });
     return 0;
 }
 
-template <class P, class S, bool kHides>
+template <class P, class S>
 void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before, S* sums) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
     const Vec<S> floor = splat(a.settings.transmittance_min), alpha_max = splat(a.settings.alpha_max), none = splat(S(0));
     fill(before, int64_t(stage.tiles) * n, S(1));
     const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
-        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        const Vec<S> opacity = splat(line[kOpacity]);
         Vec<S> seen_sum = none, total = none;
         for (; hit < end; ++hit) {
             S* mine = before + int64_t(*hit) * n;
             typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(mine);
             const Mask<S> inside = shape.look(*hit, seen), lit = at_most(floor, light);
-            const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
+            const Layer<S> layer(seen.form, inside, opacity, alpha_max);
             const Vec<S> weight = light * layer.alpha;
             total += layer.alpha, seen_sum += select(lit, weight, none);
-            store(mine, select(lit, layer.behind(light, weight), light));
+            store(mine, select(lit, light - weight, light));
         }
         S* slot = sums + 2 * strip.slot(rank);
         slot[0] = sum<S>(seen_sum), slot[1] = sum<S>(total);
@@ -130,8 +129,8 @@ template <class S> int64_t weights(const Call& call) {
     Reader in(call);
     const WeightArgs<S> a(call, in);
     Buffer<S> sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
-    each_strip<S>(a, nullptr, 0, 0, 1, [&](auto projection, auto hides, auto, auto&&... strip) {
-        weigh_strip<decltype(projection), S, hides.value>(a, strip..., sums.data);
+    each_strip<S>(a, nullptr, 0, 0, 1, [&](auto projection, auto, auto&&... strip) {
+        weigh_strip<decltype(projection), S>(a, strip..., sums.data);
     });
     constexpr int chunk = 1024;
     const int chunks = (a.plan.count + chunk - 1) / chunk;

@@ -13,7 +13,7 @@ template <class S> struct FreezeArgs : ViewArgs<S> {  // of one pose
 };
 
 // Counts the blocks of each tile of a strip (ranks null) or writes them, front to back.
-template <class P, class S, bool kHides>
+template <class P, class S>
 void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
@@ -23,15 +23,15 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
     Buffer<int64_t> counts(stage.tiles);
     fill(before, int64_t(stage.tiles) * n, S(1));
     const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
-        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        const Vec<S> opacity = splat(line[kOpacity]);
         for (; hit < end; ++hit) {
             typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(before + *hit * n);
             const Mask<S> counts_here = shape.look(*hit, seen) & at_most(floor, light);
             if (!any(counts_here)) continue;
-            const Layer<S, kHides> layer(seen.form, counts_here, opacity, extinction, alpha_max);
+            const Layer<S> layer(seen.form, counts_here, opacity, alpha_max);
             const Vec<S> weight = light * layer.alpha;
-            store(before + *hit * n, layer.behind(light, weight));
+            store(before + *hit * n, light - weight);
             const int64_t number = counts[*hit]++;
             if (!a.ranks) continue;
             a.ranks[starts[*hit] + number] = rank;
@@ -46,8 +46,8 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
 template <class S> int64_t freeze(const Call& call) {
     Reader in(call);
     const FreezeArgs<S> a(call, in);
-    each_strip<S>(a, nullptr, 0, 0, 1, [&](auto projection, auto hides, auto, auto&&... strip) {
-        freeze_strip<decltype(projection), S, hides.value>(a, strip...);
+    each_strip<S>(a, nullptr, 0, 0, 1, [&](auto projection, auto, auto&&... strip) {
+        freeze_strip<decltype(projection), S>(a, strip...);
     });
     return Lanes<S>::n;
 }

@@ -5,7 +5,7 @@
 namespace gsparc {
 
 template <class S> struct ProjectArgs {
-    Model<S> model;                 // opacities here: the larger of opacity and extinction
+    Model<S> model;
     int count;
     KernelSettings<S> settings;
     S *records, *depths, *means2d, *radii;  // (N, kRecord), (N,), (N, 2), (N,)

@@ -28,7 +28,7 @@ template <class S, class From> KernelSettings<S> in_precision(const KernelSettin
 }
 
 constexpr int kRecord = 12;     // scalars of one footprint, see pixels.h
-constexpr int kMoments = 9;     // scalars of Moments
+constexpr int kMoments = 8;     // scalars of Moments
 constexpr int kLanes = 16;      // most pixels done at a time by any instruction set
 
 // What a plan returns of a pose, and of equal ids at one distance; of a Gaussian 4 i + parameter.
@@ -39,10 +39,13 @@ constexpr int64_t kUnsoundFeatures = int64_t(1) << 60, kRefused = -2;
 // A strip is kStripRows rows of the image, the unit of work. Row-wise strips let azimuth wrap without tiles.
 constexpr int kStripRows = 4;
 
-// Of the CUDA kernels: pixels of a tile, which a warp takes at a time; of a block of the similarity, and its widest
-// window; the most inputs and outputs of a network, whose weights pass through registers.
+// Taps of the similarity's window to either side of the middle one.
+constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
+
+// Of the CUDA kernels: pixels of a tile, which a warp takes at a time; of a block of the similarity; the most inputs and
+// outputs of a network, whose weights pass through registers.
 constexpr int kTileWidth = 8, kTileHeight = 4;
-constexpr int kSimilarityWidth = 32, kSimilarityHeight = 8, kMostRadius = 5;
+constexpr int kSimilarityWidth = 32, kSimilarityHeight = 8;
 constexpr int kMostInputs = 256, kMostOutputs = 4;
 
 // A footprint's rows [row0, row1) and columns column0 + [0, columns), modulo the width.
@@ -63,8 +66,8 @@ template <class S> struct PlanView {
 };
 
 template <class S> struct Model {
-    const S *means, *quats, *scales, *opacities, *extinctions;  // extinctions may be null
-    const S *positions, *rotations;                             // (P, 3), (P, 3, 3)
+    const S *means, *quats, *scales, *opacities;
+    const S *positions, *rotations;  // (P, 3), (P, 3, 3)
 };
 
 // One call of a kernel from Python; `Call` of calls.py has the same fields. What sizes, numbers and tensors mean is the
@@ -91,7 +94,7 @@ struct Reader {
 
 template <class S> Model<S> read_model(Reader& in) {
     Model<S> m;
-    in.read(m.means, m.quats, m.scales, m.opacities, m.extinctions, m.positions, m.rotations);
+    in.read(m.means, m.quats, m.scales, m.opacities, m.positions, m.rotations);
     return m;
 }
 

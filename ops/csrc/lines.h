@@ -46,7 +46,7 @@ template <class S> struct Rises {
 // One Gaussian's line, side by side in depth order: its record up to the reach, then these. Offsets are in units of
 // kOffset, so that their square is the number of halvings of the footprint, which `bell` takes.
 constexpr double kOffset = 1.1774100225154747, kHalvings = 1 / (kOffset * kOffset);  // sqrt(2 log 2)
-constexpr int kOpacity = 10, kExtinction = 11, kFeatures = 12;
+constexpr int kOpacity = 10, kFeatures = 12;
 
 // Of all ranks: lines (P, N, width), K channels per pose, whole cache lines; and outlines (P, N, kOutline).
 template <class S> struct Lines {
@@ -102,20 +102,17 @@ private:
     template <class P> void fill_some(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, int pose, int rank, int some) {
         const int64_t at = int64_t(pose) * plan.count + rank;
         int32_t who[n];
-        S opacities[n], extinctions[n];
+        S opacities[n];
         for (int k = 0; k < n; ++k) {
             who[k] = plan.order[at + (k < some ? k : some - 1)];
             opacities[k] = model.opacities[who[k]];
-            if (model.extinctions) extinctions[k] = model.extinctions[who[k]];
         }
         Pack<S> record[kRecord];
         gather_at(plan.records + int64_t(pose) * plan.count * kRecord, kRecord, who, kRecord, record);
         const Outline<Pack<S>> outline = P::outline(record, root(record[kReach]) * S(1.001), stage.settings);  // a little larger than life
         const Pack<S> numbers[kOutline] = {outline.column, outline.middle, outline.height, outline.lean, outline.width, outline.left, outline.right, outline.stretch};
         for (int c = 0; c < kOutline; c += 4) scatter_fours(numbers + c, kOutline, some, outlines.data + at * kOutline + c);
-        const Pack<S> gain = record[kGain];
-        record[kOpacity] = gain * Pack<S>(load(opacities));
-        record[kExtinction] = model.extinctions ? gain * Pack<S>(load(extinctions)) : record[kOpacity];
+        record[kOpacity] = record[kGain] * Pack<S>(load(opacities));
         record[kReach] = record[kReach] * S(kHalvings);
         P::line(record, stage.tables.turn);
         for (int c = 0; c < kFeatures; c += 4) scatter_fours(record + c, width, some, rows.data + at * width + c);

@@ -17,7 +17,7 @@ namespace gsparc {
 namespace {
 
 template <class S> struct PlanArgs {
-    Model<S> model;                    // opacities: the larger of opacity and extinction
+    Model<S> model;
     const int64_t* ids;                // (N,) or null: the row number
     int poses, count, strips, threads;
     KernelSettings<S> settings;
@@ -290,9 +290,8 @@ template <class S> int64_t rasterize_of(const Call& given) {
     int samples, channels;
     const S *features, *image, *transmittance;
     in.sizes(samples, channels);
-    in.read(features, image, transmittance, a.model.opacities, a.ids, a.means2d, a.radii, a.visible);
-    const S* strongest = std::exchange(a.model, view.model).opacities;
-    a.model.opacities = strongest;
+    in.read(features, image, transmittance, a.ids, a.means2d, a.radii, a.visible);
+    a.model = view.model;
     a.poses = view.plan.poses, a.count = view.plan.count, a.strips = view.plan.strips;
     a.threads = view.threads, a.settings = view.settings;
     const int64_t all = int64_t(a.poses) * a.count, strips = int64_t(a.poses) * a.strips;

@@ -7,15 +7,15 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
-// B images (H, W), seen through a separable window of 2 radius + 1 taps.
+// B images (H, W), seen through a separable window of kTaps taps.
 struct SimilarityArgs {
-    int count, height, width, radius, threads;
+    int count, height, width, threads;
     float c1, c2;
     const float *taps, *prediction, *target;
     float *value, *slope;           // (B,), and (B, H, W) d value / d prediction, or null
     explicit SimilarityArgs(const Call& call) : threads(call.threads), c1(float(call.numbers[0])), c2(float(call.numbers[1])) {
         Reader in(call);
-        in.sizes(count, height, width, radius);
+        in.sizes(count, height, width);
         in.read(taps, prediction, target, value, slope);
     }
 };
@@ -32,8 +32,8 @@ struct SimilarityScratch {
     static constexpr int kMaps = 5, kSlopes = 3;
     Plane p, t, by[kSlopes], columns, half;  // columns (kMaps, stride), half (kSlopes, stride)
 
-    static int stride_of(const SimilarityArgs& a) { return (a.width + 4 * kLanes + 2 * a.radius) / kLanes * kLanes; }
-    static int64_t plane(const SimilarityArgs& a) { return int64_t(stride_of(a)) * (a.height + 2 * a.radius); }
+    static int stride_of(const SimilarityArgs& a) { return (a.width + 4 * kLanes + 2 * kRadius) / kLanes * kLanes; }
+    static int64_t plane(const SimilarityArgs& a) { return int64_t(stride_of(a)) * (a.height + 2 * kRadius); }
     static int64_t size(const SimilarityArgs& a) { return (2 + kSlopes) * plane(a) + (kMaps + kSlopes) * stride_of(a); }
     SimilarityScratch(const SimilarityArgs& a, float* memory) {
         const int stride = stride_of(a);
@@ -54,12 +54,12 @@ GSPARC_INLINE Vec<float> first_of(Vec<float> v, int count) {
 
 // Windowed moments of one row of the valid part; returns the row's sum of the similarity. Derivatives by the
 // windowed mean, square and product go into `by`, shifted by the radius so that its border stays zero.
-template <int kTaps> inline float similarity_row(const SimilarityArgs& a, const SimilarityScratch& s, int y, float shift, float share) {
+inline float similarity_row(const SimilarityArgs& a, const SimilarityScratch& s, int y, float shift, float share) {
     constexpr int n = Lanes<float>::n;
-    const int taps = kTaps ? kTaps : 2 * a.radius + 1, valid = a.width - 2 * a.radius;
+    const int valid = a.width - 2 * kRadius;
     for (int x = 0; x < a.width; x += n) {
         Vec<float> m[5] = {};
-        for (int k = 0; k < taps; ++k) {
+        for (int k = 0; k < kTaps; ++k) {
             const Vec<float> w = splat(a.taps[k]), p = load(s.p.row(y + k) + x), t = load(s.t.row(y + k) + x), wp = w * p, wt = w * t;
             m[0] += wp, m[1] += wt, m[2] = fma(wp, p, m[2]), m[3] = fma(wt, t, m[3]), m[4] = fma(wp, t, m[4]);
         }
@@ -68,30 +68,29 @@ template <int kTaps> inline float similarity_row(const SimilarityArgs& a, const 
     Vec<float> total = splat(0.0f);
     for (int x = 0; x < valid; x += n) {
         Vec<float> m[5] = {};
-        for (int k = 0; k < taps; ++k)
+        for (int k = 0; k < kTaps; ++k)
             for (int c = 0; c < 5; ++c) m[c] = fma(splat(a.taps[k]), load(s.columns.row(c) + x + k), m[c]);
         Vec<float> by[3];
         total += first_of(similar_at(m, shift, a.c1, a.c2, share, a.slope != nullptr, by), valid - x);
         if (!a.slope) continue;
-        for (int c = 0; c < 3; ++c) store(s.by[c].row(y + a.radius) + x + a.radius, first_of(by[c], valid - x));
+        for (int c = 0; c < 3; ++c) store(s.by[c].row(y + kRadius) + x + kRadius, first_of(by[c], valid - x));
     }
     return sum<float>(total);
 }
 
 // One row of the transposed window of the derivatives, which is the window itself over a border of zeros.
-template <int kTaps> inline void similarity_slope(const SimilarityArgs& a, const SimilarityScratch& s, int y, float* slope) {
+inline void similarity_slope(const SimilarityArgs& a, const SimilarityScratch& s, int y, float* slope) {
     constexpr int n = Lanes<float>::n;
-    const int taps = kTaps ? kTaps : 2 * a.radius + 1;
-    const int begin = y < 2 * a.radius ? 2 * a.radius - y : 0, past = a.height - y, end = past < taps ? past : taps;  // rows that hold something
+    const int begin = y < 2 * kRadius ? 2 * kRadius - y : 0, past = a.height - y, end = past < kTaps ? past : kTaps;  // rows that hold something
     for (int x = 0; x < a.width; x += n) {
         Vec<float> m[3] = {};
         for (int k = begin; k < end; ++k)
-            for (int c = 0; c < 3; ++c) m[c] = fma(splat(a.taps[k]), load(s.by[c].row(y + k - a.radius) + x), m[c]);
-        for (int c = 0; c < 3; ++c) store(s.half.row(c) + a.radius + x, m[c]);
+            for (int c = 0; c < 3; ++c) m[c] = fma(splat(a.taps[k]), load(s.by[c].row(y + k - kRadius) + x), m[c]);
+        for (int c = 0; c < 3; ++c) store(s.half.row(c) + kRadius + x, m[c]);
     }
     for (int x = 0; x < a.width; x += n) {
         Vec<float> m[3] = {};
-        for (int k = 0; k < taps; ++k)
+        for (int k = 0; k < kTaps; ++k)
             for (int c = 0; c < 3; ++c) m[c] = fma(splat(a.taps[k]), load(s.half.row(c) + x + k), m[c]);
         const Vec<float> all = m[0] + 2.0f * load(s.p.row(y) + x) * m[1] + load(s.t.row(y) + x) * m[2];
         float lanes[n];
@@ -112,7 +111,7 @@ inline float mean_of(const float* x, int64_t count) {
     return float(all / double(count));
 }
 
-template <int kTaps> inline void similarity_image(const SimilarityArgs& a, const SimilarityScratch& s, int image) {
+inline void similarity_image(const SimilarityArgs& a, const SimilarityScratch& s, int image) {
     const int64_t pixels = int64_t(a.height) * a.width;
     const float *prediction = a.prediction + image * pixels, *target = a.target + image * pixels;
     const float shift = mean_of(target, pixels);  // moments about it: flat images would lose every digit
@@ -121,26 +120,21 @@ template <int kTaps> inline void similarity_image(const SimilarityArgs& a, const
             s.p.row(y)[x] = prediction[int64_t(y) * a.width + x] - shift;
             s.t.row(y)[x] = target[int64_t(y) * a.width + x] - shift;
         }
-    const int rows = a.height - 2 * a.radius;
-    const double count = double(rows) * (a.width - 2 * a.radius);
+    const int rows = a.height - 2 * kRadius;
+    const double count = double(rows) * (a.width - 2 * kRadius);
     double total = 0;
     for (int y = 0; y < a.height; ++y) {
-        if (y < rows) total += similarity_row<kTaps>(a, s, y, shift, float(1 / count));
-        if (a.slope) similarity_slope<kTaps>(a, s, y, a.slope + image * pixels + int64_t(y) * a.width);
+        if (y < rows) total += similarity_row(a, s, y, shift, float(1 / count));
+        if (a.slope) similarity_slope(a, s, y, a.slope + image * pixels + int64_t(y) * a.width);
     }
     a.value[image] = float(total / count);
 }
 
 template <class S> int64_t similarity(const Call& call) {
     const SimilarityArgs a(call);
-    constexpr int usual = 11;  // Wang's window
     const int64_t each = SimilarityScratch::size(a);
     Buffer<float> memory(each * a.threads);
-    auto run = [&](int image, int worker) {
-        const SimilarityScratch s(a, memory.data + worker * each);
-        if (2 * a.radius + 1 == usual) similarity_image<usual>(a, s, image);
-        else similarity_image<0>(a, s, image);
-    };
+    auto run = [&](int image, int worker) { similarity_image(a, SimilarityScratch(a, memory.data + worker * each), image); };
     parallel_for(a.count, a.threads, run);
     return 0;
 }

@@ -22,7 +22,7 @@ def there(count: int = 0, n: int = 60, **kind):
 @pytest.mark.parametrize("count", [0, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_tensors_on_the_gpu_go_through_its_kernels(projection, count, dtype):
-    scene = random_scene(hides=True, seed=count)
+    scene = random_scene(seed=count)
     want = render(scene, poses(count), GRID, "reference", projection=projection)
     moved = scene.to(dtype).on("cuda")
     got = render(moved, poses(count).to("cuda"), GRID, "cuda", projection=projection)

@@ -25,7 +25,7 @@ class Shapes:
 
     @staticmethod
     def composite(plan, gaussians, features, means2d):
-        means, quats, scales, opacities, _ = gaussians
+        means, quats, scales, opacities = gaussians
         one = (features.sum(1) + (means + scales).sum() + quats.sum() + opacities.sum())[..., None, None]
         image = one.expand(*one.shape[:2], plan.grid.height, plan.grid.width)
         return image, means.new_empty(plan.num_poses, plan.grid.height, plan.grid.width)

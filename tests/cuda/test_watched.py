@@ -99,7 +99,7 @@ def everything(dtype: torch.dtype) -> None:
     """Each kernel: both projections, one pose and several, few and many channels, long and short lists."""
     for projection in ("tangent", "equirect"):
         for count in (0, 3):
-            scene = random_scene(n=30, hides=True).to(dtype)
+            scene = random_scene(n=30).to(dtype)
             render(scene, poses(count), GRIDS["patch"], projection=projection)
         scene = random_scene(n=150, seed=12, size=1.5).to(dtype)
         model = (scene.means, scene.quats, scene.scales, 0.3 * scene.opacities)
@@ -114,7 +114,7 @@ def everything(dtype: torch.dtype) -> None:
             render(raster, origin(), SMALL, projection=projection)
     images = torch.rand(2, 23, 40, generator=torch.Generator().manual_seed(0))
     for slope in (True, False):
-        similarity_op(images, images.flip(0), [0.1, 0.2, 0.4, 0.2, 0.1], [1e-4, 9e-4], slope)
+        similarity_op(images, images.flip(0), [1 / 11] * 11, [1e-4, 9e-4], slope)
     weights = [torch.ones(shape, requires_grad=True) for shape in ((9, 19, 24), (9, 24), (9, 24, 2), (9, 2))]
     for samples in (1, 21):
         networks.networks(torch.ones(samples, 19), *weights).sum().backward()

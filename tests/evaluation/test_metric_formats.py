@@ -16,7 +16,7 @@ from gsparc.evaluation.metric_formats import (
     score_heading,
     score_of,
 )
-from gsparc.evaluation.metrics import metrics_for
+from gsparc.evaluation.metrics import METRICS
 from gsparc.evaluation.report import plots
 
 OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quantiles of a figure with an entry
@@ -26,7 +26,7 @@ def figure_names(kind):
     shape = {"spectrum": (1, 16, 16), "rssi": (1, 1)}.get(kind, (1, 1, 2))
     one, metric = (
         torch.ones(shape, dtype=torch.complex64 if "csi" in kind else torch.float32),
-        metrics_for(kind),
+        METRICS[kind](),
     )
     metric.update(one, one)
     return set(metric.summary(metric.compute())) - {"samples", "silent_samples"}

@@ -8,10 +8,10 @@ import torch
 from skimage.metrics import structural_similarity
 
 from gsparc.evaluation.metrics import (
+    METRICS,
     ChannelMetrics,
     PowerMetrics,
     SpectrumMetrics,
-    metrics_for,
     paired_values,
 )
 
@@ -68,7 +68,7 @@ def test_batches_change_nothing(kind):
         prediction, target = torch.rand(5, 1) + 0.1, torch.rand(5, 1) + 0.1
     else:
         prediction, target = spectra(5) if kind == "spectrum" else channels(5)
-    once, parts = metrics_for(kind), metrics_for(kind)
+    once, parts = METRICS[kind](), METRICS[kind]()
     once.update(prediction, target)
     for rows in (slice(0, 2), slice(2, 5)):
         parts.update(prediction[rows], target[rows])
@@ -173,7 +173,7 @@ def test_power_figures_in_decibels(caplog):
 @pytest.mark.parametrize("kind", ["spectrum", "csi"])
 def test_paired_values_average_to_the_figures(kind):
     prediction, target = spectra() if kind == "spectrum" else channels()
-    metric = metrics_for(kind, 0.1)
+    metric = METRICS[kind](0.1)
     metric.update(prediction, target)
     samples = metric.compute()
     figures = metric.summary(samples)
@@ -203,10 +203,10 @@ def test_what_nothing_was_measured_of_is_not_perfect(kind):
     unknown = target.clone()
     unknown[0] = torch.nan
     name = "psnr_db" if kind == "spectrum" else "snr_db"
-    kept = summarise(metrics_for(kind), prediction[1:], target[1:])
+    kept = summarise(METRICS[kind](), prediction[1:], target[1:])
     for figures in (
-        summarise(metrics_for(kind), prediction, target, mask),
-        summarise(metrics_for(kind), prediction, unknown),
+        summarise(METRICS[kind](), prediction, target, mask),
+        summarise(METRICS[kind](), prediction, unknown),
     ):
         for figure in (name, "mse", "mae"):
             assert figures[figure] == pytest.approx(kept[figure]), figure

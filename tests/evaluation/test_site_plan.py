@@ -67,7 +67,7 @@ def test_levels_in_dbm_were_drawn_as_db(figures):
     arrays = {"rx_position": place, "station_position": np.array([[3.0, 3, 5]]), "rssi_db": level[:, None]}
     data = from_arrays(arrays, {"level_unit": "dBm"})
     levels = link_levels(data)
-    draw_site(data, "unused.png", levels, [(0, LevelStep(39, 40, -25.0, 9.0))])
+    draw_site(data, "unused.png", levels, [(0, LevelStep(39, 40, -25.0))])
     assert {axis.get_ylabel() for axis in figures[-1].axes} >= {"level [dBm]", "received power [dBm]"}
 
 

@@ -80,9 +80,8 @@ def test_gradient_is_exactly_zero_where_nothing_is_seen(backend, drawn: Drawn):
 def test_weights_and_frozen_views_say_the_same(backend, drawn: Drawn):
     scene, optics = drawn.scene.to(drawn.dtype), drawn.optics
     model = scene.model
-    hidden = {"extinctions": scene.extinctions}
-    plan = make_plan(*model, drawn.pose, drawn.grid, ids=scene.ids, backend=backend, **hidden, **optics)
-    seen, view = mean_weights(plan, *model, **hidden), freeze(plan, *model, version=0, **hidden)
+    plan = make_plan(*model, drawn.pose, drawn.grid, ids=scene.ids, backend=backend, **optics)
+    seen, view = mean_weights(plan, *model), freeze(plan, *model, version=0)
     slack = 1 + 64 * torch.finfo(drawn.dtype).eps
     assert ((seen.share >= 0) & (seen.share <= slack)).all()
     assert ((seen.mean >= 0) & (seen.mean <= slack)).all()
@@ -92,7 +91,7 @@ def test_weights_and_frozen_views_say_the_same(backend, drawn: Drawn):
     assert ((view.render(scene.features, version=0) - image).abs() <= room).all()
 
 
-@holds(25, 500, drawn=fields(hides=False), name=NAMES, row=st.integers(0, 9), value=ANYTHING)
+@holds(25, 500, drawn=fields(), name=NAMES, row=st.integers(0, 9), value=ANYTHING)
 def test_any_number_is_refused_by_name_or_harmless(backend, drawn: Drawn, name: str, row: int, value: float):
     """NaN, infinities, denormals, 1e38 in one place of one Gaussian."""
     assume(len(drawn.scene.means) > 0)

@@ -20,7 +20,7 @@ GRID = SphereGrid.hemisphere()
 @PROJECTIONS
 @pytest.mark.parametrize("count", [0, 3])
 def test_bit_identical(dtype, projection, count):
-    scene = random_scene(n=700, seed=1, hides=True).to(dtype)
+    scene = random_scene(n=700, seed=1).to(dtype)
     optics = {"projection": projection, "behind": False}
     assert_threads_agree(lambda: list(render(scene, poses(count), GRID, **optics).values()))
 

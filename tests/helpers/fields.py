@@ -63,7 +63,7 @@ class Drawn:
 
 
 @st.composite
-def fields(draw, hides: bool | None = None, grids: st.SearchStrategy = GRIDS) -> Drawn:
+def fields(draw, grids: st.SearchStrategy = GRIDS) -> Drawn:
     """Up to 8 Gaussians before one receiver a little off the origin."""
     noise = torch.Generator().manual_seed(draw(st.integers(0, 2**20)))
     count = draw(st.integers(0, 8))
@@ -88,12 +88,9 @@ def fields(draw, hides: bool | None = None, grids: st.SearchStrategy = GRIDS) ->
         rows.append((mean, turn, size * shape, draw(st.sampled_from(OPACITIES))))
     stack = lambda k, width: torch.stack([r[k] for r in rows]) if rows else torch.zeros(0, width)  # noqa: E731
     features = torch.randn(2, count, 1, generator=noise)
-    hidden = torch.rand(count, generator=noise) if (draw(st.booleans()) if hides is None else hides) else None
     ids = torch.randperm(1000, generator=noise)[:count]
     scene = (
-        Scene(
-            stack(0, 3), stack(1, 4), stack(2, 3), torch.tensor([r[3] for r in rows]), features, hidden, ids
-        )
+        Scene(stack(0, 3), stack(1, 4), stack(2, 3), torch.tensor([r[3] for r in rows]), features, ids)
         .to(torch.float32)
         .to(torch.float64)
     )
@@ -132,12 +129,10 @@ def nudged(drawn: Drawn, seed: int) -> Drawn:
     scene = drawn.scene
     moved = {name: getattr(scene, name) for name in ("means", "quats")}
     moved = {k: v + draws(v.shape) * v.norm(dim=-1, keepdim=True) for k, v in moved.items()}
-    for name in ("scales", "opacities", "features", "extinctions"):
+    for name in ("scales", "opacities", "features"):
         value = getattr(scene, name)
-        if value is not None:
-            moved[name] = value * (1 + draws(value.shape))
-    for name in {"opacities", "extinctions"} & set(moved):
-        moved[name] = moved[name].clamp(0, 1)
+        moved[name] = value * (1 + draws(value.shape))
+    moved["opacities"] = moved["opacities"].clamp(0, 1)
     # Turned as a whole: the directions of the pixels are rounded too.
     x, y, z = draws(torch.Size([3])).tolist()
     turn = torch.tensor([[1, -z, y], [z, 1, -x], [-y, x, 1]], dtype=torch.float64)
@@ -152,7 +147,7 @@ class Layers:
     Attributes:
         order: (N,) Gaussians from front to back.
         strength: what is compared with the cut-off.
-        most: the larger of what it emits and hides, before the clamp.
+        most: its opacity before the clamp.
         light: what arrives at it.
         facing: cosine between pixel and Gaussian.
     """
@@ -173,11 +168,9 @@ def layers(drawn: Drawn) -> Layers:
         scene.means[order], scene.quats[order], scene.scales[order], drawn.pose, drawn.grid, optics
     )
     shapes = reference.footprints(seen, drawn.grid, optics, torch.zeros_like(scene.means[:, :2]))
-    hides = scene.opacities if scene.extinctions is None else scene.extinctions
-    gain = seen.gain[:, None]
-    most = torch.maximum(gain * scene.opacities[order, None], gain * hides[order, None]) * shapes
-    _, gamma = reference.layers(seen, shapes, scene.opacities[order], hides[order], optics)
-    light, _ = reference.transmittances(gamma, optics.cutoff.transmittance)
+    most = seen.gain[:, None] * scene.opacities[order, None] * shapes
+    alpha = reference.layers(seen, shapes, scene.opacities[order], optics)
+    light, _ = reference.transmittances(alpha, optics.cutoff.transmittance)
     directions = drawn.grid.directions().flatten(0, 1)
     return Layers(
         order, shapes if optics.cutoff.relative else most, most, light, seen.direction @ directions.mT

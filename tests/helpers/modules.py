@@ -6,8 +6,9 @@ from gsparc.field.confidence import ConfidenceSettings
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
+from gsparc.field.losses import LossSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
-from gsparc.field.module import GaussianModule, LossSettings
+from gsparc.field.module import GaussianModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.ops import Pose
 

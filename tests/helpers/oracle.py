@@ -50,9 +50,7 @@ class Footprint:
     variance: float
 
 
-def look(
-    means, quats, scales, opacities, extinctions, features, ids, pose, grid, optics, unsure=UNSURE
-) -> Seen:
+def look(means, quats, scales, opacities, features, ids, pose, grid, optics, unsure=UNSURE) -> Seen:
     """Arrays (N, ...) of Gaussians, features (B, N, C); position (3,) and rotation (3, 3)."""
     position, rotation = pose
     local = (means - position) @ rotation
@@ -74,19 +72,19 @@ def look(
             continue
         nearness = np.clip(distance[i] / optics.near - 1, 0, 1)
         gain = nearness**2 * (3 - 2 * nearness) * (mark.share if optics.compensate else 1.0)
-        emits, hides = gain * opacities[i] * mark.shape, gain * extinctions[i] * mark.shape
-        strength = mark.shape if cutoff.relative else np.maximum(emits, hides)
+        emits = gain * opacities[i] * mark.shape
+        strength = mark.shape if cutoff.relative else emits
         counts = strength >= cutoff.alpha
         certain &= mark.certain & (np.abs(strength - cutoff.alpha) > unsure * cutoff.alpha)
         certain &= ~counts | (np.abs(light - cutoff.transmittance) > unsure * cutoff.transmittance)
-        peak = gain * max(opacities[i], extinctions[i])
+        peak = gain * opacities[i]
         reached[i] = peak > 0 and (mark.certain & (strength > (1 + unsure) * cutoff.alpha)).any()
         beyond = (1.0 if cutoff.relative else peak) / cutoff.alpha
         radii[i] = np.sqrt(2 * np.log(max(beyond, 1.0)) * mark.variance)
         counts &= light >= cutoff.transmittance
         weight = np.where(counts, np.minimum(emits, 0.99) * light, 0.0)
         image += weight * features[:, i, :, None, None]
-        light = np.where(counts, light * (1 - np.minimum(hides, 0.99)), light)
+        light = np.where(counts, light * (1 - np.minimum(emits, 0.99)), light)
     return Seen(image, light, certain, reached, radii)
 
 

@@ -29,7 +29,6 @@ class Scene:
     scales: Tensor
     opacities: Tensor
     features: Tensor
-    extinctions: Tensor | None = None
     ids: Tensor | None = None
 
     @property
@@ -51,7 +50,7 @@ class Scene:
 
 
 def random_scene(
-    n: int = 60, channels: int = 2, samples: int = 3, *, seed: int = 0, size: float = 0.4, hides: bool = False
+    n: int = 60, channels: int = 2, samples: int = 3, *, seed: int = 0, size: float = 0.4
 ) -> Scene:
     """Gaussians all around the origin, a few metres away, float64 values that float32 holds exactly."""
     draw = torch.Generator().manual_seed(seed)
@@ -69,7 +68,6 @@ def random_scene(
             scales=uniform(n, 3) * size + 0.02,
             opacities=uniform(n) * 0.95 + 0.02,
             features=normal(samples, n, channels),
-            extinctions=uniform(n) * 0.95 if hides else None,
         )
         .to(torch.float32)
         .to(torch.float64)
@@ -123,12 +121,10 @@ def render(
     """Image, transmittance, and the gradients of a fixed random linear function of both over `pixels`."""
     started = time.perf_counter()
     names = ["means", "quats", "scales", "opacities", "features"]
-    names += [] if scene.extinctions is None else ["extinctions"]
     leaves = {name: getattr(scene, name).clone().requires_grad_() for name in names}
-    hidden = leaves.get("extinctions")
     model = [leaves[name] for name in names[:4]]
-    plan = make_plan(*model, pose, grid, extinctions=hidden, ids=scene.ids, backend=backend, **optics)
-    raster = composite(plan, *model, leaves["features"], extinctions=hidden)
+    plan = make_plan(*model, pose, grid, ids=scene.ids, backend=backend, **optics)
+    raster = composite(plan, *model, leaves["features"])
     draw = torch.Generator().manual_seed(5)
     if upstream is None:
         upstream = torch.randn(raster.image.shape, generator=draw, dtype=torch.float64)

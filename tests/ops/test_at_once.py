@@ -29,10 +29,9 @@ def at_once(monkeypatch):
 def both(scene, pose, grid=GRIDS["hemisphere"], **optics):
     """Rasters in one call and in two."""
     model = scene.model
-    options = {"extinctions": scene.extinctions, "ids": scene.ids}
-    plan = make_plan(*model, pose, grid, **options, **optics)
-    apart = composite(plan, *model, scene.features, extinctions=scene.extinctions)
-    return rasterize(*model, scene.features, pose, grid, **options, **optics), apart
+    plan = make_plan(*model, pose, grid, ids=scene.ids, **optics)
+    apart = composite(plan, *model, scene.features)
+    return rasterize(*model, scene.features, pose, grid, ids=scene.ids, **optics), apart
 
 
 def assert_alike(pair):
@@ -46,9 +45,8 @@ def assert_alike(pair):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("count", [0, 3], ids=["shared", "each"])
-@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
-def test_same_bits(at_once, projection, dtype, grid, count, hides):
-    scene, pose = random_scene(n=200, hides=hides).to(dtype), poses(count)
+def test_same_bits(at_once, projection, dtype, grid, count):
+    scene, pose = random_scene(n=200).to(dtype), poses(count)
     found = assert_alike(both(scene, pose, GRIDS[grid], projection=projection))
     assert len(at_once) == 1 and (found.image != 0).any()
 

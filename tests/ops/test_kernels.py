@@ -32,9 +32,8 @@ BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["fl
 @PROJECTIONS
 @pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
 @pytest.mark.parametrize("count", [0, 3], ids=["shared", "posed"])
-@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
-def test_equals_reference(dtype, projection, grid, count, hides):
-    scene, pose = random_scene(hides=hides, seed=count), poses(count)
+def test_equals_reference(dtype, projection, grid, count):
+    scene, pose = random_scene(seed=count), poses(count)
     got, want = assert_equals_reference(scene, pose, grid, dtype, projection=projection)
     assert not (want["visible"] & ~got["visible"]).any()
     assert torch.allclose(got["radii"][want["visible"]].double(), want["radii"][want["visible"]], rtol=1e-4)
@@ -47,30 +46,26 @@ def test_equals_reference(dtype, projection, grid, count, hides):
     ids=["uncompensated", "sharp", "relative", "fading"],
 )
 def test_switches_equal_reference(projection, optics):
-    scene = random_scene(seed=7, hides=True)
+    scene = random_scene(seed=7)
     assert_equals_reference(scene, poses(0), GRIDS["hemisphere"], projection=projection, **optics)
 
 
 @BOTH
 @PROJECTIONS
-@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
-def test_weights_equal_reference(dtype, projection, hides):
-    scene, pose, grid = random_scene(hides=hides, seed=2), poses(2), GRIDS["hemisphere"]
+def test_weights_equal_reference(dtype, projection):
+    scene, pose, grid = random_scene(seed=2), poses(2), GRIDS["hemisphere"]
     cut = Cutoff(1e-3, 1e-4, relative=True)
     results = {}
     for backend, kind in (("reference", torch.float64), ("cpu", dtype)):
         cast = scene.to(kind)
         leaves = [leaf.clone().requires_grad_() for leaf in cast.model]
-        hidden = cast.extinctions.detach().clone().requires_grad_() if hides else None
-        plan = make_plan(
-            *leaves, pose, grid, projection=projection, cutoff=cut, extinctions=hidden, backend=backend
-        )
-        seen = mean_weights(plan, *leaves, extinctions=hidden)
+        plan = make_plan(*leaves, pose, grid, projection=projection, cutoff=cut, backend=backend)
+        seen = mean_weights(plan, *leaves)
         draw = torch.Generator().manual_seed(3)
         a, b = (torch.randn(seen.mean.shape, generator=draw, dtype=torch.float64).to(kind) for _ in range(2))
         (1000 * (seen.mean * a).sum() + (seen.share * b).sum()).backward()
         values = [seen.mean.detach(), seen.share.detach(), *(leaf.grad for leaf in leaves)]
-        results[backend] = dict(enumerate(values + ([hidden.grad] if hides else [])))
+        results[backend] = dict(enumerate(values))
     assert_close(results["cpu"], results["reference"], TOLERANCES[dtype])
 
 
@@ -135,7 +130,7 @@ def test_kernels_of_another_compiler_were_the_slowest_ones():
 @PROJECTIONS
 def test_every_instruction_set(name, dtype, projection):
     with instruction_set(name):
-        scene = random_scene(seed=11, hides=True)
+        scene = random_scene(seed=11)
         assert_equals_reference(scene, poses(3), GRIDS["hemisphere"], dtype, projection=projection)
 
 
@@ -144,24 +139,24 @@ def test_every_instruction_set(name, dtype, projection):
 @pytest.mark.parametrize("seed", [3, 4])
 def test_gradcheck(projection, backend, seed):
     """Every derivative by finite differences, with cut-offs so low that none is crossed."""
-    scene = random_scene(n=4, seed=seed, hides=True)
+    scene = random_scene(n=4, seed=seed)
     cut = Cutoff(1e-30, 0.0, relative=seed == 4)
     features = scene.features[:2, :, :1]
-    inputs = [scene.means, scene.quats, scene.scales, scene.opacities, scene.extinctions, features]
+    inputs = [scene.means, scene.quats, scene.scales, scene.opacities, features]
     inputs = [tensor.clone().requires_grad_() for tensor in inputs]
     kind = {"projection": projection, "cutoff": cut, "backend": backend}
 
-    def picture(m, q, s, o, x, f):
-        raster = rasterize(m, q, s, o, f, poses(2), SphereGrid.full_sphere(3, 6), extinctions=x, **kind)
+    def picture(m, q, s, o, f):
+        raster = rasterize(m, q, s, o, f, poses(2), SphereGrid.full_sphere(3, 6), **kind)
         return raster.image, raster.transmittance
 
-    def weights(m, q, s, o, x):
-        plan = make_plan(m, q, s, o, poses(2), SphereGrid.full_sphere(3, 6), extinctions=x, **kind)
-        seen = mean_weights(plan, m, q, s, o, extinctions=x)
+    def weights(m, q, s, o):
+        plan = make_plan(m, q, s, o, poses(2), SphereGrid.full_sphere(3, 6), **kind)
+        seen = mean_weights(plan, m, q, s, o)
         return seen.mean, seen.share
 
     assert torch.autograd.gradcheck(picture, inputs, atol=1e-6)
-    assert torch.autograd.gradcheck(weights, inputs[:5], atol=1e-6)
+    assert torch.autograd.gradcheck(weights, inputs[:4], atol=1e-6)
 
 
 def test_clamped_layers_pass_gradient_to_features_only():

@@ -37,7 +37,6 @@ class Field:
     quats: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
-    extinctions: np.ndarray
     features: np.ndarray
     ids: np.ndarray
     positions: np.ndarray
@@ -48,7 +47,7 @@ class Field:
     def seen(self, unsure: float) -> list[Seen]:
         """By each pose: all samples by a single one, else each its own."""
         parts = [self.features] if len(self.positions) == 1 else self.features[:, None]
-        model = (self.means, self.quats, self.scales, self.opacities, self.extinctions)
+        model = (self.means, self.quats, self.scales, self.opacities)
         poses = zip(self.positions, self.rotations, strict=True)
         return [
             look(*model, part, self.ids, pose, self.grid, self.optics, unsure)
@@ -57,14 +56,14 @@ class Field:
 
     def rendered(self, backend: str, dtype: torch.dtype = torch.float64) -> Raster:
         """By a backend."""
-        parts = (self.means, self.quats, self.scales, self.opacities, self.extinctions, self.features)
+        parts = (self.means, self.quats, self.scales, self.opacities, self.features)
         given = (torch.from_numpy(np.ascontiguousarray(part)).to(dtype) for part in parts)
-        *model, extinctions, features = given
+        *model, features = given
         optics = {name: getattr(self.optics, name) for name in self.optics.__dataclass_fields__}
         pose = Pose(torch.from_numpy(self.positions), torch.from_numpy(self.rotations))
         return rasterize(
             *model, features, pose, self.grid, **optics,
-            extinctions=extinctions, ids=torch.from_numpy(self.ids), backend=backend,
+            ids=torch.from_numpy(self.ids), backend=backend,
         )  # fmt: skip
 
 
@@ -114,7 +113,6 @@ def drawn(number: int) -> Field:
     )
     return Field(
         *(means, quats, scales, opacities),
-        extinctions=opacities if rng.random() < 0.5 else rng.choice([0.0, 0.3, 1.0], count),
         features=rng.normal(size=(samples, count, int(rng.integers(1, 6)))), ids=rng.permutation(count),
         positions=place, rotations=turn, grid=grid, optics=optics,
     )  # fmt: skip

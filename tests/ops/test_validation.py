@@ -21,24 +21,24 @@ from gsparc.ops import (
 
 GRID = SphereGrid.hemisphere(9, 18)
 BACKENDS = pytest.mark.parametrize("backend", ["reference", "cpu"])
-NAMES = ("means", "quats", "scales", "opacities", "features", "extinctions")
+NAMES = ("means", "quats", "scales", "opacities", "features")
 PLACE, TURN = poses(2).position, poses(2).rotation
 
 
 def drawn(backend, apart=False, **change):
     """In one call, or in two."""
-    scene = random_scene(n=6, samples=2, hides=True)
+    scene = random_scene(n=6, samples=2)
     given = {name: getattr(scene, name) for name in NAMES} | {"pose": poses(2), "backend": backend} | change
     if not apart:
         return rasterize(**given, grid=GRID)
     features = given.pop("features")
     plan = make_plan(**given, grid=GRID)
-    return composite(plan, *(given[name] for name in NAMES[:4]), features, extinctions=given["extinctions"])
+    return composite(plan, *(given[name] for name in NAMES[:4]), features)
 
 
 def wrong(name, index, value):
     """One number of an input replaced."""
-    tensor = getattr(random_scene(n=6, samples=2, hides=True), name).clone()
+    tensor = getattr(random_scene(n=6, samples=2), name).clone()
     tensor[index] = value
     return {name: tensor}
 
@@ -69,9 +69,7 @@ REFUSED = [
       for name in NAMES[:4] for value in (math.nan, math.inf)),
     *((wrong("features", (1, 4, 0), value), UnsoundGaussian, "Gaussian 4 has features that are not finite")
       for value in (math.nan, math.inf)),
-    # What emits and what hides are looked at both: only the larger was, and -1e30 went through.
-    *((wrong(name, 3, -0.5), UnsoundGaussian, r"Gaussian 3 has opacities that are not in \[0, 1\]")
-      for name in ("opacities", "extinctions")),
+    (wrong("opacities", 3, -0.5), UnsoundGaussian, r"Gaussian 3 has opacities that are not in \[0, 1\]"),
     *((posed(far=far), ValueError, NO_POSE) for far in (2e6, 1e30, math.nan)),
     *((posed(matrix=matrix), ValueError, NO_POSE) for matrix in (
         [[0.0] * 3] * 3, [[2.0, 0, 0], [0, 2, 0], [0, 0, 2]], [[1.0, 0, 0], [0, 1, 0], [0, 0, -1]],

@@ -54,7 +54,8 @@ class Located:
     @classmethod
     def from_posterior(cls, posterior: Posterior, mass: float, place: np.ndarray, seconds: float = 0) -> Self:
         """Return what is known at a place (3,) [m, local], with the area of cells of a `mass`."""
-        area = float(posterior.cells.volume[posterior.densest_cells(mass)].sum())
+        volume = posterior.cells.volume
+        area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
         return cls(place, area, len(posterior.modes(mass)), posterior, seconds)
 
 

@@ -112,13 +112,9 @@ class Posterior:
                 break
         return place
 
-    def densest_cells(self, share: float) -> np.ndarray:
-        """Return the most likely cells (c,) that hold a share of the mass, most likely first."""
-        return densest_cells(self.log_density, self.cells.volume, share)
-
     def modes(self, share: float) -> list[np.ndarray]:
         """Cells of each connected part of the area that holds a share of the mass, heaviest first."""
-        some = self.densest_cells(share)
+        some = densest_cells(self.log_density, self.cells.volume, share)
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
         # Cells touch where centres are no farther apart than half the sum of edges, 1 % for rounding.

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.moments import number_moments
 from gsparc.data.schema import Kind, Measurements, Site
 
 PIXELS = 1_000  # about as many of a spectrum are compared: an array's have far fewer degrees of freedom
@@ -50,10 +51,8 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     rows = np.sort(np.asarray(rows))
     count = 1 if site.stations is None else len(site.stations)
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
-    place = rows if data.place is None or count == 1 else data.place[rows]
-    keys = np.c_[place, _repetition(np.c_[place, station])]
-    _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    which = which.reshape(-1)
+    moment = np.arange(len(rows)) if count == 1 else number_moments(data, rows)
+    _, first, which = np.unique(moment, return_index=True, return_inverse=True)
     measured = flatten_targets(data.targets(rows))
     measured = measured.to(torch.complex128) if measured.is_complex() else measured.double()
     if site.kind == "rssi":
@@ -121,12 +120,3 @@ def _without_silence(values: Tensor, silent: Tensor | None) -> tuple[Tensor, Ten
         return values, None
     gap = torch.full_like(values, np.nan)
     return torch.where(silent, gap, values), torch.where(silent, values, gap)
-
-
-def _repetition(keys: np.ndarray) -> np.ndarray:
-    """How many rows before each (m,) have the same keys (m, k)."""
-    number = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
-    order = np.argsort(number, kind="stable")
-    earlier = np.empty(len(keys), np.int64)
-    earlier[order] = np.arange(len(keys)) - np.searchsorted(number[order], number[order])
-    return earlier

@@ -136,7 +136,9 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     rms = np.array([float(np.sqrt(mass @ error**2)) for error, mass in spreads])
     typical = np.array([float(np.median(one.spread_db)) for one in bins])
     weight = np.array([len(one) for one in bins], float)
-    half, rms = (_rising(middle, one * typical, weight) / typical for one in (half, rms))
+    isotonic, order = IsotonicRegression(), np.arange(count)
+    half = isotonic.fit_transform(order, half * typical, sample_weight=weight) / typical
+    rms = isotonic.fit_transform(order, rms * typical, sample_weight=weight) / typical
     tail = None
     if heard.all():
         tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
@@ -196,12 +198,6 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
             ratio = max(typical(own), 1e-3 * whole) / whole
             factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
     return factors
-
-
-def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    if len(distance) == 1:
-        return width
-    return IsotonicRegression().fit_transform(np.arange(len(distance)), width, sample_weight=weight)
 
 
 def interval_coverage(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:

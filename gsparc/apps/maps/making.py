@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from gsparc.apps.maps import field_map
@@ -25,6 +24,7 @@ from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import finite_array
 from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.schema import End, Site
+from gsparc.data.spacing import neighbour_distance
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.predictor import Predictor
@@ -202,11 +202,7 @@ def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
     """Cells between those that are asked about everywhere: no farther apart than what was measured."""
     if tolerance_db <= 0 or grid.inside.sum() <= ALL_CELLS or promise is None:
         return 1
-    places = np.unique(promise.known[:, -3:-1], axis=0)
-    if len(places) < 2:
-        return 1
-    apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
-    return max(int(apart / grid.step / 2), 1)
+    return max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
 
 
 def _asker(

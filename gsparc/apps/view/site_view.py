@@ -54,6 +54,7 @@ class SiteView:
         grid: cells of planes; None where no power is predicted.
         at: world place where the moving end first stands; None: chosen.
         other: the same of the transmitter, where both move.
+        made: stations' views, as they are asked for.
     """
 
     viewed: Viewed
@@ -61,7 +62,7 @@ class SiteView:
     grid: Grid | None = None
     at: np.ndarray | None = None
     other: np.ndarray | None = None
-    _made: dict[str | None, StationView] = field(default_factory=dict)
+    made: dict[str | None, StationView] = field(default_factory=dict)
     _lock: Any = field(default_factory=threading.Lock)
 
     @property
@@ -71,16 +72,12 @@ class SiteView:
 
     def station(self, name: str | None) -> StationView:
         """Return the view of a station, made when first asked for, in seconds; those made wait for nobody."""
-        if name not in self._made:
+        if name not in self.made:
             # Two clients that ask for a new station at once wait for one making of it.
             with self._lock:
-                if name not in self._made:
-                    self._made[name] = self._make(name)
-        return self._made[name]
-
-    def has_station(self, name: str | None) -> bool:
-        """Return whether a station was made."""
-        return name in self._made
+                if name not in self.made:
+                    self.made[name] = self._make(name)
+        return self.made[name]
 
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed

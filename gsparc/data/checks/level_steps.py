@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.data.errors import DataError
 from gsparc.processes.factor import Factor
 
 MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
@@ -31,13 +30,11 @@ class LevelStep:
         last: the last row before it.
         first: the first row after it.
         change_db: level after minus level before, at equal places.
-        sigmas: the same in standard deviations of the estimate.
     """
 
     last: int
     first: int
     change_db: float
-    sigmas: float
 
 
 def detect_level_steps(
@@ -59,13 +56,7 @@ def detect_level_steps(
         level_db: (n,) [dB], NaN where there is none.
         station_position: (2,) or (3,) [m]; None: the level is not tied to a distance.
         most_blocks: rows are averaged to at most so many (median), against outliers and for speed.
-
-    Raises:
-        DataError: shapes that do not fit, or positions that are not finite.
     """
-    position, level_db = np.asarray(position, np.float64), np.asarray(level_db, np.float64)
-    if position.ndim != 2 or level_db.shape != position.shape[:1] or not np.isfinite(position).all():
-        raise DataError("level_steps: expected finite positions (n, 2) or (n, 3) and as many levels")
     rows = np.flatnonzero(np.isfinite(level_db))
     if len(rows) < LEAST_ROWS or not np.ptp(position[rows], axis=0).any():
         return ()
@@ -80,16 +71,12 @@ def detect_level_steps(
         mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
     regressors = np.stack(mean, axis=1)
     precision = _precision(places, level, regressors)
-    after, change, sigmas = _search(precision, level, regressors)
     steps = [
-        LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(d), float(s))
-        for k, d, s in zip(after, change, sigmas, strict=True)
-        if abs(d) >= LEAST_DB and s >= LEAST_SIGMAS
+        LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(change))
+        for k, change in zip(*_search(precision, level, regressors), strict=True)
+        if abs(change) >= LEAST_DB
     ]
     return tuple(sorted(steps, key=lambda step: step.first))
-
-
-Steps = tuple[list[int], np.ndarray, np.ndarray]
 
 
 def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
@@ -125,8 +112,8 @@ def _covariance(distance: np.ndarray, reach: float, nugget: float) -> np.ndarray
     return np.exp(-distance / reach) + nugget * np.eye(len(distance))
 
 
-def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> Steps:
-    """First blocks after steps, estimates [dB] of all steps together, and how many deviations each is."""
+def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """First blocks after steps of `LEAST_SIGMAS` and more, and estimates [dB] of all of them together."""
     count = len(level)
     margin = max(3, int(SHORTEST * count))
     after: list[int] = []
@@ -141,10 +128,10 @@ def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) ->
         change = (covariance @ (design.T @ (precision @ level)))[regressors.shape[1] :]
         deviation = np.sqrt(np.diag(covariance)[regressors.shape[1] :].clip(1e-300))
         # A step that is none takes from its neighbours: without it the others are estimated again.
-        weak = np.argmin(np.abs(change) / deviation) if after else 0
-        if not after or abs(change[weak]) / deviation[weak] >= LEAST_SIGMAS:
-            return after, change, np.abs(change) / deviation
-        after.pop(int(weak))
+        sigmas = np.abs(change) / deviation
+        if not after or sigmas.min() >= LEAST_SIGMAS:
+            return after, change
+        after.pop(int(sigmas.argmin()))
 
 
 def _best(precision: np.ndarray, level: np.ndarray, mean: np.ndarray, steps: list[int], margin: int) -> int:

@@ -116,8 +116,6 @@ class StrongestLists:
         for t in range(self.level.shape[1]):
             listed = np.isfinite(self.level[:, t])
             own, heard = np.flatnonzero(~listed & known), np.flatnonzero(listed & known)
-            if not len(own):
-                continue
             expected = np.full(len(own), -FALL_DB)
             if len(heard):
                 far, near = cKDTree(self.place[heard]).query(self.place[own])
@@ -130,7 +128,7 @@ class StrongestLists:
             order = np.lexsort((-tells, square[own]))
             turn = np.arange(len(order)) - np.searchsorted(square[own][order], square[own][order])
             parts.append(np.stack([own[order], np.full(len(own), t), tells[order] / (1 + turn)], 1))
-        moment, station, tells = np.concatenate(parts).T if parts else np.zeros((3, 0))
+        moment, station, tells = np.concatenate(parts).T
         tells = np.where(np.isin(moment, several), np.inf, tells)
         chosen = np.sort(np.argsort(-tells, kind="stable")[:most])
         moment, station = moment[chosen].astype(np.int64), station[chosen].astype(np.int64)

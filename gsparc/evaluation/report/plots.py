@@ -71,7 +71,10 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
     x, y = [points[i][0] for i in best], [points[i][1] for i in best]
     axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
     set_log_axis(axes)
-    _accuracy_axis(axes, name)
+    axes.set_ylabel(heading_of(name))
+    # Errors span decades; minposy is infinite where none is above 0.
+    if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
+        axes.set_yscale("log")
     if name == "psnr_db" and len(points) > 1:  # a black image at 6 dB would flatten everything above 25
         values = [value for _, value in points]
         middle, best_value = float(np.median(values)), max(values)
@@ -166,21 +169,10 @@ def _axes() -> Axes:
 def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
     axes.set_xlabel(horizontal)
     axes.figure.set_label(title)
-    _legend(axes)
-    return axes.figure  # type: ignore[return-value]
-
-
-def _accuracy_axis(axes: Axes, name: str) -> None:
-    axes.set_ylabel(heading_of(name))
-    # Errors span decades; minposy is infinite where none is above 0.
-    if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
-        axes.set_yscale("log")
-
-
-def _legend(axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         axes.legend(handles, [shorten_setting(label, 44) for label in labels], fontsize=6.5)
+    return axes.figure  # type: ignore[return-value]
 
 
 def shorten_setting(text: str, most: int = 32) -> str:

@@ -264,17 +264,15 @@ class _Search:
     def _measured(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
         """With what left-out rows say."""
         errors = np.mean([_left_out(part, prior).mean(1) for part in parts], axis=0)
-        return Candidate(prior, negative_log_evidence(parts, prior) + self._worth(prior), errors)
+        numbers = sum(2 * group.target.numel() for group in self.groups)
+        # What the terms beside the isotropic field must gain [nats].
+        worth = 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
+        return Candidate(prior, negative_log_evidence(parts, prior) + worth, errors)
 
     def _fitted(self, prior: ChannelPrior) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(prior)
         return self._measured(fit_powers(parts, prior, SHRINKAGE)[0], parts)
-
-    def _worth(self, prior: ChannelPrior) -> float:
-        """What the terms beside the isotropic field must gain [nats]."""
-        numbers = sum(2 * group.target.numel() for group in self.groups)
-        return 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
 
     @property
     def one_end(self) -> bool:

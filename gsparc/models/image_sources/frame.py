@@ -15,9 +15,10 @@ from torch.nn.functional import normalize
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.rows import Rows, channel_places, moving_end, static_array
+from gsparc.models.image_sources.rows import Rows, channel_places, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.places import moving_end
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 

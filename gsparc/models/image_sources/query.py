@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances
-from gsparc.models.image_sources.rows import moving_end, ranges_at
+from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
 from gsparc.models.method import to_double
 from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.kernel import distances
+from gsparc.processes.places import moving_end
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 MATERN32 = 3  # factor of squared distances over lengths in Matern-3/2

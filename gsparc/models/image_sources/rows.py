@@ -7,7 +7,6 @@ the static end is the same for every receiver and folds into the complex gain. T
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -15,9 +14,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.physics.waves import ranges
-
-A = TypeVar("A", Tensor, np.ndarray)
-
+from gsparc.processes.places import moving_end
 
 LEAST_ROWS = 8  # that a search may be limited to
 
@@ -61,11 +58,6 @@ class Rows:
     def static_ends(self, static: Tensor) -> Tensor:
         """Return the static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
         return static if self.array is None else static + self.array
-
-
-def moving_end(places: A) -> A:
-    """Return positions (..., 3) [m] of the moving end, of places (..., 3 or 6) as `Rows.places` has them."""
-    return places[..., :3]
 
 
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
@@ -173,9 +165,3 @@ def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
         # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
         sources = sources + torch.einsum("kij,mj->mki", turned, places[:, position.shape[1] :])
     return ranges(position, sources)
-
-
-def bounding_box(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Return the lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
-    places = torch.cat([rows.position, transmitter[None]])
-    return torch.stack([places.amin(0), places.amax(0)])

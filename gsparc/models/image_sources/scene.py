@@ -14,10 +14,11 @@ from torch.nn.functional import normalize
 
 from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.rows import Rows, moving_end
+from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
 from gsparc.physics.waves import ranges, wave
 from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.places import moving_end
 
 BETAS = 0.8, 0.95  # decay rates of Adam's moments: of tens of steps, not its usual thousand
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance

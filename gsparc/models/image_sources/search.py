@@ -25,7 +25,7 @@ from gsparc.models.image_sources.refine import (
     learn_visibility,
     refine_scene,
 )
-from gsparc.models.image_sources.rows import LEAST_ROWS, Rows, bounding_box
+from gsparc.models.image_sources.rows import LEAST_ROWS, Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
@@ -92,7 +92,8 @@ class Search:
         self.rows, self.settings, self.last_round = rows, settings, last_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
-        self.box = bounding_box(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
+        measured = torch.cat([rows.position, transmitter[None]])
+        self.box = torch.stack([measured.amin(0) - settings.margin, measured.amax(0) + settings.margin])
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
         self.scene = Scene.from_static_end(transmitter, loudness, math.log(NOISE))
         if found is not None and settings.order:

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind
 from gsparc.field.gaussians import FieldSettings
-from gsparc.field.losses import task_loss
+from gsparc.field.losses import LossSettings, task_loss
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
@@ -44,7 +44,8 @@ class ComplexGaussians(GaussianNetwork):
         super().__init__(scene, settings.count)
         count, self.degree, self.order = settings.count, settings.degree, settings.order
         self.fourier_weight = settings.fourier_weight
-        self.ssim_weight = settings.ssim_weight / (1 - settings.fourier_weight)  # of what the base counts
+        # Of what the base counts.
+        self.losses = LossSettings(settings.ssim_weight / (1 - settings.fourier_weight))
         self.field = initial_gaussians(scene, count)
         self.grid, self.options = rendering_options(scene)
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, count_terms(self.degree, self.order), 2))
@@ -89,7 +90,7 @@ class ComplexGaussians(GaussianNetwork):
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
         seen = self(batch.tx, batch.rx)
-        plain = task_loss(seen, batch, self).mean()
+        plain = task_loss(seen, batch, self.losses).mean()
         # A transform mixes all pixels, those that were not measured among them.
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain

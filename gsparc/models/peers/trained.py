@@ -16,9 +16,8 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.gradient_stage import interruptible, make_trainer, read_trainer_result, requested_steps
-from gsparc.field.initial import Snapshot
-from gsparc.field.losses import task_loss
-from gsparc.field.module import LossSettings, NetworkModule
+from gsparc.field.losses import LossSettings, task_loss
+from gsparc.field.module import NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction
@@ -72,8 +71,7 @@ class Network(nn.Module):
         count: Gaussians, or virtual transmitters.
     """
 
-    ssim_weight = LossSettings().ssim_weight
-    snapshot: Snapshot = "none"
+    losses = LossSettings()
 
     def __init__(self, scene: Scene, count: int = 0) -> None:
         super().__init__()
@@ -81,7 +79,7 @@ class Network(nn.Module):
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the training loss () of a batch; `generator` for whatever is drawn at random."""
-        return task_loss(self(batch.tx, batch.rx), batch, self).mean()
+        return task_loss(self(batch.tx, batch.rx), batch, self.losses).mean()
 
     @torch.no_grad()
     def rendered(self, tx: Tensor, rx: Pose) -> Tensor:

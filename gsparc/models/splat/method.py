@@ -29,8 +29,9 @@ from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
+from gsparc.field.losses import LossSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
-from gsparc.field.module import GaussianModule, LossSettings, squared_error
+from gsparc.field.module import GaussianModule, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
@@ -456,10 +457,7 @@ class LearnedField(Method):
 
     # -- what it can do besides ----------------------------------------------------------------------
 
-    def reduction_settings(self) -> tuple[str, ...]:
-        """See `Method.reduced`."""
-        return reduce.reduction_settings(self.fitted())
-
+    reduction_settings = reduce.reduction_settings
     reduction_inputs = reduce.reduction_inputs
     reduced = reduce.reduced
 

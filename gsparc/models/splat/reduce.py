@@ -25,18 +25,14 @@ if TYPE_CHECKING:
     from gsparc.models.splat.method import LearnedField
 
 
-def is_imaged_by_array(model: GaussianModel) -> bool:
-    """Return whether Gaussians emit fields that an array images, on pixels of its own."""
-    return model.settings.response.array
-
-
-def reduction_settings(model: GaussianModel) -> tuple[str, ...]:
+def reduction_settings(method: LearnedField) -> tuple[str, ...]:
     """See `Method.reduced`.
 
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
     places that the features are told by, which `keep` is a share of, and pixels.
     """
-    if not is_imaged_by_array(model):
+    model = method.fitted()
+    if not model.settings.response.array:
         return ("confidence", "stride")
     return ("keep", "stride", "confidence") if model.tells_unknown else ("confidence",)
 
@@ -64,7 +60,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     raster = model.settings.raster
     raster = replace(raster, low_pass=raster.low_pass / stride**2)  # as wide as before on the sky
     model.settings = replace(model.settings, raster=raster)
-    by_places = is_imaged_by_array(model) and model.tells_unknown
+    by_places = model.settings.response.array and model.tells_unknown
     if "keep" in settings:
         distil_features(model, float(settings["keep"]))
     if not settings.get("confidence", True):

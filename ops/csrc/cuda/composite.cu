@@ -30,9 +30,9 @@ __global__ void __launch_bounds__(kBlock) composite_kernel(View<S> v, Model<S> m
             for (int j = 0; j < walk.taken; ++j) {
                 const S form = walk.form(j);
                 if (form < 0 || !walk.lit(light)) continue;
-                const Layer<S, true> layer = walk.layer(j, form);
+                const Layer<S> layer = walk.layer(j, form);
                 const S weight = light * layer.alpha;
-                light *= S(1) - layer.gamma;
+                light *= S(1) - layer.alpha;
                 GSPARC_UNROLL
                 for (int k = 0; k < kChannels; ++k) sums[k] = fma(walk.entry(j).features[k], weight, sums[k]);
             }
@@ -89,9 +89,9 @@ __global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> mo
         S light = walk.start, spent = 0;
         for (int j = 0; j < walk.taken && walk.lit(light); ++j) {
             if (walk.form(j) < 0) continue;
-            const Layer<S, true> layer = walk.layer(j, walk.form(j));
+            const Layer<S> layer = walk.layer(j, walk.form(j));
             spent += light * layer.alpha * gain_of(j);
-            light *= S(1) - layer.gamma;
+            light *= S(1) - layer.alpha;
         }
         const S after = light;
         desk.spent[walk.warp][walk.lane] = spent;
@@ -111,11 +111,11 @@ __global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> mo
                 if (counts) {
                     S tau1, tau2, form;
                     walk.pixel.offsets(walk.entry(j).record, v.settings, tau1, tau2, form);
-                    const Layer<S, true> layer = walk.layer(j, form);
-                    const S gain = lit ? gain_of(j) : S(0), weight = light * layer.alpha, through = S(1) - layer.gamma;
+                    const Layer<S> layer = walk.layer(j, form);
+                    const S gain = lit ? gain_of(j) : S(0), weight = light * layer.alpha, through = S(1) - layer.alpha;
                     if (lit) rest -= weight * gain;
-                    MomentSums<S, P, true> sums;
-                    sums.add(layer, true, fma(light, gain, per_alpha), lit ? -rest / through : S(0), tau1, tau2, form, walk.alpha_max);
+                    MomentSums<S, P> sums;
+                    sums.add(layer, true, fma(light, gain, per_alpha) + (lit ? -rest / through : S(0)), tau1, tau2, form, walk.alpha_max);
                     sums.write(values);
                     GSPARC_UNROLL
                     for (int k = 0; k < kChannels; ++k) values[kMoments + k] = lit ? weight * g[k] : S(0);
@@ -148,9 +148,9 @@ __global__ void __launch_bounds__(kBlock) weigh_kernel(View<S> v, Model<S> model
         for (int j = 0; j < walk.taken; ++j) {
             S weight = 0, alpha = 0;
             if (walk.form(j) >= 0) {
-                const Layer<S, true> layer = walk.layer(j, walk.form(j));
+                const Layer<S> layer = walk.layer(j, walk.form(j));
                 alpha = layer.alpha;
-                if (walk.lit(light)) weight = light * alpha, light *= S(1) - layer.gamma;
+                if (walk.lit(light)) weight = light * alpha, light *= S(1) - layer.alpha;
             }
             if (out.blocks) out.blocks[int64_t(walk.first + j) * kWarp + walk.lane] = weight;
             if (!out.rows) continue;
@@ -221,10 +221,10 @@ __global__ void add_rows(View<S> v, const S* rows, int width, int split, S* firs
 }
 
 template <class S> struct Slopes {
-    S *means, *quats, *scales, *opacities, *extinctions;  // the last may be absent
+    S *means, *quats, *scales, *opacities;
 };
 
-constexpr int kSlopes = 12;  // of a mean, a quaternion, three scales, opacity and extinction
+constexpr int kSlopes = 11;  // of a mean, a quaternion, three scales and opacity
 
 // Chains the sums (chunks, P, N, kMoments) into slopes (P, N, kSlopes) of the parameters as each pose sees them.
 template <class S, class P>
@@ -243,14 +243,13 @@ __global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunk
     for (int chunk = 0; chunk < chunks; ++chunk)
         for (int k = 0; k < kMoments; ++k) m[k] += sums[(int64_t(chunk) * all + row) * kMoments + k];
     const Gaussian<S> g = gaussian(model, i);
-    const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : opacity;
     const S* rotation = model.rotations + 9 * pose;
     const Footprint<S> f = project<P>(g, model.positions + 3 * pose, rotation, v.settings);
-    const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
-    const Gradients<S> one = project_backward<P>(f, moments, opacity, extinction, rotation, v.settings);
+    const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7]};
+    const Gradients<S> one = project_backward<P>(f, moments, model.opacities[i], rotation, v.settings);
     for (int k = 0; k < 3; ++k) to[k] = one.mean[k], to[7 + k] = one.scale[k];
     for (int k = 0; k < 4; ++k) to[3 + k] = one.quat[k];
-    to[10] = one.opacity, to[11] = one.extinction;
+    to[10] = one.opacity;
     if (screen) screen[2 * int64_t(row)] = one.screen[0], screen[2 * int64_t(row) + 1] = one.screen[1];
 }
 
@@ -258,16 +257,12 @@ __global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunk
 template <class S> __global__ void add_poses(View<S> v, const S* slopes, Slopes<S> out) {
     const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, i = at / kSlopes, k = at % kSlopes;
     if (i >= v.count) return;
-    auto total = [&](int part) {
-        S sum = 0;
-        for (int pose = 0; pose < v.poses; ++pose) sum += slopes[(int64_t(pose) * v.count + i) * kSlopes + part];
-        return sum;
-    };
-    if (k < 3) out.means[3 * i + k] = total(k);
-    else if (k < 7) out.quats[4 * i + k - 3] = total(k);
-    else if (k < 10) out.scales[3 * i + k - 7] = total(k);
-    else if (k == 11 && out.extinctions) out.extinctions[i] = total(k);
-    else if (k == 10) out.opacities[i] = total(10) + (out.extinctions ? S(0) : total(11));  // what emits also hides, then
+    S sum = 0;
+    for (int pose = 0; pose < v.poses; ++pose) sum += slopes[(int64_t(pose) * v.count + i) * kSlopes + k];
+    if (k < 3) out.means[3 * i + k] = sum;
+    else if (k < 7) out.quats[4 * i + k - 3] = sum;
+    else if (k < 10) out.scales[3 * i + k - 7] = sum;
+    else out.opacities[i] = sum;
 }
 
 int64_t blocks_for(int64_t threads) { return (threads + kThreads - 1) / kThreads; }
@@ -320,7 +315,7 @@ template <class S> int64_t backward(const Call& call, bool weights) {
     if (weights) in.read(forward.features, up.per_alpha);
     else in.read(forward.features, forward.image, forward.transmittance, up.image, up.transmittance);
     Slopes<S> out;
-    in.read(out.means, out.quats, out.scales, out.opacities, out.extinctions);
+    in.read(out.means, out.quats, out.scales, out.opacities);
     S *features = nullptr, *screen = nullptr;
     if (!weights) in.read(features, screen);  // (P, N, K), (P, N, 2)
 

@@ -7,20 +7,20 @@ namespace gsparc {
 namespace GSPARC_ISA {
 namespace {
 
-constexpr int kWide = kSimilarityWidth, kHigh = kSimilarityHeight, kTaps = 2 * kMostRadius + 1;
-constexpr int kColumns = kWide + 2 * kMostRadius, kRows = kHigh + 2 * kMostRadius;
+constexpr int kWide = kSimilarityWidth, kHigh = kSimilarityHeight;
+constexpr int kColumns = kWide + 2 * kRadius, kRows = kHigh + 2 * kRadius;
 constexpr int kWindowed = 5, kDerivatives = 3;
 
 struct Images {
-    int height, width, radius, tiles_x, tiles;  // tiles of one image
+    int height, width, tiles_x, tiles;  // tiles of one image
     float taps[kTaps], c1, c2;
     const float *prediction, *target, *shift;  // (B, H, W) twice, (B,): the targets' means
     float *sums;                               // (B, tiles), of the similarity
-    float *by;                                 // (3, B, H - 2 radius, W - 2 radius), its derivatives, or null
+    float *by;                                 // (3, B, H - 2 kRadius, W - 2 kRadius), its derivatives, or null
     float *slope;                              // (B, H, W), or null
 
-    GSPARC_HD int rows() const { return height - 2 * radius; }
-    GSPARC_HD int columns() const { return width - 2 * radius; }
+    GSPARC_HD int rows() const { return height - 2 * kRadius; }
+    GSPARC_HD int columns() const { return width - 2 * kRadius; }
     GSPARC_HD int64_t pixels() const { return int64_t(height) * width; }
     GSPARC_HD int64_t places() const { return int64_t(rows()) * columns(); }
 };
@@ -35,12 +35,11 @@ __device__ void read_window(const Images& a, float (&weights)[kTaps]) {
 // The window over kMaps maps in shared memory: down the columns, then along a row for each output of this thread.
 // value(map, y, x) is what lies there; use(y, x, windowed) takes outputs, (y, x) within the tile.
 template <int kMaps, class Value, class Use>
-__device__ void window(const float* weights, int taps, float (&half)[kMaps][kHigh][kColumns], Value value, Use use) {
-    const int columns = kWide + taps - 1;
-    for (int at = threadIdx.x; at < kHigh * columns; at += kBlock) {
-        const int y = at / columns, x = at % columns;
+__device__ void window(const float* weights, float (&half)[kMaps][kHigh][kColumns], Value value, Use use) {
+    for (int at = threadIdx.x; at < kHigh * kColumns; at += kBlock) {
+        const int y = at / kColumns, x = at % kColumns;
         float sums[kMaps] = {};
-        for (int k = 0; k < taps; ++k)
+        for (int k = 0; k < kTaps; ++k)
             GSPARC_UNROLL
             for (int c = 0; c < kMaps; ++c) sums[c] = fma(weights[k], value(c, y + k, x), sums[c]);
         for (int c = 0; c < kMaps; ++c) half[c][y][x] = sums[c];
@@ -49,7 +48,7 @@ __device__ void window(const float* weights, int taps, float (&half)[kMaps][kHig
     for (int at = threadIdx.x; at < kHigh * kWide; at += kBlock) {
         const int y = at / kWide, x = at % kWide;
         float sums[kMaps] = {};
-        for (int k = 0; k < taps; ++k)
+        for (int k = 0; k < kTaps; ++k)
             GSPARC_UNROLL
             for (int c = 0; c < kMaps; ++c) sums[c] = fma(weights[k], half[c][y][x + k], sums[c]);
         use(y, x, sums);
@@ -75,7 +74,7 @@ __global__ void __launch_bounds__(kBlock) similarity_places(Images a) {
         return c < 2 ? first : first * second;
     };
     float total = 0;
-    window(weights, 2 * a.radius + 1, half, moment, [&](int y, int x, const float (&m)[kWindowed]) {
+    window(weights, half, moment, [&](int y, int x, const float (&m)[kWindowed]) {
         if (row0 + y >= a.rows() || column0 + x >= a.columns()) return;
         float by[kDerivatives];
         total += similar_at(m, shift, a.c1, a.c2, share, a.by != nullptr, by);
@@ -100,7 +99,7 @@ __global__ void __launch_bounds__(kBlock) similarity_slopes(Images a) {
     const int64_t image = blockIdx.x / a.tiles, map = int64_t(gridDim.x / a.tiles) * a.places();
     const int tile = blockIdx.x % a.tiles, row0 = tile / a.tiles_x * kHigh, column0 = tile % a.tiles_x * kWide;
     for (int at = threadIdx.x; at < kRows * kColumns; at += kBlock) {
-        const int y = row0 + at / kColumns - 2 * a.radius, x = column0 + at % kColumns - 2 * a.radius;
+        const int y = row0 + at / kColumns - 2 * kRadius, x = column0 + at % kColumns - 2 * kRadius;
         const bool there = y >= 0 && y < a.rows() && x >= 0 && x < a.columns();
         const float* from = a.by + image * a.places() + int64_t(y) * a.columns() + x;
         for (int c = 0; c < kDerivatives; ++c) by[c][at / kColumns][at % kColumns] = there ? from[c * map] : 0.0f;
@@ -108,7 +107,7 @@ __global__ void __launch_bounds__(kBlock) similarity_slopes(Images a) {
     read_window(a, weights);
     block_sync();
     const float shift = a.shift[image];
-    window(weights, 2 * a.radius + 1, half, [&](int c, int y, int x) { return by[c][y][x]; }, [&](int y, int x, const float (&m)[kDerivatives]) {
+    window(weights, half, [&](int c, int y, int x) { return by[c][y][x]; }, [&](int y, int x, const float (&m)[kDerivatives]) {
         if (row0 + y >= a.height || column0 + x >= a.width) return;
         const int64_t at = image * a.pixels() + int64_t(row0 + y) * a.width + column0 + x;
         a.slope[at] = m[0] + 2.0f * (a.prediction[at] - shift) * m[1] + (a.target[at] - shift) * m[2];
@@ -126,9 +125,9 @@ extern "C" int64_t gsparc_similarity(const gsparc::Call* call) {
     Images a;
     gsparc::Reader in(*call);
     int64_t samples;
-    in.sizes(samples, a.height, a.width, a.radius);
+    in.sizes(samples, a.height, a.width);
     a.c1 = float(call->numbers[0]), a.c2 = float(call->numbers[1]);
-    for (int k = 0; k < kTaps; ++k) a.taps[k] = k > 2 * a.radius ? 0.0f : float(call->numbers[2 + (k <= a.radius ? k : 2 * a.radius - k)]);
+    for (int k = 0; k < gsparc::kTaps; ++k) a.taps[k] = float(call->numbers[2 + (k <= gsparc::kRadius ? k : 2 * gsparc::kRadius - k)]);
     in.read(a.prediction, a.target, a.shift, a.sums, a.slope);
     Arena arena(reinterpret_cast<void*>(uintptr_t(call->scratch)));
     a.by = a.slope ? arena.take<float>(kDerivatives * samples * a.places()) : nullptr;

@@ -17,7 +17,7 @@ template <class S> struct alignas(16) Quarter {
 
 template <class S, int kChannels> struct alignas(16) Staged {
     S record[kRecord];
-    S opacity, extinction, features[kChannels + (kChannels == 16)];  // one to spare, see below
+    S opacity, features[kChannels + 1 + (kChannels == 16)];  // one or two to spare, see below
     int32_t slot, gaussian;
 };
 // Lanes fill an entry each: an odd number of quarters from one to the next spreads them over the banks.
@@ -49,7 +49,7 @@ template <class S, class P, int kChannels> struct Walk {
     GSPARC_HD bool lit(S before) const { return pixel.real && floor <= before; }
     GSPARC_HD const Staged<S, kChannels>& entry(int j) const { return desk.staged[warp][j]; }
     GSPARC_HD S form(int j) const { return desk.forms[warp][j][lane]; }
-    GSPARC_HD Layer<S, true> layer(int j, S form) const { return {form, true, entry(j).opacity, entry(j).extinction, alpha_max}; }
+    GSPARC_HD Layer<S> layer(int j, S form) const { return {form, true, entry(j).opacity, alpha_max}; }
 
     // Fetches this warp's piece and evaluates it. features: (P, N, channels), of which `used` from `from` on.
     __device__ void look(const Model<S>& model, const S* features, int channels, int from, int used) {
@@ -65,9 +65,7 @@ template <class S, class P, int kChannels> struct Walk {
             const Quarter<S>* record = reinterpret_cast<const Quarter<S>*>(v.records + row * kRecord);
             Quarter<S>* copy = reinterpret_cast<Quarter<S>*>(to.record);
             for (int k = 0; k < int(kRecord * sizeof(S) / sizeof(Quarter<S>)); ++k) copy[k] = record[k];
-            const S gain = to.record[kGain];
-            to.opacity = gain * model.opacities[i];
-            to.extinction = model.extinctions ? gain * model.extinctions[i] : to.opacity;
+            to.opacity = to.record[kGain] * model.opacities[i];
             for (int k = 0; k < kChannels; ++k) to.features[k] = k < used ? features[row * channels + from + k] : S(0);
             to.slot = v.slot_of[first + lane], to.gaussian = i;
         }
@@ -76,7 +74,7 @@ template <class S, class P, int kChannels> struct Walk {
         for (int j = 0; j < taken; ++j) {
             S tau1, tau2, form;
             const bool inside = pixel.offsets(entry(j).record, v.settings, tau1, tau2, form);
-            if (inside) product *= S(1) - layer(j, form).gamma;
+            if (inside) product *= S(1) - layer(j, form).alpha;
             desk.forms[warp][j][lane] = inside ? form : S(-1);
         }
         desk.through[warp][lane] = product;

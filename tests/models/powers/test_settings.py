@@ -80,7 +80,7 @@ def test_the_mean_is_chosen_by_likelihood_and_by_name():
         (flat, "distance", "about a distance law"),
     ):
         assert said in fit(GaussianProcess(mean=about), data, 50)[1][0]
-    with pytest.raises(ValueError, match="mean='flat' is none of auto, constant, distance"):
+    with pytest.raises(ValueError, match="mean='flat': one of auto, constant, distance is needed"):
         GaussianProcess(mean="flat")
 
 

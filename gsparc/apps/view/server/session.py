@@ -175,7 +175,7 @@ class Session:
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
         self.chosen_station = value
-        if not self.view.has_station(value):
+        if value not in self.view.made:
             self.title.content = f"**{value} is being prepared ...**"
         self.view.station(value)
         # Meanwhile another may have been chosen: only the last is shown.

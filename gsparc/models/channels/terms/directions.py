@@ -85,7 +85,7 @@ class Directions(ChannelTerm):
         return whole if len(whole) == len(a) else repeat(whole[0], len(a))
 
     def variance(self, a: SlotPlaces) -> Tensor:
-        """Return the sum of powers (n,), see `Term`."""
+        """Return the sum of powers (n,), see `ChannelTerm`."""
         return self.powers_at_ends([a.slot])[0].sum().expand(len(a.places))
 
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:

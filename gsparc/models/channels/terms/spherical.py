@@ -52,7 +52,7 @@ class Spherical(ChannelTerm):
         )
 
     def variance(self, a: SlotPlaces) -> Tensor:
-        """Return that of all waves (n,), see `Term`."""
+        """Return that of all waves (n,), see `ChannelTerm`."""
         return self.power.view(2, -1).sum(0) @ self.waves(a).abs().square()
 
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:

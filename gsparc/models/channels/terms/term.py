@@ -62,7 +62,7 @@ class ChannelTerm(Term[SlotPlaces]):
         return map(self.covariance, a, b)
 
     def variance(self, a: SlotPlaces) -> Tensor:
-        """Return the variance (n,), see `Term`."""
+        """Return the variance (n,) of values at `a`."""
         return self.power.sum().expand(len(a.places))
 
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:

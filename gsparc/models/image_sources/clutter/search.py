@@ -11,7 +11,7 @@ from functools import partial
 import torch
 
 from gsparc.models.image_sources.backprojection import select_separated
-from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, Clutter, visible_share
+from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, visible_share
 from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_occluding_box
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_patch, find_small_mirrors
 from gsparc.models.image_sources.clutter.refine import refine_with_clutter
@@ -163,7 +163,9 @@ class _ClutterSearcher:
 
     def _add_mirror(self, mirror: SmallMirror) -> bool:
         scene, number = self.scene, len(self.scene.planes)
-        sequences = _sequences_over(number, scene.walls)
+        # Itself, after and before each wall.
+        sequences: list[Reflections] = [(number,)]
+        sequences += [(wall, number) for wall in scene.walls] + [(number, wall) for wall in scene.walls]
         clutter = scene.clutter.add_patch(mirror.patch, number)
         trial = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter)
         return self._add(trial, sequences, 1.5, MIRROR, len(sequences))
@@ -223,18 +225,10 @@ class _ClutterSearcher:
         best = scores.topk(min(60, len(sequences))).indices.tolist()
         self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
 
-    def _set_clutter(self, clutter: Clutter) -> None:
-        self._set_scene(replace(self.scene, clutter=clutter))
-
     def _drop(self) -> None:
         """Remove clutter that the likelihood no longer supports."""
         number = 0
         while number < len(clutter := self.scene.clutter):
             parameters = BOX if number < len(clutter.boxes) else PATCH
-            less = partial(self._set_clutter, clutter.remove_piece(number))
-            number += not self._changed(less, -parameters * self.parameter_cost)
-
-
-def _sequences_over(number: int, known: list[int]) -> list[Reflections]:
-    """Words over a plane: itself, after and before each wall."""
-    return [(number,), *((wall, number) for wall in known), *((number, wall) for wall in known)]
+            less = replace(self.scene, clutter=clutter.remove_piece(number))
+            number += not self._changed(partial(self._set_scene, less), -parameters * self.parameter_cost)

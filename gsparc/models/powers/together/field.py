@@ -21,9 +21,9 @@ from gsparc.data.errors import DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import JointLevels, Prediction
-from gsparc.models.per_station import SAME_PLACE_M
 from gsparc.models.powers.together.learning import (
     LEAST_STATIONS,
     TRIED_EACH,
