@@ -178,3 +178,15 @@ def test_help_named_no_setting(capsys):
         main(["--help"])
     told = capsys.readouterr().out
     assert "absent: auto" in told and "columns:" in told and "dataset.KEY=VALUE" in told
+
+
+def test_a_file_in_radians_ended_in_good(tmp_path):
+    """Arrays have no heads to say so in, and the doubt was a note among others."""
+    rng = np.random.default_rng(0)
+    places = {name: np.radians(rng.uniform(48, 48.1, 50)) for name in ("latitude", "longitude")}
+    arrays = {**places, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
+    np.savez(tmp_path / "a.npz", **arrays)
+    good, text = _said(tmp_path / "a.npz")
+    assert good and "a.npz: readable, but see its 1 warning\n" in text
+    assert "warning     the places lie in the Gulf of Guinea" in text
+    assert "radians? write degrees, or [rad] in the heads of a table" in text

@@ -50,7 +50,8 @@ def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
     if np.median(latitude) > 75:
         return [f"the places lie in the Arctic ({where}): latitude and longitude swapped?"]
     if np.abs(latitude).max() <= np.pi / 2 and np.abs(longitude).max() <= np.pi:
-        return [f"the places lie in the Gulf of Guinea ({where}), at sea: radians? then say so in the heads"]
+        sea = f"the places lie in the Gulf of Guinea ({where}), at sea"
+        return [f"{sea}: radians? write degrees, or [rad] in the heads of a table"]
     return []
 
 

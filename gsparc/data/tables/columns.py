@@ -129,7 +129,7 @@ def choose_columns(
             notes.append(_note(chosen[role]))
     for column in (columns[0] for columns in chosen.values()):
         if not column.word and column.unit is not None and column.unit.changes:
-            notes.append(f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}")
+            notes.append(_turned(column, column.unit))
     _one_unit(sheet, chosen)
     # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
@@ -354,13 +354,32 @@ def _note(columns: tuple[Column, ...]) -> str:
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
 
 
+def _factor_of(unit: Unit | None) -> tuple[str, str]:
+    """The factor that a setting gives, "" for none, and the unit of the head, "" for none."""
+    name = "" if unit is None else unit.name
+    return (name.split()[1], " ".join(name.split()[2:])) if name.startswith("x ") else ("", name)
+
+
+def _turned(column: Column, unit: Unit) -> str:
+    """What becomes of a column that a setting chose; with a caution where its unit is counted twice."""
+    (factor, bare), wanted = _factor_of(unit), schema_unit(column)
+    if not factor:
+        return f"column {column.head!r}: {bare} turned into {wanted}"
+    then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
+    value = float(unit.convert(np.array(100.0)))
+    said = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
+    if then and math.isclose(float(factor), UNITS[bare.lower()].factor):
+        return Caution(f"{said}; twice? dataset.columns.{column.role}={column.head} turns {bare} alone")
+    return said
+
+
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
-    unit = SCHEMA.get(KINDS[column.role], "deg")
-    if column.unit is None and "rsrp" in heads.words_of(column.head or ""):
+    unit, bare = SCHEMA.get(KINDS[column.role], "deg"), _factor_of(column.unit)[1]
+    if not bare and "rsrp" in heads.words_of(column.head or ""):
         return unit  # dBm by definition (3GPP TS 36.214)
     # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
-    return "dB" if unit == "dBm" and (column.unit is None or column.unit.name == "dB") else unit
+    return "dB" if unit == "dBm" and bare in ("", "dB") else unit
 
 
 def rename_for_stations(column: Column) -> Column:

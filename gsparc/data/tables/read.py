@@ -28,7 +28,7 @@ from gsparc.data.tables.columns import (
     choose_columns,
     schema_unit,
 )
-from gsparc.data.tables.heads import LISTS, PERCENT, station_in_head, words_of
+from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
 from gsparc.data.tables.opening import read_parquet, read_sheet
 from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
@@ -207,11 +207,12 @@ class Builder:
         """Add positions and stations."""
         by_end = {end: read_places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
         ends = {end: where for end, where in by_end.items() if where is not None}
-        if self.sheet.problems:
-            return
-        if not ends:
+        # Said beside what is wrong with levels: one look at the file mends both.
+        if {f"{end}{axis}" for end in by_end for axis in AXES if axis != "z"}.isdisjoint(self.chosen):
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
             return self.refuse(f"{fault}, or .latitude, .longitude")
+        if self.sheet.problems:
+            return
         # Two named ends and one without a name: nothing says which of the named ones it would replace.
         if len(ends) == 3:
             fault = "coordinates of rx, of tx and of an end without a name"
