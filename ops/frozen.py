@@ -51,7 +51,7 @@ class FrozenPlan:
         return self._render(features, picked=False)
 
     @torch.no_grad()
-    def compose(self, seen: Tensor) -> Tensor:
+    def render_visible(self, seen: Tensor) -> Tensor:
         """Render as `render` does, features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
         if seen.dim() not in (2, 3) or seen.shape[-2] != len(self.order):
             count = len(self.order)

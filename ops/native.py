@@ -36,13 +36,13 @@ def run_on_plan(
     """Call a kernel that begins with `ViewArgs` of csrc/layout.h, then `tensors`."""
     inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
     counts = (plan.num_poses, plan.num_gaussians, *sizes)
-    return calls.run(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
+    return calls.launch(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
 
 
 @register_kernel("plan", "cpu")
 def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     means, pose = gaussians.means, plan.pose
-    call = partial(calls.run, sizes=(plan.num_poses, len(means)), settings=plan.settings)
+    call = partial(calls.launch, sizes=(plan.num_poses, len(means)), settings=plan.settings)
     inputs = contiguous((*gaussians, pose.position, pose.rotation, ids))
     # In two passes: how many entries there are is known when all footprints have been placed.
     status = call("plan", means, *inputs, *plan.buffers[:-1], plan.means2d, plan.radii, plan.visible)
@@ -73,7 +73,9 @@ def rasterize(
     # The kernel counts the entries, and refuses more than the bound before it allocates them.
     sizes, bound = (poses, n, samples, channels), (operators.MEMORY_BOUND,)
     screen = means2d, radii, visible
-    status = calls.run("rasterize", means, *tensors, *screen, sizes=sizes, numbers=bound, settings=settings)
+    status = calls.launch(
+        "rasterize", means, *tensors, *screen, sizes=sizes, numbers=bound, settings=settings
+    )
     if status <= _native.REFUSED:
         check_memory(_native.REFUSED - status, 4)
     if status == _native.UNSOUND_FEATURES:
@@ -148,7 +150,7 @@ def thaw(
     image = features.new_empty(samples * channels, grid.height, grid.width)
     tensors = contiguous((features, None if picked else order))
     sizes = (samples, channels, grid.height, grid.width, len(order), count)
-    status = calls.run("thaw", features, *buffers, *tensors, image, sizes=sizes)
+    status = calls.launch("thaw", features, *buffers, *tensors, image, sizes=sizes)
     if status >= 0:
         validation.seen_features(features, order, picked)  # says what is wrong
     return image

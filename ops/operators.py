@@ -105,7 +105,7 @@ class _Operator(torch.autograd.Function):
         return None, None, None, None, *gradients
 
 
-def differentiable(
+def call_differentiable(
     operator: Callable[..., Any],
     gradient: Callable[..., Any],
     fixed: Any,
@@ -191,7 +191,7 @@ def composite_gradient(
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Return image (B, C, H, W), transmittance (P, H, W) of (B, N, C); `means2d` only gets a gradient."""
     inputs = means2d, features, *gaussians
-    return differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
+    return call_differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
 
 
 def _weights(plan: Plan, *parts: Tensor) -> tuple[Tensor, Tensor]:
@@ -211,7 +211,7 @@ def _weights_gradient(
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    seen, total = differentiable(_weights, _weights_gradient, plan, *gaussians)
+    seen, total = call_differentiable(_weights, _weights_gradient, plan, *gaussians)
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 

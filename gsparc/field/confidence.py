@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -36,8 +37,15 @@ LEAST_UNKNOWN = 1e-3  # of the variance is always unknown: quantisation, recover
 ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 
 
+class ErrorLaw(NamedTuple):
+    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u."""
+
+    level: float
+    power: float
+
+
 class ErrorModel(nn.Module):
-    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u.
+    """The error that an `ErrorLaw` expects.
 
     What errors of left-out training rows say; nothing is learned by gradient.
 
@@ -69,10 +77,10 @@ class ErrorModel(nn.Module):
         self.far, self.power = (float(value) for value in state)
 
 
-def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
+def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> ErrorLaw:
+    """Return the law that errors (n,) at unknown shares (n,) follow.
 
-    The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
+    The likeliest for errors that are exponential about it, so that their mean is right at every level: a
     line through logarithms would fit the many small errors and miss the few large ones.
     """
     x, y = np.log(unknown + LEAST_UNKNOWN), error + 1e-9
@@ -82,7 +90,7 @@ def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]
         return float((y * np.exp(-level) + level).mean())
 
     result = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
-    return float(np.exp(result[0])), float(np.clip(result[1], 0.0, 2.0))
+    return ErrorLaw(float(np.exp(result[0])), float(np.clip(result[1], 0.0, 2.0)))
 
 
 class Confidence(nn.Module):
@@ -113,14 +121,14 @@ class Confidence(nn.Module):
         g = g if g.dtype == torch.float64 else g.float()
         return g.clamp(-self.settings.clamp, self.settings.clamp)
 
-    def calibrate(self, position: Tensor) -> None:
+    def store_range(self, position: Tensor) -> None:
         """Store the range of g over calibration positions (n, 3) [m]."""
         with torch.no_grad():
             g = self.exponent(position)
             self.low.copy_(g.min())
             self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
 
-    def normalised(self, position: Tensor) -> Tensor:
+    def normalised_confidence(self, position: Tensor) -> Tensor:
         """Return the confidence in [0, 1] (B,): C between its least and largest on the calibration data.
 
         It decays outside the box of what was measured, where the network's lines run on unchecked.

@@ -8,6 +8,7 @@ sources.
 from __future__ import annotations
 
 from itertools import pairwise, product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,14 +18,21 @@ NO_PLANES = torch.zeros(0, 4, dtype=torch.float64)
 Reflections = tuple[int, ...]  # indices of planes, in the order in which they mirror
 
 
-def normal_form(planes: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit normals (..., 3) and offsets (..., 1) [m] of planes (..., 4), Hesse's normal form.
+class NormalForm(NamedTuple):
+    """Unit normals (..., 3) and offsets (..., 1) [m] of planes: Hesse's normal form."""
+
+    normal: Tensor
+    offset: Tensor
+
+
+def normal_form(planes: Tensor) -> NormalForm:
+    """Return the normal form of planes (..., 4).
 
     >>> normal_form(torch.tensor([0.0, 0.0, 2.0, 3.0]))
-    (tensor([0., 0., 1.]), tensor([3.]))
+    NormalForm(normal=tensor([0., 0., 1.]), offset=tensor([3.]))
     """
     normal, offset = planes.split((3, 1), -1)
-    return normalize(normal, dim=-1), offset
+    return NormalForm(normalize(normal, dim=-1), offset)
 
 
 def reflect(points: Tensor, planes: Tensor) -> Tensor:

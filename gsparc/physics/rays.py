@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 MIN_ANGLE = 0.02  # [rad]: more parallel rays have no well-defined crossing
 
 
+class ClosestApproach(NamedTuple):
+    """Ranges (P, Q) [m] along the rays of two places, and the distance (P, Q) [m] between the rays there."""
+
+    first: np.ndarray
+    second: np.ndarray
+    gap: np.ndarray
+
+
 def closest_approach(
     first: np.ndarray, first_rays: np.ndarray, second: np.ndarray, second_rays: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> ClosestApproach:
     """Find the closest points of every pair of rays from two places.
 
     >>> x, y = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
@@ -22,8 +32,7 @@ def closest_approach(
         first_rays, second_rays: (P, 3) and (Q, 3) unit vectors.
 
     Returns:
-        Ranges (P, Q) [m] along the rays of both places, and the distance (P, Q) [m] between the rays there:
-        infinite behind a place and between nearly parallel rays.
+        See `ClosestApproach`; gaps are infinite behind a place and between nearly parallel rays.
     """
     offset, cosine = second - first, first_rays @ second_rays.T
     a, b = (first_rays @ offset)[:, None], (second_rays @ offset)[None, :]
@@ -32,4 +41,5 @@ def closest_approach(
     s, t = (a - cosine * b) / sine2, (cosine * a - b) / sine2
     between = offset + t[..., None] * second_rays[None] - s[..., None] * first_rays[:, None]
     gap = np.linalg.norm(between, axis=-1)
-    return s, t, np.where((s > 0) & (t > 0) & (1 - cosine**2 > MIN_ANGLE**2), gap, np.inf)
+    well = (s > 0) & (t > 0) & (1 - cosine**2 > MIN_ANGLE**2)
+    return ClosestApproach(s, t, np.where(well, gap, np.inf))

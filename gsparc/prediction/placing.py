@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,8 +65,15 @@ def to_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     return world
 
 
-def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, float]:
-    """Tell which places (n,) bool lie farther outside the training places' box than a margin, and that [m].
+class Outside(NamedTuple):
+    """Which places (n,) bool lie farther outside a box than the margin [m]."""
+
+    far: np.ndarray
+    margin: float
+
+
+def far_outside(world: dict[End, np.ndarray], site: Site) -> Outside:
+    """Tell which places lie far outside the box of the training places.
 
     >>> far, margin = far_outside({"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}, predictor.site)
     >>> far, 0 < margin < 1  # a tenth of the longer side
@@ -76,7 +84,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     low, high = site.moving_box
     # Of the longest side: a corridor is so narrow that every place beside it would be far outside.
     margin = MARGIN * float((high - low).max())
-    return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
+    return Outside(((place < low - margin) | (place > high + margin)).any(axis=1), margin)
 
 
 def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
@@ -87,7 +95,7 @@ def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) 
     # With heights as measured: if these places are inside, height alone is what was wrong.
     inside = np.clip(heights, low, high)
     flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(ends)}
-    if far_outside(flat, site)[0].any():
+    if far_outside(flat, site).far.any():
         return ""
     beyond = (heights - inside)[far].ravel()
     most = float(beyond[np.abs(beyond).argmax()])

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.special import betainc
@@ -157,7 +157,7 @@ def choose_threshold(
             continue
         effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
         # A fixed sequence: as the first test that fails ends it, delta need not be divided among the tests.
-        if _tail(wrong / effect, accepted / effect, guarantee.alpha) > guarantee.delta:
+        if _error_tail(wrong / effect, accepted / effect, guarantee.alpha) > guarantee.delta:
             break
         threshold = Threshold(float(level), accepted, wrong)
     return threshold
@@ -185,7 +185,7 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     return max(1.0, float(bound * between / (share * (1 - share))))
 
 
-def _tail(wrong: Any, accepted: Any, alpha: float) -> Any:
+def _error_tail(wrong: Any, accepted: Any, alpha: float) -> Any:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
     # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
     return betainc(np.maximum(accepted - wrong, 1e-9), wrong + 1, 1 - alpha)
@@ -264,10 +264,25 @@ class Trial:
         }  # fmt: skip
 
 
-def split_evidence(
-    evidence: Evidence, how: How, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return disjoint rows of the evidence: to choose on, to calibrate on, to test on.
+class EvidenceSplit(NamedTuple):
+    """Disjoint rows of evidence."""
+
+    choose_on: np.ndarray
+    calibrate: np.ndarray
+    test: np.ndarray
+
+
+class CalibratedThreshold(NamedTuple):
+    """Kind of confidence, its threshold, rows that neither saw, and rows that the kind is chosen on."""
+
+    kind: str
+    threshold: Threshold
+    test: np.ndarray
+    choose_on: np.ndarray
+
+
+def split_evidence(evidence: Evidence, how: How, rng: np.random.Generator) -> EvidenceSplit:
+    """Return rows of the evidence to choose on, to calibrate on, to test on.
 
     `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
     across a cell's border.
@@ -285,8 +300,7 @@ def split_evidence(
             f"take more test rows{'' if how == 'random' else ', or spatial=false'}"
         )
     parts = order[:first], order[first:second], order[second:]
-    choose_on, calibrate, test = (np.flatnonzero(np.isin(unit, part)) for part in parts)
-    return choose_on, calibrate, test
+    return EvidenceSplit(*(np.flatnonzero(np.isin(unit, part)) for part in parts))
 
 
 def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0) -> str | None:
@@ -299,7 +313,7 @@ def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0) -> str |
     # A share of alpha or more passes with no number: what none bad would need is the least.
     bad = bad if bad < guarantee.alpha else 0.0
     least = np.arange(guarantee.least, MOST_CALIBRATED)
-    passed = least[_tail(bad * least, least, guarantee.alpha) <= guarantee.delta]
+    passed = least[_error_tail(bad * least, least, guarantee.alpha) <= guarantee.delta]
     if not len(passed) or count >= (needed := int(np.ceil(passed[0] / SHARES[1]))):
         return None
     return (
@@ -314,7 +328,7 @@ def relax_guarantee(
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(guarantee, limit_db=float(limit))
-        if calibrate_threshold(evidence, other, kind, spatial, seed)[1].accepted:
+        if calibrate_threshold(evidence, other, kind, spatial, seed).threshold.accepted:
             return other
     return None
 
@@ -360,8 +374,8 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 def calibrate_threshold(
     evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int | list[int],
     apart_m: float = 0,
-) -> tuple[str, Threshold, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
+) -> CalibratedThreshold:  # fmt: skip
+    """Choose a confidence and its threshold.
 
     Raises:
         ValueError: `kind` is no confidence of this evidence.
@@ -379,7 +393,7 @@ def calibrate_threshold(
     threshold = choose_threshold(
         score[calibrate], bad[calibrate], threshold_levels(score[choose_on]), guarantee, patch
     )
-    return used, threshold, test, choose_on
+    return CalibratedThreshold(used, threshold, test, choose_on)
 
 
 def run_trials(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,11 +43,18 @@ class PseudoValues:
     settled: bool
 
 
-def truncated_moments(z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return, of a standard normal cut off above z (n,), minus its mean, and the share of its variance lost.
+class TruncatedMoments(NamedTuple):
+    """Of a standard normal cut off above a level: minus its mean, and the share of its variance lost."""
+
+    minus_mean: Tensor
+    lost_variance: Tensor
+
+
+def truncated_moments(z: Tensor) -> TruncatedMoments:
+    """Return moments (n,) of a standard normal cut off above z (n,).
 
     >>> truncated_moments(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
-    (tensor([0.7979]), tensor([0.6366]))
+    TruncatedMoments(minus_mean=tensor([0.7979]), lost_variance=tensor([0.6366]))
     """
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
     # In logarithms: density and distribution underflow long before their ratio does.
@@ -54,7 +62,7 @@ def truncated_moments(z: Tensor) -> tuple[Tensor, Tensor]:
     series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
     remaining = t**2 * (1 - 6 * t**2 + 50 * t**4)
     lost = torch.where(z < FAR, 1 - remaining, ratio * (inside + ratio))
-    return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
+    return TruncatedMoments(torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12))
 
 
 def fit_by_ep(

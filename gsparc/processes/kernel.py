@@ -259,7 +259,7 @@ class Kernel(Stored):
         return self.lengths[0]
 
     @property
-    def compiled(self) -> list[float] | None:
+    def compiled_lengths(self) -> list[float] | None:
         """Lengths as compiled kernels have them, negative of Matern-1/2; None where they cannot answer."""
         signed = [term.compiled * float(term.length) for term in self.signals]
         return signed if all(signed) and len(signed) <= COMPILED else None
@@ -276,13 +276,13 @@ class Kernel(Stored):
         first, *others = (term.share * term.correlation(distance) for term in self.signals)
         return sum(others, first)
 
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
+    def correlations(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
         return self.correlation(distances(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""
-        result = self.between(places, places)
+        result = self.correlations(places, places)
         result.diagonal().add_(self.noise)
         return result
 

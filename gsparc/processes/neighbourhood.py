@@ -64,7 +64,7 @@ class Neighbourhood(Stored):
     A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
 
     >>> line = np.linspace(0, 100, 11)[:, None]  # every 10 m
-    >>> Neighbourhood.from_places(line, seed=0).nearest(np.array([[41.0]]), most=2).tolist()
+    >>> Neighbourhood.from_places(line, seed=0).nearest_rows(np.array([[41.0]]), most=2).tolist()
     [[4, 5]]
 
     Attributes:
@@ -106,7 +106,7 @@ class Neighbourhood(Stored):
         counts = [most - share * sparser, *[share] * sparser]
         return [(own, count) for (own, _), count in zip(self._trees[::-1], counts, strict=True)]
 
-    def nearest(
+    def nearest_rows(
         self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
     ) -> np.ndarray:
         """Return numbers (B, k) of neighbours of queries (B, D).
@@ -138,7 +138,7 @@ def rows_with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOUR
     """
     # A row need not come first among its neighbours, as others may lie at its place.
     alike = Neighbourhood(places, np.zeros(len(places), np.int8))
-    return np.c_[row, alike.nearest(places[row], row, most)]
+    return np.c_[row, alike.nearest_rows(places[row], row, most)]
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     return distances(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]
 
 
-def spacing(places: np.ndarray) -> float:
+def median_spacing(places: np.ndarray) -> float:
     """Return the median distance [m] from a place (n, D) to the next other one.
 
     >>> spacing(np.array([[0.0], [0.0], [2.0], [4.0]]))

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from gsparc.processes.factor import Factor, whitened_rounded
-from gsparc.processes.left_out import left_out_residuals
+from gsparc.processes.averages import MeanVariance
+from gsparc.processes.factor import Factor, whiten_in_float32
+from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
@@ -76,7 +77,7 @@ class SharedTermsPosterior:
             self._blocks[number] = Block.from_process(process, self.columns(process.rows))
         return self._blocks[number]
 
-    def answer(self, queries: Tensor, number: Tensor, float64: bool = False) -> tuple[Tensor, Tensor]:
+    def answer(self, queries: Tensor, number: Tensor, float64: bool = False) -> MeanVariance:
         """Return the mean and variance of a measurement, each (B,).
 
         Args:
@@ -97,7 +98,7 @@ class SharedTermsPosterior:
                 spread = (spread - known[there]).clamp_min(0.0)
             mean = mean.index_add(0, at, more[there])
             left = left.index_add(0, at, spread + shared.square().sum(2)[there])
-        return mean, left
+        return MeanVariance(mean, left)
 
     def predict_joint(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
@@ -106,7 +107,7 @@ class SharedTermsPosterior:
         asked = flat[None], (number,), own[None], self.columns(flat)[None]
         prior, more, white, shared = self._condition(*asked, rounded=False)
         terms, kernel = own.unflatten(0, groups), prior.kernel
-        left = kernel.between(queries, queries) + terms @ terms.mT
+        left = kernel.correlations(queries, queries) + terms @ terms.mT
         left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
         # Rows take variance away; weights that are not fully known give some back.
         for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
@@ -141,14 +142,14 @@ class SharedTermsPosterior:
             # With less noise float32's rounding would show in the variance.
             rounded &= prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
             places, terms, weights = self._stack(asked, torch.float32 if rounded else torch.float64)
-            near = prior.kernel.between(queries.to(places), places)
+            near = prior.kernel.correlations(queries.to(places), places)
             cross = process_deviation(prior) * near.baddbmm(own.to(places), terms.mT)
             more = more + (cross @ weights)[..., 0]
             blocks = [self.block(one) for one in asked]
             factors = [block.process.factor for block in blocks]
             parts = [part[:, : len(one.lower)].T for one, part in zip(factors, cross, strict=True)]
             if rounded:
-                white = [one.T for one in whitened_rounded(factors, parts)]
+                white = [one.T for one in whiten_in_float32(factors, parts)]
             else:
                 white = [one.whiten(part).T for one, part in zip(factors, parts, strict=True)]
             if len(self.mean):
@@ -173,7 +174,7 @@ class SharedTermsPosterior:
         return self._stacks[asked, dtype]
 
     @torch.no_grad()
-    def left_out(self, number: int) -> tuple[Tensor, Tensor]:
+    def left_out(self, number: int) -> LeftOutErrors:
         """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,)."""
         block = self.block(number)
         root = block.process.factor.root / process_deviation(block.process.prior)
@@ -199,7 +200,7 @@ def shared_weights(blocks: list[Block]) -> tuple[Factor, Tensor]:
     return factor, factor.solve(right[:, None])[:, 0]
 
 
-def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
+def left_out_processes(blocks: list[Block]) -> list[LeftOutErrors]:
     """Return errors (n,) of each process's rows predicted from the other processes, and variances.
 
     With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
@@ -211,5 +212,5 @@ def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
         lower = block.process.factor.lower * process_deviation(block.process.prior)
         inner = Factor.from_gram(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
         error = inner.solve((block.values - block.columns @ mean)[:, None])[:, 0]
-        result.append((lower @ error, inner.whiten(lower.T).square().sum(0)))
+        result.append(LeftOutErrors(lower @ error, inner.whiten(lower.T).square().sum(0)))
     return result

@@ -14,7 +14,7 @@ class Cancelled(BaseException):
 
 
 @contextmanager
-def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
+def _add_condition(name: str, condition: Callable[[], bool]) -> Iterator[None]:
     """Within, this thread is asked `condition` as `name`, beside what surrounds it."""
     before = getattr(_asked, name, None)
     # What surrounds it is asked first: an outer end is one of all within.
@@ -27,7 +27,7 @@ def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
 
 def cancel_when(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
     """Make `raise_if_cancelled` raise, within, as soon as `unwanted`, or who surrounds it, says so."""
-    return _within("unwanted", unwanted)
+    return _add_condition("unwanted", unwanted)
 
 
 def raise_if_cancelled() -> None:
@@ -47,7 +47,7 @@ def end_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
     >>> out_of_time()
     False
     """
-    return _within("over", over)
+    return _add_condition("over", over)
 
 
 def step_limit(most: int) -> Callable[[], bool]:

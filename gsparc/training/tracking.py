@@ -36,7 +36,7 @@ class PartLogger(Logger):
     name = property(lambda self: self.whole.name)
     version = property(lambda self: self.whole.version)
 
-    def log_hyperparams(self, *unused: Any, **named: Any) -> None:
+    def log_hyperparams(self, *params: Any, **kwargs: Any) -> None:
         """Log nothing: the run's are said once."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
@@ -103,10 +103,10 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
         mode = "offline" if stays else None
     given = {name: value for name, value in settings.items() if value}
     # As an argument: Lightning's `offline` sets a variable that wandb, once asked for a login, does not read.
-    return WandbLogger(offline=mode == "offline", **{**_of_job(), **given, "mode": mode})
+    return WandbLogger(offline=mode == "offline", **{**_job_tags(), **given, "mode": mode})
 
 
-def _of_job() -> dict[str, Any]:
+def _job_tags() -> dict[str, Any]:
     """What runs are sorted by: choices of groups, and of a job its multirun and what it differs in."""
     if not HydraConfig.initialized():
         return {}

@@ -67,10 +67,10 @@ def serving(where: str) -> Iterator[cuda_library.Library]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(calls.libraries, "cpu", kernels)
         patch.setitem(operators.KERNELS, "cpu", operators.KERNELS["cuda"])
-        patch.setattr(backends, "_cpu", lambda: cuda)
-        patch.setattr(backends, "_cuda", lambda: cuda)
+        patch.setattr(backends, "_load_cpu", lambda: cuda)
+        patch.setattr(backends, "_load_cuda", lambda: cuda)
         if where == "gpu":
-            patch.setattr(calls, "run", on_gpu(calls.run))
-        cuda._tables.cache_clear()
+            patch.setattr(calls, "launch", on_gpu(calls.launch))
+        cuda._sincos.cache_clear()
         yield kernels
-    cuda._tables.cache_clear()
+    cuda._sincos.cache_clear()

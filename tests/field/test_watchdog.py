@@ -48,7 +48,7 @@ class Looks:
 def watched() -> Iterator[Looks]:
     """Watch the block: budgets read, workers that ask whether to end, signals in this, the main thread."""
     looks = Looks()
-    counted, ask = TimeBudget.counted.fget, worker.raise_if_cancelled
+    counted, ask = TimeBudget.by_clock.fget, worker.raise_if_cancelled
 
     def reads(budget: TimeBudget):
         looks.look("clock")

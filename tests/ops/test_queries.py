@@ -51,7 +51,7 @@ def test_weights_of_the_nearest_rows(near, kernel):
     noise = kernel.noise * (1 + torch.rand(200, dtype=torch.float64))
     rows = torch.cdist(queries, places).topk(near, largest=False).indices
     expected = neighbour_weights(kernel, queries, places[rows], noise[rows])
-    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled, kernel.shares)
+    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled_lengths, kernel.shares)
     assert found is not None
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, atol=1e-10, rtol=1e-9)

@@ -37,7 +37,7 @@ from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import image_rotations, normal_form
 from gsparc.physics.row_factors import Freedom, align_factors
-from gsparc.physics.waves import wave, wave_over_band
+from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import Race
 from gsparc.training.time_budget import TimeBudget
@@ -131,7 +131,7 @@ class ImageSourceGP(SourcesInFrame):
         self._become(rows, members)
         self.held = self._left_out_rows(data, seen, members, len(rows))
         notes += self._described(members, budget)
-        return FitReport(budget.counted.wall, tuple(notes), budget.limited_by)
+        return FitReport(budget.by_clock.wall, tuple(notes), budget.limited_by)
 
     def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
@@ -271,7 +271,7 @@ class ImageSourceGP(SourcesInFrame):
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
         away = self.query.ranges(places)
         gain = self.query.gains(places) * weight[:, None, None]
-        gain = gain * wave(away, self.frame.carrier_hz).T[..., None]
+        gain = gain * point_wave(away, self.frame.carrier_hz).T[..., None]
         return gain.movedim(0, -1), away, self.query.sources
 
     def left_out(self) -> LeftOutRows:

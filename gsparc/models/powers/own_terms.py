@@ -119,7 +119,7 @@ def less_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
 
 def about_terms(rest: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
     """Return a trend of rows less the terms' means, with the terms, in units of what it leaves of rows."""
-    heard = rest.heard
+    heard = rest.heard_rows
     left = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
     unit = float(left.std()) or 1.0
     return in_unit_of(replace(trend, more=(*trend.more, *terms)), unit)

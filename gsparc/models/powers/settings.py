@@ -120,7 +120,7 @@ def candidate_priors(
 
 def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    fit = fit_variogram(rows.places, rows.regression_about(trend)[2].numpy())
+    fit = fit_variogram(rows.places, rows.regression_inputs(trend)[2].numpy())
     sill = max(fit.sill, LEAST_SILL * fit.variance)
     kernel = Kernel.from_length(fit.range, max(fit.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
@@ -139,7 +139,7 @@ def mix_candidates(
     part = rows.draw_subset(chosen_on, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in found]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    gram = _relative([_among_rows(rows.measured, one.prior, seed) for one in found])
+    gram = _relative([_among_rows(rows.measured_rows, one.prior, seed) for one in found])
     for sides in SPANS:
         gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
@@ -186,7 +186,7 @@ def _settings(
     rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
 ) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows.heard.draw_subset(chosen_on, seed)
+    loud = rows.heard_rows.draw_subset(chosen_on, seed)
     few = loud.draw_subset(COMPARED_ON, seed)
     weighed = rows.draw_subset(min(WEIGHED_ON, chosen_on), seed)
     both = weighed.silent.any() and not weighed.silent.all()
@@ -227,7 +227,7 @@ def _trends(rows: PowerRows, site: Site, mean: MeanName) -> list[tuple[Trend, fl
 
 
 def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
-    distance, terms, values = rows.regression_about(trend)
+    distance, terms, values = rows.regression_inputs(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
@@ -241,7 +241,7 @@ def _searched(
     rows: PowerRows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = fit_kernel_by_left_out(starts, *rows.regression_about(one.trend), looks=looks)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.regression_inputs(one.trend), looks=looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
@@ -254,9 +254,9 @@ def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
 
 def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.regression_about(one.trend)
+    distance, terms, values = rows.regression_inputs(one.trend)
     gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
-    silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
+    silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
     used = ~rows.silent
@@ -266,7 +266,7 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
 
 def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.regression_about(one.trend)
+    distance, terms, values = rows.regression_inputs(one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = one.kernel.bounds(distance)

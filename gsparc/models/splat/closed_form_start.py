@@ -19,7 +19,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Prior
-from gsparc.field.initial import InitTask, Start, keep_weights
+from gsparc.field.initial import InitTask, Start, keep_random_weights
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
 from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
@@ -155,7 +155,7 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     batch = data.batch(rows)
     images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
     emission = Factor.from_gram(gram + ridge).solve(weights.mT @ images.mT).mT
-    distance = model.distances(batch.tx)
+    distance = model.relative_distances(batch.tx)
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
     outputs = model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1)
@@ -205,11 +205,11 @@ def initialise(task: InitTask) -> Start:
         return start_from_vectors(task)
     if task.closed_form:
         assert task.receiver is not None  # else `auto_settings` refuses
-        process = learn_process(task.data, task.rows, task.anchors, task.seed)
+        process = learn_process(task.data, task.rows, task.most_anchors, task.seed)
         solve = partial(
             solve_emissions, data=task.data, rows=task.rows, receiver=task.receiver, process=process
         )
         return Start(process.prior, solve)
     kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
-    prior = learn_prior(task.data, task.rows, task.anchors, task.seed) if kernel else None
-    return Start(prior, keep_weights)
+    prior = learn_prior(task.data, task.rows, task.most_anchors, task.seed) if kernel else None
+    return Start(prior, keep_random_weights)

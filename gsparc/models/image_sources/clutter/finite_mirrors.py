@@ -19,7 +19,7 @@ from gsparc.models.image_sources.clutter.boxes import maximise_by_evolution
 from gsparc.models.image_sources.clutter.residual import UnexplainedRows
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
-from gsparc.physics.draws import draw_in_box, draw_sides
+from gsparc.physics.draws import draw_in_box, draw_lengths
 from gsparc.physics.mirror_planes import normal_form, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
@@ -60,7 +60,7 @@ def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]
         return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
     middle = draw_in_box(low, high, DRAWS, unexplained.generator)
-    side = draw_sides(SMALLEST, LARGEST, middle, unexplained.generator)
+    side = draw_lengths(SMALLEST, LARGEST, middle, unexplained.generator)
     starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[score(starts).topk(8).indices]
     return maximise_by_evolution(starts, score, repaired, unexplained.generator, rounds=10)

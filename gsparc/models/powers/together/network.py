@@ -128,7 +128,7 @@ def learn_network(
     """
     few = rows.subset(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
-    loud = few.heard
+    loud = few.heard_rows
     decades = law.decades(torch.from_numpy(loud.places))
     start = replace(
         network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
@@ -178,7 +178,10 @@ def _shared_bounds() -> list[tuple[float, float]]:
 
 def _rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     """Shared parameters, gains (T,) and the deviation [dB] of rows taken as independent."""
-    places, number = torch.from_numpy(rows.places), torch.from_numpy(sector_of(rows.places).astype(np.int64))
+    places, number = (
+        torch.from_numpy(rows.places),
+        torch.from_numpy(sector_of(rows.places).astype(np.int64)),
+    )
     bands, count = len(start.levels), len(start.table)
 
     def objective(at: Tensor) -> Tensor:
