@@ -79,7 +79,7 @@ def make_call(
 
 
 def launch(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int:
-    """Return the result of the kernel `name` on the device of `like`. `numbers` as `call_for`.
+    """Return the result of the kernel `name` on the device of `like`. `numbers` as `make_call`.
 
     Sizes, numbers and tensors are in the order in which the kernel reads them; tensors are contiguous. On
     a GPU the kernel has scratch memory and runs on torch's current stream.

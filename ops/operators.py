@@ -1,7 +1,7 @@
 """What kernels compute on a plan: shapes and gradients stated once, filled on each device.
 
 An operator makes its empty outputs and has them filled by the function that `kernel` marks for its name and
-the device; `differentiable` joins it with its gradient, another operator.
+the device; `call_differentiable` joins it with its gradient, another operator.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def _make_plan(
     backend: str | None,
 ) -> Plan:
     """`make_plan` of Gaussians whose shapes agree."""
-    # Read before `detached`, which takes gradients off: a pose's would then be none without a word.
+    # Read before `detach`, which takes gradients off: a pose's would then be none without a word.
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
     validation.check_transforms(gaussians, pose, pose_trained)
     chosen = backends.choose_backend(backend, gaussians.means.device)

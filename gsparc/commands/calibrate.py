@@ -46,7 +46,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
-        how = promise, config.confidence, bool(config.spatial), int(config.seed)
+        how = promise, config.confidence, bool(config.spatial), int(config.seed), float(config.apart_m)
         for path in paths:
             stored, bound = calibrate_and_store(path, settings["dataset"], settings["split"], *how)
             # An infinite threshold accepts nobody, and JSON has no infinity.

@@ -20,7 +20,8 @@ from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
 from gsparc.evaluation.experiment.done import State, measurements_hash, run_once
-from gsparc.evaluation.metric_formats import DECIDING, score_of
+from gsparc.evaluation.intervals import pool_figures
+from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
@@ -65,14 +66,14 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
     points, other_ms = tradeoff.measure_candidates(candidates, threads, data, fold, **how)
-    figure = DECIDING[data.site.scored]
+    figure = deciding_figure(points[0].figures, data.site.scored)
     pareto = pareto_front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     # Stored points are chosen by closeness to the full model, which uses no measured value of tested rows.
     chosen = pareto_front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         operating_point.store_points(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
-        name: Point(name, {}, 1, one.scores.figures(), np.nan, other_ms[name], 0)
+        name: Point(name, {}, 1, pool_figures(one.scores, data, run.split), np.nan, other_ms[name], 0)
         for name, one in others.items()
     }
     copy_ms = float(np.median(other_ms[COPY]))

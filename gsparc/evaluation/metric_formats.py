@@ -68,7 +68,12 @@ PER_SAMPLE: dict[Scored, str] = {
 def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
     """Return the figure that methods are compared by; where rows were silent, these count too."""
     kind: Scored = facts["dataset/kind"] if facts.get("dataset/kind") in DECIDING else "spectrum"
-    return WITH_SILENT if facts.get(f"{prefix}/{WITH_SILENT}") is not None else DECIDING[kind]
+    return deciding_figure({WITH_SILENT: facts.get(f"{prefix}/{WITH_SILENT}")}, kind)
+
+
+def deciding_figure(figures: Mapping[str, Any], kind: Scored) -> str:
+    """Return what `main_figure` does, of figures by name."""
+    return DECIDING[kind] if figures.get(WITH_SILENT) is None else WITH_SILENT
 
 
 def heading_of(name: str) -> str:

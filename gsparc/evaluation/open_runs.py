@@ -32,8 +32,10 @@ from gsparc.prediction.risk import (
     Evidence,
     Guarantee,
     calibrate_threshold,
+    design_effect,
     explain_too_few,
     join_evidence,
+    number_patches,
     relax_guarantee,
 )
 from gsparc.training.context import FitContext
@@ -366,7 +368,7 @@ def collect_evidence(
 
 def calibrate_and_store(
     path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: Guarantee, kind: str, spatial: bool,
-    seed: int,
+    seed: int, apart_m: float = 0.0,
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
     run = _unseen(path, dataset, split)
@@ -374,7 +376,8 @@ def calibrate_and_store(
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
-    kind_used, choice, _, _ = calibrate_threshold(evidence, guarantee, kind, spatial, seed)
+    how = kind, spatial, seed, apart_m
+    kind_used, choice, _, _ = calibrate_threshold(evidence, guarantee, *how, tested=False)
     threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
     box = confidence.calibrated_box(known, evidence.position)
@@ -391,18 +394,21 @@ def calibrate_and_store(
     if np.isfinite(threshold):
         of = f"at most {guarantee.alpha:.0%} of these are worse than {guarantee.limit_db:g} dB"
         return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
-    bad, limit = float(guarantee.is_bad(evidence.error).mean()), f"{guarantee.limit_db:g} dB"
-    few = explain_too_few(len(evidence), guarantee, bad)
-    if few is not None:
+    wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
+    effect = design_effect(wrong, number_patches(evidence.position)) if spatial else 1.0
+    bad = float(wrong.mean())
+    if few := explain_too_few(len(evidence), guarantee, bad, effect):
         return stored, f"{kind_changed}no threshold keeps the bound: {few}"
-    other = relax_guarantee(evidence, guarantee, kind, spatial, seed)
+    other = relax_guarantee(evidence, guarantee, *how)
     hint = (
         f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
     )
+    reason = "the others are not told from them surely enough"
+    if bad < guarantee.alpha:
+        reason = f"so few do not show that at most alpha={guarantee.alpha:g} are"
     return stored, (
         f"{kind_changed}no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse "
-        f"than {limit}, and the others are not told from them surely enough; {hint} kept, more training "
-        "rows may help"
+        f"than {limit}, and {reason}; {hint} kept, more training rows may help"
     )
 
 

@@ -24,7 +24,7 @@ def steering_matrix(array: np.ndarray, grid: SphereGrid, wavelength: float) -> T
     """Return the steering matrix A (M, H * W) complex128: `exp(+j k u.a_m)`.
 
     >>> array = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])  # half a wavelength of 10 cm apart
-    >>> steering(array, SphereGrid.hemisphere(1, 4), 0.1)[1].real.round(decimals=3)
+    >>> steering_matrix(array, SphereGrid.hemisphere(1, 4), 0.1)[1].real.round(decimals=3)
     tensor([-1.,  1., -1.,  1.], dtype=torch.float64)
 
     Args:
@@ -46,7 +46,7 @@ def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tenso
 
     Args:
         waves: arriving field per direction, complex.
-        matrix: A of `steering`, same precision as `waves`.
+        matrix: A of `steering_matrix`, same precision as `waves`.
         grid: its solid angles are the weights of the sum.
         pattern: (H, W) element amplitude; None for isotropic elements.
     """
@@ -58,8 +58,8 @@ def bartlett_spectrum(vectors: Tensor, matrix: Tensor) -> Tensor:
     """Return `|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is taken as 0.
 
     >>> array, grid = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), SphereGrid.hemisphere(1, 4)
-    >>> matrix = steering(array, grid, 0.1)
-    >>> bartlett(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y: x is where it interferes
+    >>> matrix = steering_matrix(array, grid, 0.1)
+    >>> bartlett_spectrum(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y interferes at x
     tensor([[0., 2., 0., 2.]], dtype=torch.float64)
     """
     return _SafeAbsolute.apply(vectors @ matrix.conj())
@@ -137,7 +137,7 @@ def make_co_array(array: np.ndarray, wavelength: float) -> CoArray:
     """Return the co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one.
 
     >>> square = np.stack([*np.meshgrid(np.arange(4), np.arange(4)), np.zeros((4, 4))], -1).reshape(-1, 3)
-    >>> co_array(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
+    >>> make_co_array(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
     (25, 3)
     """
     array = np.asarray(array, dtype=np.float64)

@@ -52,7 +52,7 @@ def reduced_phase(
 def point_wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return `exp(-j 2 pi f r / c) / r` of parts `dtype`; distances [m] and frequencies [Hz] broadcast.
 
-    >>> wave(torch.tensor([2.0, 4.0]), LIGHT).real  # whole wavelengths of 1 m
+    >>> point_wave(torch.tensor([2.0, 4.0]), LIGHT).real  # whole wavelengths of 1 m
     tensor([0.5000, 0.2500])
     """
     return torch.polar((1 / distance).to(dtype), reduced_phase(distance, frequency_hz, dtype))
@@ -83,7 +83,7 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = 
 def is_comb(frequency: Tensor) -> bool:
     """Tell whether tones (F,) [Hz] are a comb.
 
-    >>> evenly_spaced(torch.tensor([0.0, 1e6, 2e6])), evenly_spaced(torch.tensor([0.0, 1e6, 3e6]))
+    >>> is_comb(torch.tensor([0.0, 1e6, 2e6])), is_comb(torch.tensor([0.0, 1e6, 3e6]))
     (True, False)
     """
     step = frequency.diff()

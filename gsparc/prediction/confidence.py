@@ -105,7 +105,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
-    return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean))
+    return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean), 1)
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -1,10 +1,11 @@
 """A threshold with a promise: at most a share alpha of accepted positions is bad, with confidence 1 - delta.
 
 Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-sequence testing: thresholds are
-tried from strict to lax, each is a binomial test on the calibration positions it accepts, and the first that
-fails ends the search. Given who is accepted the bad ones are binomial, so the promise is about the error
-*among accepted positions*; plain split conformal promises a share of all positions instead. Whether promises
-hold is told by `run_trials`: thresholds of many draws, tried on other rows.
+tried towards laxer ones from where other positions predict success, each is a binomial test on the
+calibration positions it accepts, and the first that fails ends the search. Given who is accepted the bad ones
+are binomial, so the promise is about the error *among accepted positions*; plain split conformal promises a
+share of all positions instead. Whether promises hold is told by `run_trials`: thresholds of many draws, tried
+on other rows.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import betainc
-from scipy.stats import binomtest, chi2, spearmanr
+from scipy.special import betainc, log_expit
+from scipy.stats import binom, binomtest, chi2, spearmanr
 
 from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.data.spacing import thin_rows
@@ -25,9 +26,12 @@ RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
 # Thresholds that are tried: more of them resolve finer, but each one may end the search.
 LEVELS = 50
+# Odds of bad as powers of the rank, all equally likely before positions are seen: powers and log factors.
+CURVES = np.array([0, 0.5, 1, 2, 4])[:, None, None], np.linspace(-6, 6, 25)[:, None]
+NEARLY_BEST = 0.98  # of the best level's chance to pass: the laxest such level is tried first
 SURE_OF_EFFECT = 0.8
 How = Literal["random", "spatial"]
-SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+SHARES = (0.2, 0.4)  # of the positions that choose kind and levels, and that calibrate where the rest tests
 MOST_CALIBRATED = 10_000  # positions that a message may ask for
 MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
 CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
@@ -127,9 +131,25 @@ def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[flo
     return float(interval.low), float(interval.high)
 
 
-def threshold_levels(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
-    """Return thresholds (at most `count`,), strict to lax: quantiles of scores (n,) not the calibration's."""
-    return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
+def threshold_levels(score: np.ndarray, bad: np.ndarray, guarantee: Guarantee, count: int) -> np.ndarray:
+    """Return thresholds (at most `LEVELS`,), strict to lax: quantiles of scores (n,) not the calibration's.
+
+    The first is the laxest whose chance to pass on `count` calibration positions is nearly the best, so that
+    one bad row among the few surest does not end the search. Chances are predicted from who is `bad` (n,), as
+    the mean over `CURVES`, weighed by their likelihoods.
+    """
+    levels = np.unique(np.quantile(score, np.linspace(0, 1, LEVELS)))[::-1]
+    order, (powers, factors) = np.argsort(-score), CURVES
+    # Log odds of bad by rank, the surest first: (powers, factors, n).
+    odds = factors + powers * np.log((np.arange(len(score)) + 0.5) / len(score))
+    fit = np.where(bad[order], log_expit(odds), log_expit(-odds)).sum(-1)
+    accepted = np.searchsorted(-score[order], -levels, side="right")
+    share = np.cumsum(np.exp(log_expit(odds)), -1)[..., accepted - 1] / accepted
+    expected = np.round(accepted / len(score) * count)
+    most = binom.ppf(guarantee.delta, expected, guarantee.alpha) - 1  # bad ones with which a level passes
+    chance = np.where(most < 0, 0, _error_tail(np.maximum(most, 0), expected, share))
+    chance = np.tensordot(np.exp(fit - fit.max()), chance, 2)
+    return levels[np.flatnonzero(chance >= NEARLY_BEST * chance.max())[-1] :]
 
 
 def choose_threshold(
@@ -145,7 +165,7 @@ def choose_threshold(
     all are, accepting everybody is tested.
 
     >>> score = np.linspace(0, 1, 100)
-    >>> choose_threshold(score, score < 0.5, threshold_levels(score), Guarantee()).accepted >= 50
+    >>> choose_threshold(score, score < 0.5, score[::-2], Guarantee()).accepted >= 50
     True
     """
     threshold = Threshold(float("inf"), 0, 0)
@@ -185,7 +205,7 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     return max(1.0, float(bound * between / (share * (1 - share))))
 
 
-def _error_tail(wrong: Any, accepted: Any, alpha: float) -> Any:
+def _error_tail(wrong: Any, accepted: Any, alpha: Any) -> Any:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
     # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
     return betainc(np.maximum(accepted - wrong, 1e-9), wrong + 1, 1 - alpha)
@@ -303,32 +323,35 @@ def split_evidence(evidence: Evidence, how: How, rng: np.random.Generator) -> Ev
     return EvidenceSplit(*(np.flatnonzero(np.isin(unit, part)) for part in parts))
 
 
-def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0) -> str | None:
+def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0, effect: float = 1.0) -> str | None:
     """Say how many test positions a promise needs of which a share `bad` is bad; None: not more than `count`.
+
+    `effect` is their `design_effect`.
 
     >>> explain_too_few(32, Guarantee(alpha=0.2))  # enough
     >>> explain_too_few(32, Guarantee(alpha=0.2), bad=0.1).split(";")[0]
-    '32 test positions are too few: alpha=0.2, delta=0.1 with 10% bad need 35 to calibrate on, 88 in all'
+    '32 test positions are too few: alpha=0.2, delta=0.1 with 10% bad need 35 calibrated on, 44 in all'
     """
     # A share of alpha or more passes with no number: what none bad would need is the least.
     bad = bad if bad < guarantee.alpha else 0.0
     least = np.arange(guarantee.least, MOST_CALIBRATED)
-    passed = least[_error_tail(bad * least, least, guarantee.alpha) <= guarantee.delta]
-    if not len(passed) or count >= (needed := int(np.ceil(passed[0] / SHARES[1]))):
+    passed = least[_error_tail(bad * least / effect, least / effect, guarantee.alpha) <= guarantee.delta]
+    if not len(passed) or count >= (needed := int(np.ceil(passed[0] / (1 - SHARES[0])))):
         return None
+    alike = "" if effect == 1 else f", as neighbours err alike ({effect:.1f} are as one)"
     return (
         f"{count} test positions are too few: alpha={guarantee.alpha:g}, delta={guarantee.delta:g} with "
-        f"{bad:.0%} bad need {passed[0]} to calibrate on, {needed} in all; measure more, or promise less"
+        f"{bad:.0%} bad need {passed[0]} calibrated on{alike}, {needed} in all; measure more, or promise less"
     )
 
 
 def relax_guarantee(
-    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int
+    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int, apart_m: float
 ) -> Guarantee | None:
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(guarantee, limit_db=float(limit))
-        if calibrate_threshold(evidence, other, kind, spatial, seed).threshold.accepted:
+        if calibrate_threshold(evidence, other, kind, spatial, seed, apart_m, False).threshold.accepted:
             return other
     return None
 
@@ -373,9 +396,11 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 
 def calibrate_threshold(
     evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int | list[int],
-    apart_m: float = 0,
+    apart_m: float = 0, tested: bool = True,
 ) -> CalibratedThreshold:  # fmt: skip
     """Choose a confidence and its threshold.
+
+    Unless `tested`, the unseen positions calibrate, too: a threshold that nobody tries needs none.
 
     Raises:
         ValueError: `kind` is no confidence of this evidence.
@@ -386,13 +411,14 @@ def calibrate_threshold(
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], guarantee.is_bad(evidence.error)
+    if not tested:
+        calibrate, test = np.concatenate([calibrate, test]), test[:0]
     if apart_m > 0:  # neighbours err together and count as one
         calibrate = thin_rows(evidence.position, calibrate, apart_m, rng)
     # Divided at random, accepted positions are independent draws, and their counts are binomial.
     patch = number_patches(evidence.position)[calibrate] if spatial else None
-    threshold = choose_threshold(
-        score[calibrate], bad[calibrate], threshold_levels(score[choose_on]), guarantee, patch
-    )
+    levels = threshold_levels(score[choose_on], bad[choose_on], guarantee, len(calibrate))
+    threshold = choose_threshold(score[calibrate], bad[calibrate], levels, guarantee, patch)
     return CalibratedThreshold(used, threshold, test, choose_on)
 
 

@@ -259,6 +259,20 @@ class Kernel(Stored):
         return self.lengths[0]
 
     @property
+    def description(self) -> str:
+        """One line of lengths and noise.
+
+        >>> Kernel.from_lengths((0.5, 2.0), (0.25, 0.75), noise=0.1).description
+        "lengths 0.5 m (25%) and 2 m (75%), noise 0.1 of the signal's variance"
+        """
+        parts = [f"{length:.4g} m" for length in self.lengths]
+        if len(parts) == 2:
+            parts = [f"{part} ({share:.0%})" for part, share in zip(parts, self.shares, strict=True)]
+        kind = "exponential " * isinstance(self.terms[0], ExponentialShadowing)
+        word = "lengths" if len(parts) == 2 else "length"
+        return f"{kind}{word} {' and '.join(parts)}, noise {self.noise:.3g} of the signal's variance"
+
+    @property
     def compiled_lengths(self) -> list[float] | None:
         """Lengths as compiled kernels have them, negative of Matern-1/2; None where they cannot answer."""
         signed = [term.compiled * float(term.length) for term in self.signals]

@@ -152,7 +152,7 @@ def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
 def median_spacing(places: np.ndarray) -> float:
     """Return the median distance [m] from a place (n, D) to the next other one.
 
-    >>> spacing(np.array([[0.0], [0.0], [2.0], [4.0]]))
+    >>> median_spacing(np.array([[0.0], [0.0], [2.0], [4.0]]))
     2.0
     """
     places = np.unique(places, axis=0)

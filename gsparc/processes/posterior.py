@@ -106,7 +106,7 @@ class Exact(Posterior):
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
     def cross_covariance(self, queries: Tensor, columns: Tensor) -> Tensor:
-        """Return covariances (B, n) of places (B, D), whose terms are `own` (B, Q), with the rows."""
+        """Return covariances (B, n) of places (B, D), whose terms are `columns` (B, Q), with the rows."""
         result = self.prior.kernel.correlations(queries, self.rows)
         return result if self.prior.trend is None else result.addmm(columns, self._trend_columns.T)
 

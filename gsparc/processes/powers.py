@@ -41,7 +41,7 @@ class PowerRows:
     """Powers and where they were measured.
 
     >>> rows = PowerRows(np.zeros((3, 3)), np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8))
-    >>> rows.silent, len(rows.measured.decibels)  # the second lies below its level
+    >>> rows.silent, len(rows.measured_rows.decibels)  # the second lies below its level
     (array([False,  True, False]), 2)
 
     Attributes:

@@ -12,7 +12,7 @@ import torch
 
 PLUGINS = "gsparc.terms"  # entry points of installed kinds
 MAIN = "__main__"  # module of what a notebook or script defines
-KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
+KINDS: dict[str, type[Stored]] = {}  # by the name that `to_plain` gives them
 
 
 def kind_name(kind: type) -> str:
@@ -43,9 +43,9 @@ class Stored:
 
 
 def to_plain(part: Any) -> Any:
-    """Return what `restored` reads.
+    """Return what `from_plain` reads.
 
-    >>> stored((1.0, None, np.zeros(2)))
+    >>> to_plain((1.0, None, np.zeros(2)))
     [1.0, None, {'array': tensor([0., 0.], dtype=torch.float64)}]
     """
     if isinstance(part, Stored):
@@ -56,7 +56,7 @@ def to_plain(part: Any) -> Any:
 
 
 def from_plain(part: Any) -> Any:
-    """Return what `stored` was given; lists as tuples.
+    """Return what `to_plain` was given; lists as tuples.
 
     Raises:
         ValueError: see `find_kind`.
@@ -71,7 +71,7 @@ def from_plain(part: Any) -> Any:
 
 
 def find_kind(name: str) -> type[Stored]:
-    """Return the kind that `stored` names so, of what was imported or is installed.
+    """Return the kind that `to_plain` names so, of what was imported or is installed.
 
     Raises:
         ValueError: there is none.

@@ -71,18 +71,18 @@ def test_threshold_counts_the_bad_and_bounds_their_share() -> None:
     promise = Guarantee(alpha=0.1, delta=0.1)
     score = np.linspace(1, 0, 400)
     bad = np.arange(400) >= 200
-    found = choose_threshold(score, bad, threshold_levels(score), promise)
+    levels = threshold_levels(score, bad, promise, 400)
+    found = choose_threshold(score, bad, levels, promise)
     assert 180 <= found.accepted < 230 and found.bad == max(0, found.accepted - 200)
     assert found.bound(0.1) <= 0.1 + 1e-9
-    assert choose_threshold(score, np.ones(400, bool), threshold_levels(score), promise).value == float("inf")
+    assert choose_threshold(score, np.ones(400, bool), levels, promise).value == float("inf")
     assert Threshold(0.0, 0, 0).bound(0.1) == 1.0
 
 
 def test_too_few_to_test_promise_nothing() -> None:
     score = np.linspace(1, 0, 15)
-    found = choose_threshold(
-        score, np.zeros(15, bool), threshold_levels(score), Guarantee(alpha=0.1, delta=0.1)
-    )
+    good, promise = np.zeros(15, bool), Guarantee(alpha=0.1, delta=0.1)
+    found = choose_threshold(score, good, threshold_levels(score, good, promise, 15), promise)
     assert found.accepted == 0  # 0.9^15 = 0.2 > delta
     with pytest.raises(ValueError, match="above 0 and below 1"):
         Guarantee(alpha=1.5)
@@ -93,17 +93,39 @@ def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
     good, promise = replace(_evidence(32), error=np.full(32, 0.01)), Guarantee(0.0, alpha=0.2)
     accepted = [calibrate_threshold(good, promise, "auto", False, seed)[1].accepted for seed in range(50)]
     assert min(accepted) >= promise.least  # 19 of 50 accepted none
-    assert explain_too_few(27, promise).startswith("27 test positions are too few: alpha=0.2, delta=0.1 with")
-    assert explain_too_few(32, promise) is None and "88 in all" in explain_too_few(32, promise, 0.1)
-    assert explain_too_few(27, promise, 0.9) == explain_too_few(27, promise)
+    assert explain_too_few(13, promise).startswith("13 test positions are too few: alpha=0.2, delta=0.1 with")
+    assert explain_too_few(14, promise) is None and "44 in all" in explain_too_few(32, promise, 0.1)
+    assert explain_too_few(13, promise, 0.9) == explain_too_few(13, promise)
     # Valid still: a fifth and more of all are bad, whatever the score, and one set in ten is misled.
+    assert 0.02 < _accepting(0.2 * np.ones(19), 6, promise) < 0.1
+
+
+def _accepting(share: np.ndarray, aside: int, promise: Guarantee, least: float = -np.inf, sets: int = 300):
+    """Of sets of rows that are bad with `share` (n,), surest first, how many accept scores below `least`."""
     rng = np.random.default_rng(0)
-    score, bad = rng.normal(size=(2000, 19)), rng.random((2000, 13)) < 0.2
-    misled = [
-        choose_threshold(s[6:], b, threshold_levels(s[:6]), promise).accepted > 0
-        for s, b in zip(score, bad, strict=True)
-    ]
-    assert 0.02 < np.mean(misled) < 0.1
+    found = 0
+    for _ in range(sets):
+        row = rng.permutation(len(share))
+        score, bad = -row / len(share), rng.random(len(share)) < share[row]
+        levels = threshold_levels(score[:aside], bad[:aside], promise, len(share) - aside)
+        threshold = choose_threshold(score[aside:], bad[aside:], levels, promise)
+        found += threshold.accepted > 0 and (least == -np.inf or threshold.value < least)
+    return found / sets
+
+
+@pytest.mark.parametrize("share", [0.08, 0.22])
+def test_one_bad_row_of_the_surest_ended_the_search(share) -> None:
+    """Of 60 rows the first test was one of five: sets that promised something were .67 and .24 of all."""
+    promise = Guarantee(alpha=0.3, delta=0.2)
+    assert _accepting(np.full(60, share), 12, promise, sets=200) > (0.95 if share == 0.08 else 0.42)
+
+
+def test_where_the_search_begins_misleads_no_more_sets_than_promised() -> None:
+    """With `alpha` bad at every threshold, and with errors that grow beyond half of the rows."""
+    promise = Guarantee(alpha=0.3, delta=0.2)
+    assert _accepting(np.full(60, 0.3), 12, promise) < 0.2
+    growing = np.where(np.arange(60) < 30, 0.3, 0.6)
+    assert _accepting(growing, 12, promise) < 0.2 and _accepting(growing, 12, promise, -0.5) < 0.1
 
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
@@ -126,6 +148,15 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     stored, said = command.calibrate_and_store("", {}, {}, Guarantee(better), *how)
     assert f"confidence={stored.kind}, before: the model's own; accepted from" in said and len(kept) == 1
     assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better - 1), *how)[1]
+    # Rows of one patch count as one, which the stored threshold did not do.
+    assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better), *how, 0.8)[1]
+    # Fewer than alpha were bad, and a confidence was blamed; rows of patches that err together were too few.
+    evidence.error[:] = np.where(np.arange(900) % 8 == 0, 10.0, 0.01)
+    said = command.calibrate_and_store("", {}, {}, Guarantee(alpha=0.144), "auto", False, 2)[1]
+    assert "so few do not show that at most alpha=0.144 are" in said
+    evidence.error[:] = np.where(number_patches(evidence.position) % 8 == 0, 10.0, 0.01)
+    said = command.calibrate_and_store("", {}, {}, Guarantee(alpha=0.2), "distance", True, 0)[1]
+    assert "as neighbours err alike" in said
     evidence.error[:] = 10.0
     assert "no limit_db= up to 6 is kept" in command.calibrate_and_store("", {}, {}, Guarantee(), *how)[1]
 

@@ -46,7 +46,7 @@ def gpu() -> cuda_library.Library:
 
 
 def on_gpu(run: Callable) -> Callable:
-    """`run` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
+    """`launch` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
 
     def there(name, like, *tensors, **options):
         moved = [None if t is None else t.cuda() for t in tensors]

@@ -4,10 +4,15 @@
 counts when it is a gross one, after five fresh seeds.
 """
 
+import numpy as np
 import pytest
+from campaigns import compose
 from judging import repeated, run
 from product import PARTS
-from worlds import CHOICES, World, covering, every, possible_pairs
+from worlds import CHOICES, World, arrays, covering, every, possible_pairs
+
+from gsparc.commands.train import read_inputs
+from gsparc.evaluation.baselines import fit_baseline
 
 FEW = covering(every((30,)), 1)[:14]  # seven of eight pairs; `make grid` has all
 FIRST = 9  # of them, at every change: seven of ten pairs
@@ -45,6 +50,17 @@ def test_every_kind_of_thirty_rows(number, tmp_path):
 )
 def test_every_kind_of_three_hundred_rows(world, tmp_path):
     assert_served(world, tmp_path, 15.0)
+
+
+def test_a_process_of_one_length_predicted_the_mean_in_a_gap(tmp_path):
+    world = World("moving_array", 1, 4, "rx", "metres", "none", "blocks", 300)
+    np.savez(file := tmp_path / "own.npz", **arrays(world, 33))
+    begun = read_inputs(
+        compose("dataset=own", f"dataset.file='{file}'", "model=gp", "split=blocks", "logger=none")
+    )
+    data, split = begun.module.measurements, begun.split
+    figures = [fit_baseline(name, data, split).scores.figures()["psnr_db"] for name in ("gp", "idw")]
+    assert figures[0] > figures[1] + 0.1
 
 
 def test_the_covering_set_has_every_pair():

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from towns import trained
 
 import gsparc
+from gsparc.evaluation.open_runs import calibrate_and_store
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.confidence import (
@@ -48,6 +50,19 @@ def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     assert np.allclose(plain.confidence(tx=world), as_confidence("distance", evidence.scores["distance"]))
     assert np.array_equal(plain.accepts(tx=world), plain.confidence(tx=world) >= 0.2)
     assert isinstance(plain.accepts(tx=world[0]), bool)
+
+
+def test_two_moving_ends_are_accepted_where_both_were_measured(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    ends = [np.column_stack([rng.uniform(0, 20, (60, 2)), np.full(60, 1.5)]) for _ in range(2)]
+    loss = -30 - 25 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1) + 1)
+    np.savez(tmp_path / "ends.npz", tx_position=ends[0], rx_position=ends[1], rssi_db=loss)
+    path = trained(tmp_path / "ends.npz", "gp", "split.test_fraction=0.5")
+    trusted, _ = calibrate_and_store(str(path), {}, {}, Guarantee(0.0, 0.3, 0.2), "auto", False, 0)
+    assert trusted.box.shape == (2, 6)
+    near, far, place = [5.0, 5, 1.5], [40.0, 10, 1.5], [10.0, 10, 1.5]
+    accepted = gsparc.load(path).accepts(tx=[near, far, near], rx=[place, place, far])
+    assert accepted.tolist() == [True, False, False]
 
 
 def test_what_was_never_stored_is_said(site) -> None:

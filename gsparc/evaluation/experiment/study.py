@@ -18,7 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.done import State, run_once
 from gsparc.evaluation.experiment.folds import FoldFits, fit_folds, fold_contexts
-from gsparc.evaluation.metric_formats import DECIDING, WITH_SILENT
+from gsparc.evaluation.metric_formats import deciding_figure
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.models import checkpoint, loading
@@ -183,7 +183,7 @@ class Study:
             if condition.what == "query":
                 outcome = outcome.score_on(condition.change_test(data, split, seed), split)
             # Where rows were silent they count, as in every other table.
-            figure = WITH_SILENT if WITH_SILENT in outcome.figures else DECIDING[data.site.scored]
+            figure = deciding_figure(outcome.figures, data.site.scored)
             folds = [condition.change_training(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),

@@ -18,6 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import FittedBaseline, fit_baseline
 from gsparc.evaluation.drawing import panels, set_log_axis, style_of
+from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
 from gsparc.evaluation.open_runs import Opened
 from gsparc.evaluation.scores import rows_to_score, score_methods
@@ -64,7 +65,7 @@ def measure_candidates(
         there = score_methods([recorded], data, split, eval_on)
         answers = torch.cat(recorded.means)
         whole = answers if whole is None else whole
-        scored.append((there.figures(), closeness_db(answers, whole)))
+        scored.append((pool_figures(there, data, split), closeness_db(answers, whole)))
         if number % 10 == 9:
             log.info("%d of %d faster variants scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}

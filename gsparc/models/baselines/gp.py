@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
@@ -24,7 +25,7 @@ from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_power_
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import entry_variance, power_rows, to_real
 from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
-from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, fit_kernel_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows, rows_with_nearest
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
@@ -33,6 +34,7 @@ from gsparc.processes.prior import Prior
 
 LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
 STRONGEST = 32  # components that they are chosen by
+STARTS = np.array([0.01, 0.05, 0.25])  # lengths that a search starts from, of the extent
 ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
 
 
@@ -83,30 +85,35 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
-def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
-    """Return the length and noise of largest leave-one-out likelihood, from three starting lengths.
+def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: int, count: int = 2) -> Kernel:
+    """Return the lengths and noise of largest leave-one-out likelihood.
+
+    Two lengths are those of interference and of levels: one that is short enough for interference predicts
+    the mean in every gap.
 
     Args:
         positions: (n, 3) [m].
         scores: (n, P) centred targets in an orthonormal basis.
         entries: real numbers per target, P or more.
+        count: of lengths, 1 or 2.
     """
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
         return Kernel.from_length(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
-    bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2)), (math.log(1e-8), math.log(1e2))]
+    bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2))] * count
+    bounds += [*[(-SHARES, SHARES)] * (count - 1), (math.log(1e-8), math.log(1e2))]
     # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
-    starts = [Kernel.from_length(spread * share, 0.01) for share in (0.01, 0.05, 0.25)]
+    lengths = combinations(spread * STARTS, count)
+    starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    distance = distances(places, places)
     # The figures move by 1e-4 beyond this.
-    known = starts, distance, None, values, bounds
+    known = starts, distances(places, places), None, values, bounds
     return fit_kernel_by_left_out(*known, tolerance=2 * SETTLED, entries=entries, bounded=False)[1]
 
 
 class GaussianProcess(Differentiable, ClosedForm):
-    """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
+    """Matern-3/2 of two lengths, isotropic, over the moving end's position, about the mean target.
 
     Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
     where nothing was heard too (`gsparc.processes.powers`).
@@ -132,21 +139,19 @@ class GaussianProcess(Differentiable, ClosedForm):
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
         self.powers = None
-        thinned: list[str] = []
         parts = principal_components(targets, self.kind, self.limit)
-        looked_at: np.ndarray | slice = slice(None)
-        if len(targets) > CHOSEN_ON:
-            thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
-            looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
         self.scores = Exact.from_values(Prior(kernel), at, scores)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         self.lost = parts.lost
-        notes = [f"gp: length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"]
+        notes = [f"gp: {kernel.description}"]
         if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
             notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
-        return (*notes, *thinned)
+        if len(looked_at) < len(targets):
+            notes.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
+        return tuple(notes)
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
@@ -162,8 +167,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
         scheme = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
-        settings = f"length {kernel.lengths[0]:.4g} m, noise {kernel.noise:.3g} of the signal's variance"
-        return tuple(f"gp: {note}" for note in (settings, fit_note, scheme, basis))
+        return tuple(f"gp: {note}" for note in (kernel.description, fit_note, scheme, basis))
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         assert self.site is not None

@@ -20,7 +20,7 @@ from gsparc.data.schema import Site
 from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER, decibels
 
 LEAST_HELD = 4  # rows, for weights to mean anything
-LEAST_GAIN_DB = 0.2  # for which a query may take several times as long
+LEAST_GAIN_DB = 0.1  # for which a query may take several times as long
 FEW_ROWS = 40  # fewer do not tell a weight from a half, where the two differ by less than twice the error
 UNUSED = 0.05  # weight below which a predictor is left out of a mixture
 SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two

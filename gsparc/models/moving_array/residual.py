@@ -75,7 +75,7 @@ def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
     mean = values.mean(0)
     centred = (values - mean).double().numpy()
     scores = centred @ principal_axes(centred, KERNEL_COMPONENTS)[1].T
-    kernel = choose_left_out_kernel(places, scores, values.shape[1])
+    kernel = choose_left_out_kernel(places, scores, values.shape[1], 1)
     residual = solve_and_leave_out(kernel, places, torch.from_numpy(scores))[1]
     missed = float(residual.square().sum()) + (centred**2).sum() - (scores**2).sum()
     return float(missed) / len(values), kernel

@@ -90,14 +90,9 @@ class Candidate:
     @property
     def description(self) -> str:
         """One line of the settings."""
-        parts = [f"{length:.4g} m" for length in self.kernel.lengths]
-        if len(parts) == 2:
-            parts = [f"{part} ({share:.0%})" for part, share in zip(parts, self.kernel.shares, strict=True)]
-        law, noise = self.trend.law, f"noise {self.kernel.noise:.3g} of the signal's variance"
+        law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
-        word = "length" if len(parts) == 1 else "lengths"
-        word = f"exponential {word}" if isinstance(self.kernel.terms[0], ExponentialShadowing) else word
-        return f"{word} {' and '.join(parts)}, {noise}, about {mean}"
+        return f"{self.kernel.description}, about {mean}"
 
 
 def candidate_priors(

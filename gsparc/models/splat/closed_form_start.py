@@ -76,7 +76,7 @@ def _kernel(data: Measurements, rows: np.ndarray, most: int, seed: int) -> tuple
     chosen = rows if len(rows) <= most else np.sort(draw.choice(rows, most, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
     parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
-    return chosen, choose_left_out_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
+    return chosen, choose_left_out_kernel(data.moving[looked_at], parts.scores, len(parts.mean), 1)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from gsparc.training.context import FitContext
 def test_chosen_kernel_is_a_minimum(campaign):
     data = campaign("spectrum", 40)
     scores = torch.from_numpy(principal_components(data.target, "spectrum", 512).scores)
-    kernel, places = (choose_left_out_kernel(data.moving, scores.numpy(), 288), torch.from_numpy(data.moving))
+    kernel = choose_left_out_kernel(data.moving, scores.numpy(), 288, 1)
+    places = torch.from_numpy(data.moving)
     at = {
         step: LeftOutDensity.apply(
             Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores, 288, False
@@ -54,7 +55,8 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     rows = np.concatenate([fold.train, fold.val])
     k = gp.scores.prior.kernel
     target = data.target[rows].reshape(len(rows), -1).view(np.float32)
-    shape = ConstantKernel(k.amplitude) * Matern(k.length, nu=1.5) + WhiteKernel(k.amplitude * k.noise)
+    short, long = (ConstantKernel(k.amplitude * one.share) * Matern(one.length, nu=1.5) for one in k.signals)
+    shape = short + long + WhiteKernel(k.amplitude * k.noise)
     library = GaussianProcessRegressor(shape, optimizer=None, alpha=0).fit(
         data.moving[rows], target - target.mean(0)
     )
