@@ -104,7 +104,7 @@ class Densify(Checked, L.Callback):
         with torch.no_grad():
             # Draws are a pure function of (seed, step): a resumed run makes the same children.
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
-            planned = self.plan_edit(model, draws, in_place=module.solved)
+            planned = self.plan(model, draws, in_place=module.solved)
             before = len(model.gaussians)
             solved = solve_readout(model, planned, batch) if module.solved else None
             change = 0.0 if solved is None else float(process_sum(solved.change)) ** 0.5
@@ -120,9 +120,7 @@ class Densify(Checked, L.Callback):
             self.statistics = self._zero_statistics(model)
         _log_edit(trainer, module, planned, before, step)
 
-    def plan_edit(
-        self, model: GaussianModel, generator: torch.Generator, in_place: bool = False
-    ) -> edit.Edit:
+    def plan(self, model: GaussianModel, generator: torch.Generator, in_place: bool = False) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far.
 
         Args:

@@ -77,6 +77,8 @@ class FrozenPlan:
         if features.dim() not in (2, 3):
             raise ValueError(f"features must be (N, C) or (B, N, C), got {tuple(features.shape)}")
         batch = features if features.dim() == 3 else features.unsqueeze(0)
-        image = backends.backend_named(self.backend).thaw(self.grid, self.buffers, batch, self.order, picked)
+        image = backends.backend_named(self.backend).draw_frozen(
+            self.grid, self.buffers, batch, self.order, picked
+        )
         # The first and last of (B, N, C): B and C.
         return image.unflatten(0, batch.shape[::2]) if features.dim() == 3 else image

@@ -22,10 +22,10 @@ from gsparc.ops.operators import (
     mean_weights,
     register_kernel,
 )
-from gsparc.ops.results import Plan
+from gsparc.ops.results import Plan, Raster
 from gsparc.ops.settings import KernelSettings
 
-__all__ = ["composite", "freeze", "instruction_set", "make_plan", "mean_weights", "rasterize", "thaw"]
+__all__ = ["composite", "draw_frozen", "freeze", "instruction_set", "make_plan", "mean_weights", "rasterize"]
 
 NO_PLAN = (None,) * len(Buffers._fields)
 
@@ -56,8 +56,8 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
 
 def rasterize(
     gaussians: Gaussians, ids: Tensor | None, pose: Pose, features: Tensor, settings: KernelSettings
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return what a `Raster` holds, in one call that keeps no plan and passes no gradient.
+) -> Raster:
+    """Render in one call that keeps no plan and passes no gradient.
 
     Raises:
         ValueError, MemoryError: as `make_plan` and `composite`.
@@ -81,7 +81,7 @@ def rasterize(
     if status == _native.UNSOUND_FEATURES:
         validation.check_features(features)
     validation.raise_for_status(status, pose)
-    return image, transmittance, radii, visible, means2d
+    return Raster(image, transmittance, radii, visible, means2d)
 
 
 @register_kernel("composite", "cpu")
@@ -138,7 +138,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return order, (starts, ranks, weights)
 
 
-def thaw(
+def draw_frozen(
     grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
 ) -> Tensor:
     """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C).

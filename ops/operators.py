@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsparc.ops import calls
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
-from gsparc.ops.results import Plan, visible_share
+from gsparc.ops.results import Plan, Weights, visible_share
 from gsparc.ops.settings import Optics
 
 KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
@@ -209,10 +209,10 @@ def _weights_gradient(
     return run_kernel("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = call_differentiable(_weights, _weights_gradient, plan, *gaussians)
-    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+    return Weights(seen / (plan.grid.height * plan.grid.width), visible_share(seen, total))
 
 
 def check_memory(entries: int, bytes_each: int) -> None:

@@ -168,7 +168,7 @@ def rasterize(
     if at_once is not None and not is_differentiated(*inputs):
         poses = validation.check_poses(pose, means)
         values = validation.features_per_pose(features, means, poses)
-        return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))
+        return at_once(gaussians, ids, poses, values, kernel_settings(grid, optics))
     plan = _make_plan(gaussians, ids, pose, grid, optics, backend)
     return composite(plan, means, quats, scales, opacities, features)
 
@@ -189,7 +189,7 @@ def mean_weights(
     # Called for its refusal of plans that were made in inference mode.
     _needs_gradient(plan, *gaussians)
     backend = reference_by_rows if needs_reference(*gaussians) else backends.backend_named(plan.backend)
-    return Weights(*backend.mean_weights(plan, gaussians))
+    return backend.mean_weights(plan, gaussians)
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.ops import reference, validation
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
-from gsparc.ops.results import Plan, visible_share
+from gsparc.ops.results import Plan, Weights, visible_share
 from gsparc.ops.settings import Optics
 from gsparc.ops.transforms import full_precision
 
@@ -77,10 +77,10 @@ def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     return _stack_or_empty(seen, none), _stack_or_empty(total, none)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = weight_sums(plan, gaussians)
-    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+    return Weights(seen / (plan.grid.height * plan.grid.width), visible_share(seen, total))
 
 
 @full_precision
@@ -93,7 +93,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 @full_precision
-def thaw(
+def draw_frozen(
     grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
 ) -> Tensor:
     """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsparc.ops import reference_backend
 from gsparc.ops.geometry import Gaussians, SphereGrid
-from gsparc.ops.results import Plan, visible_share
+from gsparc.ops.results import Plan, Weights, visible_share
 
 ELEMENTS = 2**22  # of a tensor Gaussians x pixels
 
@@ -26,11 +26,11 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
     return torch.cat(images, -2), torch.cat(transmittances, -2)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     parts = [reference_backend.weight_sums(part, gaussians) for part in _split_rows(plan)]
     seen, total = (torch.stack(sums).sum(0) for sums in zip(*parts, strict=True))
-    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+    return Weights(seen / (plan.grid.height * plan.grid.width), visible_share(seen, total))
 
 
 def _split_rows(plan: Plan) -> Iterator[Plan]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,15 +36,8 @@ LEAST_UNKNOWN = 1e-3  # of the variance is always unknown: quantisation, recover
 ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 
 
-class ErrorLaw(NamedTuple):
-    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u."""
-
-    level: float
-    power: float
-
-
 class ErrorModel(nn.Module):
-    """The error that an `ErrorLaw` expects.
+    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u.
 
     What errors of left-out training rows say; nothing is learned by gradient.
 
@@ -77,10 +69,10 @@ class ErrorModel(nn.Module):
         self.far, self.power = (float(value) for value in state)
 
 
-def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> ErrorLaw:
-    """Return the law that errors (n,) at unknown shares (n,) follow.
+def fit_level_and_power(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
-    The likeliest for errors that are exponential about it, so that their mean is right at every level: a
+    The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
     line through logarithms would fit the many small errors and miss the few large ones.
     """
     x, y = np.log(unknown + LEAST_UNKNOWN), error + 1e-9
@@ -90,7 +82,7 @@ def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> ErrorLaw:
         return float((y * np.exp(-level) + level).mean())
 
     result = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
-    return ErrorLaw(float(np.exp(result[0])), float(np.clip(result[1], 0.0, 2.0)))
+    return float(np.exp(result[0])), float(np.clip(result[1], 0.0, 2.0))
 
 
 class Confidence(nn.Module):

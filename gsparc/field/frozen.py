@@ -15,7 +15,7 @@ from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.response import SLOPE_ENDS, ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan, queries
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.processes.features import matern_parts
+from gsparc.processes.features import matern_mixture
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class FrozenArray:
         if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
                 moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
-                self.renderer.tables, self.renderer.square, matern_parts(encoding.length, encoding.kernel),
+                self.renderer.tables, self.renderer.square, matern_mixture(encoding.length, encoding.kernel),
             )  # fmt: skip
             return Rendered(mean, None, unknown)
         encoded = encoding(moving)
@@ -153,9 +153,7 @@ def gaussian_vectors(model: GaussianModel, rx: Pose) -> Tensor:
         by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
         means, quats, scales, opacities = (part.detach() for part in model.gaussians.geometry())
         emitted = torch.zeros(count, len(parts), requires_grad=True)
-        plan = model.make_plan(
-            Pose(rx.position.clone(), rx.rotation.clone())
-        )  # perhaps made in inference mode
+        plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # perhaps made in inference mode
         image = ops.composite(plan, means, quats, scales, opacities, emitted).image
         (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))
     return torch.view_as_complex(seen.view(count, len(parts) // 2, 2))

@@ -78,7 +78,7 @@ class GaussianField(nn.Module):
         return Gaussians(self.means, self.quats, self.scales, self.opacities)
 
     @torch.no_grad()
-    def cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
+    def to_cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
         """Return what a picture or a file needs, with what each emits (N,), in the unit of `label`."""
         means, quats, scales, opacities = (part.double().numpy() for part in self.geometry())
         quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)

@@ -271,14 +271,12 @@ def read_trainer_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult
     return TrainerResult(kept, taken, timed_out)
 
 
-def _drop_unusable(
-    callbacks: Sequence[L.Callback], val_rows: int, edits_gaussians: bool
-) -> Sequence[L.Callback]:
+def _drop_unusable(callbacks: Sequence[L.Callback], val_rows: int, gaussians: bool) -> Sequence[L.Callback]:
     """Leave out callbacks that need validation rows, or Gaussians to edit, where there are none."""
     blind = [] if val_rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
     if blind:
         log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
-    return [c for c in callbacks if c not in blind and (edits_gaussians or not hasattr(c, "edits_gaussians"))]
+    return [c for c in callbacks if c not in blind and (gaussians or not hasattr(c, "edits_gaussians"))]
 
 
 def _describe_lost_process(error: ProcessException, advice: str) -> str:

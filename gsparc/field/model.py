@@ -207,7 +207,7 @@ class GaussianModel(nn.Module):
             image, unknown = raster.image, self.unknown_shares(tx, rx)
             mean = self.response(image, unknown) if self.response else image.squeeze(1)
             return Rendered(mean, raster, unknown)
-        weights = ops.mean_weights(self.make_plan(rx), *self.gaussians.geometry()).share
+        weights = ops.mean_weights(self.plan(rx), *self.gaussians.geometry()).share
         if self.response is None:
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
@@ -217,7 +217,7 @@ class GaussianModel(nn.Module):
         """Return images of features (B, N, C) from one pose, or each from its own of B."""
         return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._raster_options())
 
-    def make_plan(self, rx: Pose) -> Plan:
+    def plan(self, rx: Pose) -> Plan:
         """Return footprints and depth order from one pose, or from each of B."""
         return ops.make_plan(*self.gaussians.geometry(), rx, **self._raster_options())
 
@@ -237,6 +237,4 @@ class GaussianModel(nn.Module):
     def freeze(self, rx: Pose) -> FrozenPlan:
         """Return the pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
         with torch.no_grad():
-            return ops.freeze(
-                self.make_plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version)
-            )
+            return ops.freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))

@@ -125,7 +125,7 @@ class ArrayResponse(nn.Module):
     def background(self, image: Tensor) -> None:
         self.renderer.square.copy_(image.square())
 
-    def coarsen(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
+    def coarse_renderer(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
         """Return the renderer on `grid`, every `stride`-th row and column of its own."""
         return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
 

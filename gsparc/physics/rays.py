@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 MIN_ANGLE = 0.02  # [rad]: more parallel rays have no well-defined crossing
 
 
-class ClosestApproach(NamedTuple):
-    """Ranges (P, Q) [m] along the rays of two places, and the distance (P, Q) [m] between the rays there."""
-
-    first: np.ndarray
-    second: np.ndarray
-    gap: np.ndarray
-
-
-def closest_approach(
+def ranges_and_gap(
     first: np.ndarray, first_rays: np.ndarray, second: np.ndarray, second_rays: np.ndarray
-) -> ClosestApproach:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the closest points of every pair of rays from two places.
 
     >>> x, y = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
-    >>> ranges = closest_approach(np.zeros(3), x, np.array([2.0, -1.0, 0.0]), y)
+    >>> ranges = ranges_and_gap(np.zeros(3), x, np.array([2.0, -1.0, 0.0]), y)
     >>> [float(one[0, 0]) for one in ranges]  # 2 m along the one, 1 m along the other, where they meet
     [2.0, 1.0, 0.0]
 
@@ -32,7 +22,8 @@ def closest_approach(
         first_rays, second_rays: (P, 3) and (Q, 3) unit vectors.
 
     Returns:
-        See `ClosestApproach`; gaps are infinite behind a place and between nearly parallel rays.
+        Ranges (P, Q) [m] along the rays of both places, and the distance (P, Q) [m] between the rays there:
+        infinite behind a place and between nearly parallel rays.
     """
     offset, cosine = second - first, first_rays @ second_rays.T
     a, b = (first_rays @ offset)[:, None], (second_rays @ offset)[None, :]
@@ -41,5 +32,4 @@ def closest_approach(
     s, t = (a - cosine * b) / sine2, (cosine * a - b) / sine2
     between = offset + t[..., None] * second_rays[None] - s[..., None] * first_rays[:, None]
     gap = np.linalg.norm(between, axis=-1)
-    well = (s > 0) & (t > 0) & (1 - cosine**2 > MIN_ANGLE**2)
-    return ClosestApproach(s, t, np.where(well, gap, np.inf))
+    return s, t, np.where((s > 0) & (t > 0) & (1 - cosine**2 > MIN_ANGLE**2), gap, np.inf)

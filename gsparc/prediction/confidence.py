@@ -30,16 +30,16 @@ MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
 def gather_evidence(
-    method: Method, data: Measurements, fold: Fold, rows: np.ndarray, own: Measurements | None = None
+    method: Method, data: Measurements, fold: Fold, rows: np.ndarray, seen: Measurements | None = None
 ) -> Evidence:
-    """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `own` or `data`."""
+    """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `seen` or `data`."""
     evidence = join_evidence(
         [
             Evidence(rows[chosen], data.moving[rows[chosen]], *errors_and_scores(said, batch.target))
             for chosen, batch, said in predict_in_batches(method, data, rows)
         ]
     )
-    return replace(evidence, scores=evidence.scores | position_scores(own or data, fold, evidence.position))
+    return replace(evidence, scores=evidence.scores | position_scores(seen or data, fold, evidence.position))
 
 
 def errors_and_scores(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -281,9 +281,9 @@ class ConfidenceMixin:
             raise ValueError(f"{self.method.name} has no confidence")
         return sure, single, as_torch
 
-    def _method_confidence(self, own: Prediction, query: Query | None) -> Tensor | None:
+    def _method_confidence(self, prediction: Prediction, query: Query | None) -> Tensor | None:
         """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
-        if own.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
+        if prediction.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             return None
         places = None if query is None else query.places(self.site).numpy()
-        return torch.from_numpy(self.trusted.confidence(own, places, self.kind))
+        return torch.from_numpy(self.trusted.confidence(prediction, places, self.kind))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -65,17 +64,11 @@ def to_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     return world
 
 
-class Outside(NamedTuple):
-    """Which places (n,) bool lie farther outside a box than the margin [m]."""
+def far_outside_and_margin(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, float]:
+    """Tell which places (n,) bool lie farther outside the training places' box than a margin, and that [m].
 
-    far: np.ndarray
-    margin: float
-
-
-def far_outside(world: dict[End, np.ndarray], site: Site) -> Outside:
-    """Tell which places lie far outside the box of the training places.
-
-    >>> far, margin = far_outside({"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}, predictor.site)
+    >>> places = {"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}
+    >>> far, margin = far_outside_and_margin(places, predictor.site)
     >>> far, 0 < margin < 1  # a tenth of the longer side
     (array([False,  True]), True)
     """
@@ -84,7 +77,7 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> Outside:
     low, high = site.moving_box
     # Of the longest side: a corridor is so narrow that every place beside it would be far outside.
     margin = MARGIN * float((high - low).max())
-    return Outside(((place < low - margin) | (place > high + margin)).any(axis=1), margin)
+    return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
 
 
 def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
@@ -95,7 +88,7 @@ def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) 
     # With heights as measured: if these places are inside, height alone is what was wrong.
     inside = np.clip(heights, low, high)
     flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(ends)}
-    if far_outside(flat, site).far.any():
+    if far_outside_and_margin(flat, site)[0].any():
         return ""
     beyond = (heights - inside)[far].ravel()
     most = float(beyond[np.abs(beyond).argmax()])
@@ -116,7 +109,7 @@ def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Si
     return f"{here}: degrees or km as x and y?"
 
 
-def match_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
+def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Return row of the places and station (N,) int64 of each prediction; -1 without stations.
 
     Args:

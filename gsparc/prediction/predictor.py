@@ -353,9 +353,9 @@ def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     checkpoint.update_extra(path, extra)
 
 
-def _to_unit(own: Prediction, unit: PowerUnit) -> Prediction:
+def _to_unit(stored: Prediction, unit: PowerUnit) -> Prediction:
     """Of stored targets, in a unit."""
     # In decibels a variance depends on the mean too.
-    variance = None if own.variance is None else unit.variance(own.mean, own.variance)
-    explained = None if own.explained is None else unit.values(own.explained).to(own.mean.dtype)
-    return Prediction(unit.values(own.mean).to(own.mean.dtype), variance, own.unknown, explained)
+    variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
+    explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
+    return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)

@@ -284,14 +284,6 @@ class Trial:
         }  # fmt: skip
 
 
-class EvidenceSplit(NamedTuple):
-    """Disjoint rows of evidence."""
-
-    choose_on: np.ndarray
-    calibrate: np.ndarray
-    test: np.ndarray
-
-
 class CalibratedThreshold(NamedTuple):
     """Kind of confidence, its threshold, rows that neither saw, and rows that the kind is chosen on."""
 
@@ -301,8 +293,10 @@ class CalibratedThreshold(NamedTuple):
     choose_on: np.ndarray
 
 
-def split_evidence(evidence: Evidence, how: How, rng: np.random.Generator) -> EvidenceSplit:
-    """Return rows of the evidence to choose on, to calibrate on, to test on.
+def split_choose_calibrate_test(
+    evidence: Evidence, how: How, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return disjoint rows of the evidence: to choose on, to calibrate on, to test on.
 
     `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
     across a cell's border.
@@ -320,7 +314,8 @@ def split_evidence(evidence: Evidence, how: How, rng: np.random.Generator) -> Ev
             f"take more test rows{'' if how == 'random' else ', or spatial=false'}"
         )
     parts = order[:first], order[first:second], order[second:]
-    return EvidenceSplit(*(np.flatnonzero(np.isin(unit, part)) for part in parts))
+    choose_on, calibrate, test = (np.flatnonzero(np.isin(unit, part)) for part in parts)
+    return choose_on, calibrate, test
 
 
 def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0, effect: float = 1.0) -> str | None:
@@ -406,7 +401,9 @@ def calibrate_threshold(
         ValueError: `kind` is no confidence of this evidence.
     """
     rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = split_evidence(evidence, "spatial" if spatial else "random", rng)
+    choose_on, calibrate, test = split_choose_calibrate_test(
+        evidence, "spatial" if spatial else "random", rng
+    )
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")

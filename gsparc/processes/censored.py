@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsparc.processes.averages import MeanVariance
 from gsparc.processes.factor import Factor
 
 FAR = -30.0  # standard deviations below which the ratio of density and distribution is a series
@@ -66,20 +67,20 @@ def truncated_moments(z: Tensor) -> TruncatedMoments:
 
 
 def fit_by_ep(
-    known: ConditionalGaussian,
+    prior: ConditionalGaussian,
     level: Tensor,
     side: Tensor | float = 1.0,
     start: PseudoValues | None = None,
-    within: float = SETTLED,
+    tolerance: float = SETTLED,
 ) -> PseudoValues:
     """Find stand-ins for "below `level`" (m,), "above" where `side` is -1, of unknown entries.
 
     Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same. They end
-    when no mean moves by more than `within` deviations.
+    when no mean moves by more than `tolerance` deviations.
     """
-    mean, covariance = known.mean, known.covariance
+    mean, covariance = prior.mean, prior.covariance
     total = covariance.diagonal()
-    value, variance = (start.value, start.variance) if start else _sites(mean, total, level, side)
+    value, variance = (start.value, start.variance) if start else _match_sites(mean, total, level, side)
     settled, before = False, mean
     for _ in range(MOST_SWEEPS):
         factor = Factor.from_gram(covariance + torch.diag(variance), "raise")
@@ -88,8 +89,8 @@ def fit_by_ep(
         # The cavity: what all others say of an entry, its own stand-in taken out.
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
-        result, wide = _sites(cavity, cavity_variance, level, side)
-        settled = bool(((cavity - before).abs() / total.sqrt()).max() < within)
+        result, wide = _match_sites(cavity, cavity_variance, level, side)
+        settled = bool(((cavity - before).abs() / total.sqrt()).max() < tolerance)
         if settled:
             break
         before = cavity
@@ -105,11 +106,11 @@ def fit_by_ep(
     return PseudoValues(value, variance, float(evidence), settled)
 
 
-def _sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor]:
+def _match_sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> MeanVariance:
     """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
     deviation = variance.sqrt()
     ratio, lost = truncated_moments(side * (level - mean) / deviation)
-    return mean - side * deviation * ratio / lost, variance * (1 - lost) / lost
+    return MeanVariance(mean - side * deviation * ratio / lost, variance * (1 - lost) / lost)
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ class LeftOutDensity(torch.autograd.Function):
         return slopes[0] * (lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T)), None, None, None
 
 
-class Evidence(torch.autograd.Function):
+class LogEvidence(torch.autograd.Function):
     """Negative logarithm of the probability of values, some of them only beyond a level."""
 
     @staticmethod
@@ -96,7 +96,7 @@ class Evidence(torch.autograd.Function):
         return -slopes[0] * slope, slopes[0] * weights, None, None
 
 
-class Profiled(torch.autograd.Function):
+class ProfiledDensity(torch.autograd.Function):
     """Negative evidence of values of mean 0 at the amplitude that fits them best, and that amplitude."""
 
     @staticmethod

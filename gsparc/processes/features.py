@@ -9,7 +9,7 @@ variance `1 - |phi(x)|^2` with `phi(x) = C^T k(Z, x)`: C C^T = (K + s)^-1 where 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -39,20 +39,11 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
     return TERMS[name](length).correlation(distances(a, b))
 
 
-class MaternParts(NamedTuple):
-    """Share and length [m] of a correlation's Matern-5/2 and of its Matern-3/2."""
-
-    share52: float
-    length52: float
-    share32: float
-    length32: float
-
-
-def matern_parts(length: float, name: Correlation) -> MaternParts:
-    """Return what a correlation is a sum of."""
+def matern_mixture(length: float, name: Correlation) -> tuple[float, float, float, float]:
+    """Return share and length [m] of a correlation's Matern-5/2, share and length of its Matern-3/2."""
     if name == "matern32":
-        return MaternParts(0.0, length, 1.0, length)
-    return MaternParts(1 - ROUGH_SHARE, length, ROUGH_SHARE, ROUGH_RATIO * length)
+        return 0.0, length, 1.0, length
+    return 1 - ROUGH_SHARE, length, ROUGH_SHARE, ROUGH_RATIO * length
 
 
 @dataclass(frozen=True)

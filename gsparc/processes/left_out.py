@@ -19,17 +19,10 @@ ENTRIES = 2_000_000  # of systems solved at a time: memory
 
 
 class LeftOutErrors(NamedTuple):
-    """Residuals (n, R) of rows that were left out, and their variances (n,), None where they are not told."""
+    """Residuals (n, R) of rows that were left out, and their variances (n,); of a group their covariance."""
 
     residual: Tensor
     variance: Tensor
-
-
-class GroupErrors(NamedTuple):
-    """Residuals (s, R) of rows that were left out together, and their covariance (s, s)."""
-
-    residual: Tensor
-    covariance: Tensor
 
 
 def left_out_residuals(
@@ -57,10 +50,10 @@ def left_out_residuals(
     return LeftOutErrors(residual, variance)
 
 
-def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> GroupErrors:
+def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> LeftOutErrors:
     """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s)."""
     block = Factor.from_gram(inverse[rows[:, None], rows])
-    return GroupErrors(block.solve(weights[rows]), block.inverse)
+    return LeftOutErrors(block.solve(weights[rows]), block.inverse)
 
 
 def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> LeftOutErrors:

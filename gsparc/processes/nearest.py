@@ -54,13 +54,6 @@ class KrigingWeights(NamedTuple):
     explained_variance: Tensor
 
 
-class TrendWeights(NamedTuple):
-    """Mean (Q, P) and covariance (Q, Q) of the weights of a mean law's terms."""
-
-    mean: Tensor
-    covariance: Tensor
-
-
 def kriging_weights(gram: Tensor, cross: Tensor) -> KrigingWeights:
     """Return weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
 
@@ -207,7 +200,7 @@ class Nearest(Posterior):
         """Noise (n,) that lets any system be solved; of a million rows, made once."""
         return self.noise + JITTER
 
-    def distance(self, queries: Tensor) -> Tensor:
+    def nearest_distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return nearest_distance(self.near.tree, queries)
 
@@ -253,15 +246,15 @@ def condition_on_nearest(
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
     chosen = covering_rows(every.places, COVER, seed)
-    terms, spread = fit_trend_weights(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
+    terms, spread = trend_mean_and_covariance(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
     return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
 @torch.no_grad()
-def fit_trend_weights(
+def trend_mean_and_covariance(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
-) -> TrendWeights:
-    """Return weights of the mean law's terms given rows, unit normal before.
+) -> tuple[Tensor, Tensor]:
+    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms given rows, unit normal before.
 
     Rows in random order condition on their nearest ones in the half before them: what is left of them is
     white, and of the terms too.
@@ -295,7 +288,7 @@ def fit_trend_weights(
     terms, values = flat[:, outputs:], flat[:, :outputs]
     # Linear regression on white rows, whose weights have unit variance before.
     precision = Factor.from_gram(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
-    return TrendWeights(precision.solve(terms.T @ values), precision.inverse)
+    return precision.solve(terms.T @ values), precision.inverse
 
 
 @dataclass(frozen=True)
@@ -369,7 +362,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
     noise = start.noise / values.count[chosen]
-    about, _ = fit_trend_weights(prior, values.places[chosen], rest[chosen], noise, seed)
+    about, _ = trend_mean_and_covariance(prior, values.places[chosen], rest[chosen], noise, seed)
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]

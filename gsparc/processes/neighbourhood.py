@@ -107,24 +107,24 @@ class Neighbourhood(Stored):
         return [(own, count) for (own, _), count in zip(self._trees[::-1], counts, strict=True)]
 
     def nearest_rows(
-        self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
+        self, queries: np.ndarray, excluded: np.ndarray | None = None, most: int = NEIGHBOURS
     ) -> np.ndarray:
         """Return numbers (B, k) of neighbours of queries (B, D).
 
         Args:
             queries: [m].
-            without: (B,) a place for each query that is no neighbour of it; None: none. Of one place
+            excluded: (B,) a place for each query that is no neighbour of it; None: none. Of one place
                 alone there is then no neighbour.
             most: neighbours.
         """
         result: list[np.ndarray] = []
         # One more is looked for, as the place itself is among the nearest.
-        more = 0 if without is None else 1
+        more = 0 if excluded is None else 1
         for (own, count), (_, tree) in zip(self.split_by_density(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
-            if without is not None:
+            if excluded is not None:
                 # A stable sort puts the place itself last and keeps the others from near to far.
-                later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
+                later = np.argsort(row == excluded[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
                 row = np.take_along_axis(row, later, 1)
             result.append(row)
         return np.concatenate(result, 1)

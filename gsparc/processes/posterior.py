@@ -97,7 +97,7 @@ class Exact(Posterior):
         """See `Posterior`."""
         return self._mean(queries, self.cross_covariance(queries, self.prior.columns(queries)))
 
-    def distance(self, queries: Tensor) -> Tensor:
+    def nearest_distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return distances(queries, self.rows).amin(1)
 

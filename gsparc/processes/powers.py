@@ -28,14 +28,6 @@ BOUNDS = {1: "where nothing was heard are below", -1: "in saturation are above"}
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 
 
-class RegressionInputs(NamedTuple):
-    """Distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
-
-    distance: Tensor
-    terms: Tensor
-    values: Tensor
-
-
 @dataclass(frozen=True)
 class PowerRows:
     """Powers and where they were measured.
@@ -77,29 +69,29 @@ class PowerRows:
         """Return means (m, 1) [dB] over the rows of each place."""
         return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
-    def regression_inputs(self, trend: Trend) -> RegressionInputs:
-        """Return what a kernel about a trend is learned from."""
+    def distances_terms_values(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+        """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
-        return RegressionInputs(distances(places, places), trend.columns(places), rest[:, None])
+        return distances(places, places), trend.columns(places), rest[:, None]
 
-    def draw_subset(self, most: int, seed: int) -> Self:
+    def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
-        return self.subset(draw_rows(self.silent, most, seed))
+        return self.subset(draw_rows(self.silent, count, seed))
 
 
-def draw_rows(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
+def draw_rows(silent: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Draw at most so many rows, sorted; at least half of them were heard where as many were.
 
-    >>> len(draw_rows(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
+    >>> len(draw_rows(np.arange(100) >= 10, count=8, seed=0))  # ten were heard, 90 were not
     8
     """
     rng = np.random.default_rng(seed)
     loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
-    if len(loud) + len(quiet) > most:
-        share = round(most * len(loud) / (len(loud) + len(quiet)))
-        first = max(share, min(len(loud), most // 2))
-        loud, quiet = loud[:first], quiet[: most - first]
+    if len(loud) + len(quiet) > count:
+        share = round(count * len(loud) / (len(loud) + len(quiet)))
+        first = max(share, min(len(loud), count // 2))
+        loud, quiet = loud[:first], quiet[: count - first]
     return np.sort(np.concatenate([loud, quiet]))
 
 
@@ -173,7 +165,7 @@ class PowerProcess(Stored):
         own = 1 + self.kernel.noise
         whole = max(self.heard, own)
         by_law = 1 - own / whole  # share of that variance
-        far = self.posterior.distance(queries) / self._trend_reach
+        far = self.posterior.nearest_distance(queries) / self._trend_reach
         # What the law explains counts as unknown where no row is near.
         unknown = result.variance / whole + by_law * (1 - (-far.square()).exp())
         return PowerAnswer(result.mean[:, 0], self.kernel.amplitude * result.variance, unknown.clamp_max(1.0))

@@ -100,7 +100,7 @@ class Posterior(Stored, ABC):
         """Return the mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
 
     @abstractmethod
-    def distance(self, queries: Tensor) -> Tensor:
+    def nearest_distance(self, queries: Tensor) -> Tensor:
         """Return distances (B,) [m] from places (B, D) to the nearest row."""
 
     @cached_property

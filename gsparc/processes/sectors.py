@@ -134,7 +134,7 @@ class Sectors(Trend):
     def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """See `Trend`."""
         assert self.law is not None
-        (mean, slopes), decades = (self.linearise(places), (self.law.decades(places) - self.middle)[:, None])
+        (mean, slopes), decades = self.linearise(places), (self.law.decades(places) - self.middle)[:, None]
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
         own = (self.indicators[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -45,6 +46,22 @@ class Block:
         # L^T K^-1 y = L^-1 y, for covariances in units of the amplitude.
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
         return cls(process, process.factor.whiten(columns) / deviation, values)
+
+
+class Conditioning(NamedTuple):
+    """What S processes of one prior say.
+
+    Attributes:
+        prior: of them.
+        more: (S, k) mean beyond the prior's.
+        white: (k, n) roots of each of the variance that rows take away, none without rows.
+        shared: (S, k, P) root of the variance that the shared weights leave.
+    """
+
+    prior: Prior
+    more: Tensor
+    white: list[Tensor]
+    shared: Tensor
 
 
 class SharedTermsPosterior:
@@ -129,12 +146,8 @@ class SharedTermsPosterior:
 
     def _condition(
         self, queries: Tensor, asked: tuple[int, ...], own: Tensor, columns: Tensor, rounded: bool
-    ) -> tuple[Prior, Tensor, list[Tensor], Tensor]:
-        """What S processes of one prior say at (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P).
-
-        The prior; the mean (S, k) beyond its; roots (k, n) of each of the variance that rows take away, none
-        without rows, float32 if `rounded`; and (S, k, P) of that which the shared weights leave.
-        """
+    ) -> Conditioning:
+        """At (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P); roots are float32 if `rounded`."""
         more, shared = columns @ self.mean, columns.flatten(0, 1)
         prior, white = self.never, list[Tensor]()
         if asked[0] in self.processes:
@@ -157,7 +170,7 @@ class SharedTermsPosterior:
                 shared = shared - torch.cat(told)
         if len(self.mean):
             shared = self.factor.whiten(shared.T).T
-        return prior, more, white, shared.unflatten(0, queries.shape[:2])
+        return Conditioning(prior, more, white, shared.unflatten(0, queries.shape[:2]))
 
     def _stack(self, asked: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
         """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes; 0 beyond the rows of one."""

@@ -43,7 +43,7 @@ def with_gradient(densify: Densify, wanting: list[int], count: int = 10) -> Dens
 
 def test_small_ones_are_cloned_in_place(model):
     densify = with_gradient(Densify(grad_threshold=0.5, size_share=1.0), [2, 7])
-    edit = densify.plan_edit(model, draws())
+    edit = densify.plan(model, draws())
     assert edit.keep.all() and edit.parents.tolist() == [2, 7]
     assert torch.equal(edit.replace["gaussians.means"], model.gaussians.means[[2, 7]])
     assert torch.equal(edit.replace["gaussians.log_scales"], model.gaussians.log_scales[[2, 7]])
@@ -51,7 +51,7 @@ def test_small_ones_are_cloned_in_place(model):
 
 def test_large_ones_are_split_into_smaller(model):
     densify = with_gradient(Densify(grad_threshold=0.5, size_share=0.0, children=3), [4])
-    edit = densify.plan_edit(model, draws())
+    edit = densify.plan(model, draws())
     assert edit.keep.tolist() == [i != 4 for i in range(10)] and edit.parents.tolist() == [4, 4, 4]
     scales = edit.replace["gaussians.log_scales"].exp()
     assert torch.allclose(scales, model.gaussians.scales[[4]] / (0.8 * 3))
@@ -62,21 +62,21 @@ def test_large_ones_are_split_into_smaller(model):
 def test_faint_ones_are_pruned_down_to_the_floor(model):
     with torch.no_grad():
         model.gaussians.opacity_logits.copy_(torch.linspace(-30, -20, 10))
-    edit = with_gradient(Densify(min_gaussians=3), []).plan_edit(model, draws())
+    edit = with_gradient(Densify(min_gaussians=3), []).plan(model, draws())
     assert edit.keep.tolist() == [False] * 7 + [True] * 3  # the most opaque stay
 
 
 def test_wide_ones_are_pruned_when_asked(model):
     densify = with_gradient(Densify(max_radius=50.0, min_gaussians=1), [])
     densify.statistics["radius"][3] = 51.0
-    assert densify.plan_edit(model, draws()).keep.tolist() == [i != 3 for i in range(10)]
+    assert densify.plan(model, draws()).keep.tolist() == [i != 3 for i in range(10)]
 
 
 @pytest.mark.parametrize("share", [1.0, 0.0])
 def test_never_more_than_allowed_and_the_neediest_first(model, share):
     densify = with_gradient(Densify(grad_threshold=0.5, size_share=share, max_gaussians=14), range(10))
     densify.statistics["gradient"] = torch.arange(10.0) + 1
-    edit = densify.plan_edit(model, draws())
+    edit = densify.plan(model, draws())
     assert int(edit.keep.sum()) + len(edit.parents) == 14
     assert set(edit.parents.tolist()) == {6, 7, 8, 9}
 

@@ -22,7 +22,7 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     densify = Densify(grad_threshold=0.5)
     densify.statistics = densify._zero_statistics(model)
     densify.statistics["gradient"][::20], densify.statistics["seen"] = 1.0, torch.ones(len(model.gaussians))
-    planned = densify.plan_edit(model, torch.Generator().manual_seed(0), in_place=True)
+    planned = densify.plan(model, torch.Generator().manual_seed(0), in_place=True)
     before = model(batch.tx, batch.rx).mean
     solved = solve_readout(model, planned, batch)
     edit.apply_edit(planned, model, model.gaussians)

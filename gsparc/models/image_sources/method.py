@@ -35,7 +35,7 @@ from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
-from gsparc.physics.mirror_planes import image_rotations, normal_form
+from gsparc.physics.mirror_planes import hesse_form, image_rotations
 from gsparc.physics.row_factors import Freedom, align_factors
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
@@ -323,7 +323,7 @@ class ImageSourceGP(SourcesInFrame):
     def objects(self) -> SiteObjects:
         """Return planes and boxes of the heaviest search."""
         scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
-        normal, offset = normal_form(scene.planes.double())
+        normal, offset = hesse_form(scene.planes.double())
         # n.p = b about the frame's middle m is n.p = b + n.m in local coordinates.
         moved = torch.cat([normal, offset + (normal @ middle)[:, None]], 1)
         boxes = scene.clutter.boxes.double().unflatten(1, (2, -1)) + middle

@@ -225,7 +225,7 @@ def _apart(
         )
         places = torch.from_numpy(rows.places[part])
         error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]
-        distance[part] = known.distance(places).numpy()
+        distance[part] = known.nearest_distance(places).numpy()
     return error, distance
 
 

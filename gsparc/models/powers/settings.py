@@ -22,7 +22,7 @@ from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, about_terms, in_unit_of, less_means
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.density import LOOKS, Evidence, covariance_of, fit_kernel_by_left_out, minimise
+from gsparc.processes.density import LOOKS, LogEvidence, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
@@ -115,7 +115,7 @@ def candidate_priors(
 
 def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    fit = fit_variogram(rows.places, rows.regression_inputs(trend)[2].numpy())
+    fit = fit_variogram(rows.places, rows.distances_terms_values(trend)[2].numpy())
     sill = max(fit.sill, LEAST_SILL * fit.variance)
     kernel = Kernel.from_length(fit.range, max(fit.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
@@ -222,7 +222,7 @@ def _trends(rows: PowerRows, site: Site, mean: MeanName) -> list[tuple[Trend, fl
 
 
 def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
-    distance, terms, values = rows.regression_inputs(trend)
+    distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
@@ -236,7 +236,7 @@ def _searched(
     rows: PowerRows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = fit_kernel_by_left_out(starts, *rows.regression_inputs(one.trend), looks=looks)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.distances_terms_values(one.trend), looks=looks)
     return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
 
 
@@ -249,7 +249,7 @@ def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
 
 def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.regression_inputs(one.trend)
+    distance, terms, values = rows.distances_terms_values(one.trend)
     gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
     silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
@@ -261,7 +261,7 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
 
 def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.regression_inputs(one.trend)
+    distance, terms, values = rows.distances_terms_values(one.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = one.kernel.bounds(distance)
@@ -271,7 +271,7 @@ def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
 
     def objective(at: Tensor) -> Tensor:
         gram = at[-1].exp() * covariance_of(one.kernel.with_values(at[:-1]), distance, terms)
-        return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
+        return LogEvidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
     best, value = start, float(objective(torch.from_numpy(start)))

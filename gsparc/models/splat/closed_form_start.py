@@ -17,7 +17,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_error_law
+from gsparc.field.confidence import fit_level_and_power
 from gsparc.field.encoding import Prior
 from gsparc.field.initial import InitTask, Start, keep_random_weights
 from gsparc.field.model import GaussianModel
@@ -158,7 +158,7 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     distance = model.relative_distances(batch.tx)
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
-    outputs = model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1)
+    outputs = model.emission.to_logits(emission.unsqueeze(-1), distance).squeeze(-1)
     return ImageEmissions(weights, images, outputs.double(), attenuation)
 
 
@@ -171,7 +171,7 @@ def _errors(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor) -
     unknown = (variance - noise).clamp(0, 1)
     images = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])
-    return fit_error_law(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
+    return fit_level_and_power(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
 
 
 def _left_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:

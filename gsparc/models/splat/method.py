@@ -22,7 +22,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.field import edit, gradient_stage
-from gsparc.field.confidence import ConfidenceSettings, fit_error_law
+from gsparc.field.confidence import ConfidenceSettings, fit_level_and_power
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
@@ -375,7 +375,7 @@ class LearnedField(Method):
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
-            model.error.set_error_law(*fit_error_law(result.unknown.numpy(), error.double().numpy()))
+            model.error.set_error_law(*fit_level_and_power(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -452,7 +452,7 @@ class LearnedField(Method):
         model, square = self.model, torch.zeros(self.count_components())
         for one in query.split(1):  # features of all would be gigabytes
             square += model.emissions(one.tx, one.rx)[0].square().sum(1)
-        return model.gaussians.cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
+        return model.gaussians.to_cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
 
     # -- what it can do besides ----------------------------------------------------------------------
 

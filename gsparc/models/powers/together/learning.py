@@ -103,7 +103,7 @@ def learn_station_priors(
             numbers = []
         for number in numbers:
             some = heard.select_station(number).thin_rows(ENDS_ON, seed)
-            _, own = fit_kernel_by_left_out([kernel], *some.regression_inputs(trend), tolerance=SETTLED)
+            _, own = fit_kernel_by_left_out([kernel], *some.distances_terms_values(trend), tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -126,7 +126,7 @@ def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thin_rows(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
-    views = {number: few.select_station(number).regression_inputs(trend) for number in few.stations}
+    views = {number: few.select_station(number).distances_terms_values(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0

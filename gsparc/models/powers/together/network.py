@@ -23,7 +23,7 @@ from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows
 from gsparc.processes.censored import PseudoValues
-from gsparc.processes.density import Evidence, minimise
+from gsparc.processes.density import LogEvidence, minimise
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import horizontal, moving_end, other_end
@@ -178,10 +178,7 @@ def _shared_bounds() -> list[tuple[float, float]]:
 
 def _rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     """Shared parameters, gains (T,) and the deviation [dB] of rows taken as independent."""
-    places, number = (
-        torch.from_numpy(rows.places),
-        torch.from_numpy(sector_of(rows.places).astype(np.int64)),
-    )
+    places, number = torch.from_numpy(rows.places), torch.from_numpy(sector_of(rows.places).astype(np.int64))
     bands, count = len(start.levels), len(start.table)
 
     def objective(at: Tensor) -> Tensor:
@@ -247,7 +244,7 @@ def _by_evidence(
         total, kernel = _off(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(), start.with_values(logs)
         for i, at_ in enumerate(places):
             gram, rest = own[i] + kernel.gram(at_), values[i] - rough.powers_at(at_, shared, levels)
-            total = total + Evidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
+            total = total + LogEvidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
         return total / count
 
     *bounds, noise = start.terms[0].bounds(middle)
