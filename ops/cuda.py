@@ -212,10 +212,10 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 def draw_frozen(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
-    columns = validation.seen_features(features, order, picked).contiguous()
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C)."""
+    columns = validation.seen_features(features, order, visible_only).contiguous()
     image = columns.new_empty(columns.shape[1], grid.height, grid.width)
     if image.numel():
         calls.launch("thaw", columns, *buffers, columns, image, sizes=image.shape)

@@ -139,20 +139,20 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 def draw_frozen(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C).
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C).
 
     Raises:
         ValueError: features that are not finite, or not as many as `order` speaks of.
     """
     samples, count, channels = features.shape
     image = features.new_empty(samples * channels, grid.height, grid.width)
-    tensors = contiguous((features, None if picked else order))
+    tensors = contiguous((features, None if visible_only else order))
     sizes = (samples, channels, grid.height, grid.width, len(order), count)
     status = calls.launch("thaw", features, *buffers, *tensors, image, sizes=sizes)
     if status >= 0:
-        validation.seen_features(features, order, picked)  # says what is wrong
+        validation.seen_features(features, order, visible_only)  # says what is wrong
     return image
 
 

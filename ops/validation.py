@@ -162,15 +162,15 @@ def check_features(values: Tensor, rows: Tensor | None = None) -> None:
             raise_for_parameter("features", int(index if rows is None else rows[index]))
 
 
-def seen_features(values: Tensor, order: Tensor, picked: bool) -> Tensor:
-    """Return features (B, N, C) of `order` (V,), or those already `picked`, side by side (V, B C).
+def seen_features(values: Tensor, order: Tensor, visible_only: bool) -> Tensor:
+    """Return features (B, N, C) of `order` (V,), or those already `visible_only`, side by side (V, B C).
 
     Raises:
         ValueError: features that are not finite or too few, on the CPU.
     """
-    if not picked and not values.is_cuda and len(order) and int(order.max()) >= values.shape[1]:
+    if not visible_only and not values.is_cuda and len(order) and int(order.max()) >= values.shape[1]:
         raise ValueError(f"this view shows Gaussian {int(order.max())}, got features of {values.shape[1]}")
-    seen = values if picked else values.index_select(1, order)
+    seen = values if visible_only else values.index_select(1, order)
     check_features(seen, order)
     return seen.transpose(0, 1).reshape(seen.shape[1], values.shape[0] * values.shape[2])
 

@@ -279,7 +279,7 @@ class Kernel(Stored):
         return signed if all(signed) and len(signed) <= COMPILED else None
 
     @property
-    def by_distance(self) -> bool:
+    def is_isotropic(self) -> bool:
         """Whether distances are all that counts, also where both ends move."""
         return self.terms[0].by_distance
 
@@ -292,7 +292,7 @@ class Kernel(Stored):
 
     def correlations(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
-        return self.correlation(distances(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
+        return self.correlation(distances(a, b)) if self.is_isotropic else self.terms[0].covariance(a, b)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""

@@ -84,7 +84,7 @@ class Exact(Posterior):
     @cached_property
     def _vecchia(self) -> Nearest | None:
         """What states the variance of many rows: exactly it costs their number squared for each place."""
-        if len(self.rows) <= MANY or not self.prior.kernel.by_distance:
+        if len(self.rows) <= MANY or not self.prior.kernel.is_isotropic:
             return None
         terms = self.factor.whiten(self._trend_columns)
         # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.

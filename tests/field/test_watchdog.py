@@ -63,7 +63,7 @@ def watched() -> Iterator[Looks]:
     before = signal.signal(signal.SIGALRM, lambda signum, frame: looks.look("interrupt", frame))
     signal.setitimer(signal.ITIMER_REAL, OFTEN_S, OFTEN_S)
     try:
-        with mock.patch.object(TimeBudget, "counted", property(reads)):
+        with mock.patch.object(TimeBudget, "by_clock", property(reads)):
             for module in modules:
                 module.raise_if_cancelled = asks
             looks.look("clock")

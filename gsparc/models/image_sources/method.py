@@ -187,7 +187,7 @@ class ImageSourceGP(SourcesInFrame):
         mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(race.log_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
+        errors.append(race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
 
     def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
