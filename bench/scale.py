@@ -29,7 +29,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.method import MethodFactory
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.training.context import FitContext
 
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
@@ -68,7 +68,7 @@ def peak_gb() -> float:
 
 def measured(source: str, name: str, data: Measurements, fold: Fold) -> None:
     """Write a line of one method, in the columns of docs/results/scale/powers.csv."""
-    before, private, factory = peak_gb(), Private(), by_station(make(name), data)
+    before, private, factory = peak_gb(), Private(), wrap_per_station(make(name), data)
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
         # Both clocks: seconds of the processor do not count what others do meanwhile.

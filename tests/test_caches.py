@@ -10,7 +10,7 @@ from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.evaluation.experiment.done import measurements_hash
 from gsparc.models.array_vectors import vector_cache
-from gsparc.models.checkpoint import _as_numpy, _plain, _site_from
+from gsparc.models.checkpoint import _site_from, _tensors_to_numpy, _to_plain
 from gsparc.ops import SphereGrid
 
 ONE = np.ones(3)
@@ -36,7 +36,7 @@ def _keys(data, monkeypatch) -> dict[str, str]:
     def asked(key):
         raise Asked(key)
 
-    monkeypatch.setattr(vector_cache, "_kept", asked)
+    monkeypatch.setattr(vector_cache, "_solved_rows", asked)
     found = {}
     rows = np.arange(len(data))
     with pytest.raises(Asked) as key_of_vectors:
@@ -66,5 +66,5 @@ def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, monkeypat
 def test_facts_are_the_same_after_a_checkpoint(campaign):
     data = campaign("spectrum", 20)
     whole = replace(data.site, **{**FACTS, "target_scale": np.float64(3.0)})
-    again = _site_from(_as_numpy(_plain(asdict(whole), "site")))
+    again = _site_from(_tensors_to_numpy(_to_plain(asdict(whole), "site")))
     assert identity_hash(replace(data, site=again)) == identity_hash(replace(data, site=whole))

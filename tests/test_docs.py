@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_module
 from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
 from gsparc.commands.shared.plugins import offer_scenes
-from gsparc.models.registry import methods
+from gsparc.models.registry import built_in_methods
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
 
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
@@ -129,7 +129,7 @@ def test_the_readme_is_short():
 def test_every_method_is_listed():
     """Each name of the registry is a row or an entry of the page of methods, or of the page of training."""
     text = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("peers.md", "train.md"))
-    assert not {name for name in methods() if f"`{name}`" not in text}
+    assert not {name for name in built_in_methods() if f"`{name}`" not in text}
 
 
 def test_every_regression_test_of_the_hard_cases_is_there():

@@ -78,5 +78,5 @@ class GPyTorch(Interpolator):
             found = self._ready(asked)
             # Of the prior's variance: 0 at measured places, 1 where nothing is known.
             scores, spread = found.mean.T * self.unit, found.variance.mean(0) / self._ready.kernel.outputscale
-        mean = self._decode(self.mean + scores.float() @ self.axes)
+        mean = self._to_targets(self.mean + scores.float() @ self.axes)
         return Prediction(mean, unknown=spread.clamp(0, 1).float())

@@ -31,7 +31,7 @@ class NearestK(Interpolator):
     def _look_up(self, queries: np.ndarray) -> Prediction:
         """At places (B, 3) [m]; `variance=` and `unknown=` (B,) may be given besides."""
         near = cKDTree(self.places.numpy()).query(queries, k=range(1, self.k + 1))[1]
-        return Prediction(self._decode(self.rows[near].float().mean(1)))
+        return Prediction(self._to_targets(self.rows[near].float().mean(1)))
 
 
 class Corridor(DataModule):

@@ -253,7 +253,7 @@ def _say(config: DictConfig, method: MethodFactory, data: Measurements, split: S
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
     guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
-    limit, folds = method.time_limit(data.site, config.budget_s), len(split.folds)
+    limit, folds = method.describe_time_limit(data.site, config.budget_s), len(split.folds)
     each = f", each of {folds} folds" if limit and folds > 1 else ""
     log.info("%-10s%s", "fitting", f"{method.name}{each}{', ' * bool(limit)}{limit}{guessed}")
 
@@ -302,7 +302,7 @@ def _keep(
         log_of_models.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if not curve.read_curve(context.run_dir):  # a method that trains in one piece
         context.log_curve(report.seconds, fitted.name)
-    marks = fitting.run_marks(report, data, split.folds[number], context)
+    marks = fitting.run_extra(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
@@ -374,7 +374,8 @@ def task(config: DictConfig) -> float:
                 config.ckpt_path = config.ckpt_path or left
                 facts, objects = train(config, run_dir, read)
                 made = f"{objects.data.site.name}, split {objects.split.name}"
-                title = f"{made}, {config.eval_on}, seed {config.seed}"
+                draw = "" if config.split.get("seed") is None else f" (split.seed={config.split.seed})"
+                title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 show_result(run_dir, table, lines=summary.remarks(facts, config.eval_on))
     figure = main_figure(facts, config.eval_on)

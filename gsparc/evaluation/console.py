@@ -93,7 +93,10 @@ def error_in_one_line(error: BaseException) -> str:
         hint = suggest_or_list(choice, list_choices(group) or list(error.options))
         return f"{group}={choice}: no such choice{hint}"
     if isinstance(error, errors.OverrideParseException):
-        return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
+        nested = re.search(r"[\[{,:]\s*[\w.]+=", str(error.override))
+        inside = f'; inside brackets quote it: "{nested[0].strip("[{,: ")}..."' if nested else ""
+        form = f"write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\"{inside}"
+        return f"{error.override}: not understood; {form}"
     if isinstance(error, errors.ConfigCompositionException) and isinstance(
         error.__cause__, OmegaConfBaseException
     ):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pandas as pd
@@ -90,6 +90,7 @@ class Table:
         rows: values: text, numbers, intervals or None.
         note: what to know before reading it.
         bold: first cell of a row that is emphasised.
+        ends: what `low` and `high` of intervals are called in CSV, where that is something else.
     """
 
     title: str
@@ -97,9 +98,10 @@ class Table:
     rows: Sequence[Sequence[Any]] = field(default_factory=list)
     note: str = ""
     bold: str | None = None
+    ends: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_rows(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: str) -> Table:
+    def from_rows(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: Any) -> Table:
         """Return a row per result; `more` are `note` and `bold`."""
         return cls(title, columns, [[column.value(row) for column in columns] for row in results], **more)
 
@@ -114,7 +116,7 @@ class Table:
         """Return the same but for some columns."""
         kept = [i for i, column in enumerate(self.columns) if column.name not in names]
         rows = [[row[i] for i in kept] for row in self.rows]
-        return Table(self.title, [self.columns[i] for i in kept], rows, self.note, self.bold)
+        return replace(self, columns=[self.columns[i] for i in kept], rows=rows)
 
     @staticmethod
     def key(value: Any) -> str:
@@ -128,14 +130,16 @@ class Table:
         return [column.name for column in self.columns], rows
 
     def csv(self) -> str:
-        """Comma-separated, an interval as three columns."""
+        """Comma-separated, an interval as a column for each part that it has."""
         parts: dict[str, list[Any]] = {}
         for number, column in enumerate(self.columns):
             cells = [row[number] for row in self.rows]
             parts[column.name] = [getattr(cell, "value", cell) for cell in cells]
             if any(isinstance(cell, Interval) for cell in cells):
-                for end in ("low", "high"):
-                    parts[f"{column.name} {end}"] = [getattr(cell, end, None) for cell in cells]
+                for end in ("low", "high", "error"):
+                    ends = [getattr(cell, end, None) for cell in cells]
+                    known = any(one is not None for one in ends)
+                    parts |= {f"{column.name} {self.ends.get(end, end)}": ends} if known else {}
         # object: pandas would write whole numbers beside empty cells as 3.0.
         return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")
 

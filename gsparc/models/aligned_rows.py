@@ -76,13 +76,13 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
         if kept() is data and its == key:
             return result
     target, noise, found = np.array(data.target), data.noise_variance, []
-    for rows in _parts(data, known):
+    for rows in _group_snapshots(data, known):
         best, own = align_rows(rows, site.freedom, site), target[rows.rows]
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
             # Where gains are free rows have no level of their own: all are learned at unit power.
-            level = _rms(rows.values)[rows.moment]
+            level = _rms_of_rows(rows.values)[rows.moment]
             factors = factors / level[:, None, None]
             if noise is not None:
                 noise = np.array(noise)
@@ -124,16 +124,16 @@ def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, M
     return np.sort(rows[first]), replace(data, **means)  # type: ignore[arg-type]
 
 
-def _parts(data: Measurements, known: np.ndarray) -> list[Snapshots]:
+def _group_snapshots(data: Measurements, rows: np.ndarray) -> list[Snapshots]:
     """Rows (n,) of all stations where most are heard at each moment, else those of each station alone."""
-    numbers = np.zeros(len(known), np.int64) if data.station is None else data.station[known]
+    numbers = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
     stations = np.unique(numbers)
-    if len(known) >= SHARED * len(stations) * (number_moments(data, known).max() + 1):
-        return [Snapshots.from_rows(data, known)]
-    return [Snapshots.from_rows(data, known[numbers == one]) for one in stations]
+    if len(rows) >= SHARED * len(stations) * (number_moments(data, rows).max() + 1):
+        return [Snapshots.from_rows(data, rows)]
+    return [Snapshots.from_rows(data, rows[numbers == one]) for one in stations]
 
 
-def _rms(values: np.ndarray) -> np.ndarray:
+def _rms_of_rows(values: np.ndarray) -> np.ndarray:
     """Root mean square (n,) of what was measured in rows (n, A, K), above 0."""
     count = np.maximum((values != 0).sum((1, 2)), 1)
     return np.maximum(np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count), TINY_POWER)
@@ -151,13 +151,13 @@ def align_rows(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
-        values = values / _rms(values)[:, None, None]
+        values = values / _rms_of_rows(values)[:, None, None]
     length = site.wavelength or SPACINGS * median_spacing(rows.places)
     one = _Rows(rows.places, values, rows.tones, freedom, length)
-    found = [one.smooth(one.along_tree(None))]
-    direct = _direct(rows, site)
+    found = [one.refine_by_neighbours(one.align_along_tree(None))]
+    direct = _direct_wave(rows, site)
     if direct is not None:
-        found.append(one.waves(one.along_tree(direct)))
+        found.append(one.refine_by_waves(one.align_along_tree(direct)))
     return min(found, key=lambda each: each.error)
 
 
@@ -171,9 +171,9 @@ class _Rows:
     freedom: Freedom
     length: float
 
-    def along_tree(self, direct: np.ndarray | None) -> np.ndarray:
+    def align_along_tree(self, direct_wave: np.ndarray | None) -> np.ndarray:
         """Factors (n, K) that turn each row to the next of a tree of near places, about a direct wave."""
-        values = self.values if direct is None else self.values * direct.conj()
+        values = self.values if direct_wave is None else self.values * direct_wave.conj()
         factors = np.ones((len(values), len(self.tones)), np.complex128)
         trunk = covering_rows(self.places, TREE, 0)
         # A distance of 0 would be no edge, and several rows may lie at one place.
@@ -194,25 +194,29 @@ class _Rows:
         """Without the gain, which unit rows have lost."""
         return "phase" if self.freedom == "phase" else "phase+delay"
 
-    def smooth(self, factors: np.ndarray) -> Alignment:
+    def refine_by_neighbours(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by a process of two lengths; return the round that tells rows best."""
         kernel, found = initial_kernel(self.length, median_spacing(self.places)), []
         for _ in range(ROUNDS):
-            factors = self._swept(factors, self._weights(kernel), SWEEPS)
-            found.append(Alignment(factors, self._error(factors, self._weights(kernel)), "neighbours"))
+            factors = self._sweep_factors(factors, self._neighbour_weights(kernel), SWEEPS)
+            found.append(
+                Alignment(
+                    factors, self._left_out_error(factors, self._neighbour_weights(kernel)), "neighbours"
+                )
+            )
             turned = (self.values * factors[:, None]).reshape(len(factors), -1)
             kernel = fit_two_lengths(self.places, turned, self.length, kernel)
         return min(found, key=lambda each: each.error)
 
-    def waves(self, factors: np.ndarray) -> Alignment:
+    def refine_by_waves(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by waves from everywhere alike."""
         # An envelope of a thousand wavelengths is none within a site.
         waves = IsotropicWaves(1e3 * self.length, wavenumber=2 * math.pi / self.length)
-        weights = self._weights(Kernel((waves, WhiteNoise(WAVE_NOISE))))
-        factors = self._swept(factors, weights, WAVE_SWEEPS)
-        return Alignment(factors, self._error(factors, weights), "carrier")
+        weights = self._neighbour_weights(Kernel((waves, WhiteNoise(WAVE_NOISE))))
+        factors = self._sweep_factors(factors, weights, WAVE_SWEEPS)
+        return Alignment(factors, self._left_out_error(factors, weights), "carrier")
 
-    def _weights(self, kernel: Kernel) -> csr_array:
+    def _neighbour_weights(self, kernel: Kernel) -> csr_array:
         """Weights (n, n) of the neighbours of each row in what the others say of it."""
         index = cKDTree(self.places).query(self.places, k=min(NEIGHBOURS + 1, len(self.places)))[1]
         mine = index == np.arange(len(index))[:, None]
@@ -226,25 +230,25 @@ class _Rows:
         count, starts = len(near), np.arange(len(near) + 1) * near.shape[1]
         return csr_array((weight.ravel(), near.ravel(), starts), (count, count))
 
-    def _told(self, factors: np.ndarray, weights: csr_array) -> np.ndarray:
+    def _predict_left_out(self, factors: np.ndarray, weights: csr_array) -> np.ndarray:
         """Rows (n, A, K) as the others say."""
         turned = self.values * factors[:, None]
         return (weights @ turned.reshape(len(turned), -1)).reshape(turned.shape)
 
-    def _swept(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
+    def _sweep_factors(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
-            told = self._told(factors, weights)
+            told = self._predict_left_out(factors, weights)
             factors = align_factors(self.values, told, self.tones, self.freedom_of_phase)
         return factors
 
-    def _error(self, factors: np.ndarray, weights: csr_array) -> float:
-        told = self._told(factors, weights)
+    def _left_out_error(self, factors: np.ndarray, weights: csr_array) -> float:
+        told = self._predict_left_out(factors, weights)
         told = told * align_factors(told, self.values, self.tones, self.freedom)[:, None]
         missed = np.abs(self.values - told) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
 
 
-def _direct(rows: Snapshots, site: Site) -> np.ndarray | None:
+def _direct_wave(rows: Snapshots, site: Site) -> np.ndarray | None:
     """The direct wave (n, A, 1) where enough antennas at known places see one factor; None elsewhere."""
     if site.wavelength is None or rows.values.shape[1] < ANTENNAS or rows.places.shape[1] != 3:
         return None

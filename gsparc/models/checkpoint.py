@@ -92,8 +92,8 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     content = {
         "format": FORMAT, "version": VERSION, "config": config,
         "method": method.name, "target": import_path(method.stored_class),
-        "site": _plain(asdict(site), "site"), "state": _plain(method.state(), "state"),
-        "extra": _plain(dict(extra or {}), "extra"),
+        "site": _to_plain(asdict(site), "site"), "state": _to_plain(method.state(), "state"),
+        "extra": _to_plain(dict(extra or {}), "extra"),
     }  # fmt: skip
     _write(Path(path), content)
 
@@ -105,9 +105,9 @@ def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
         CheckpointError: as `read` and `save` do; the file is then as it was.
     """
     path = Path(path)
-    content = _content(path)
-    _stored(content, path)  # refuses what is incomplete
-    content["extra"] = {**content["extra"], **_plain(dict(extra), "extra")}
+    content = _read_content(path)
+    _stored_from_content(content, path)  # refuses what is incomplete
+    content["extra"] = {**content["extra"], **_to_plain(dict(extra), "extra")}
     _write(path, content)
 
 
@@ -134,10 +134,10 @@ def read(path: str | Path) -> Stored:
             that are NaN or infinite.
     """
     path = Path(path)
-    return _stored(_content(path), path)
+    return _stored_from_content(_read_content(path), path)
 
 
-def _content(path: Path) -> dict[str, Any]:
+def _read_content(path: Path) -> dict[str, Any]:
     """What the archive holds, of our format and of finite numbers (CheckpointError)."""
     if path.is_dir():
         inside = [*path.glob(MODEL), *sorted(path.glob(f"fold*/{MODEL}"))]
@@ -166,16 +166,16 @@ def _content(path: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: of version {version}, this gsparc reads {VERSION}; train again with it"
         )
-    if _overgrown(content):  # what walks over it would not end
+    if _exceeds_limits(content):  # what walks over it would not end
         raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")
     for part in ("site", "state"):
-        where = find_non_finite(_without_unknown_places(content.get(part)), part)
+        where = find_non_finite(_drop_unknown_places(content.get(part)), part)
         if where is not None:  # its checksum is right: it was written like this
             raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
     return content
 
 
-def _without_unknown_places(part: Any) -> Any:
+def _drop_unknown_places(part: Any) -> Any:
     """A site with 0 for NaN in places and sectors of stations: what nobody knows; else as it is."""
     stations = part.get("stations") if isinstance(part, Mapping) else None
     if not isinstance(stations, Mapping):
@@ -189,7 +189,7 @@ def _without_unknown_places(part: Any) -> Any:
     return {**part, "stations": {**stations, **known}}
 
 
-def _stored(content: Mapping[str, Any], path: Path) -> Stored:
+def _stored_from_content(content: Mapping[str, Any], path: Path) -> Stored:
     try:
         return Stored(
             method=str(content["method"]), target=str(content["target"]), config=str(content["config"]),
@@ -202,7 +202,7 @@ def _stored(content: Mapping[str, Any], path: Path) -> Stored:
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
     known = {f.name for f in fields(Site)}
-    values = {k: v for k, v in _as_numpy(facts).items() if k in known}
+    values = {k: v for k, v in _tensors_to_numpy(facts).items() if k in known}
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
     if values.get("stations") is not None:
@@ -215,14 +215,14 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
     return Site(**values)
 
 
-def _as_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
+def _tensors_to_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        k: v.numpy() if isinstance(v, Tensor) else _as_numpy(v) if isinstance(v, Mapping) else v
+        k: v.numpy() if isinstance(v, Tensor) else _tensors_to_numpy(v) if isinstance(v, Mapping) else v
         for k, v in facts.items()
     }
 
 
-def _overgrown(content: Any) -> bool:
+def _exceeds_limits(content: Any) -> bool:
     """Whether a container is in it twice or too deep, or a tensor has more numbers than are stored."""
     left, seen = [(content, 0)], set[int]()
     while left:
@@ -255,7 +255,7 @@ def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | 
     return next((result for result in each if result is not None), None)
 
 
-def _plain(value: Any, where: str) -> Any:
+def _to_plain(value: Any, where: str) -> Any:
     """The same value in types that weights-only unpickling accepts; views do not drag their storage along."""
     if value is None or type(value) in (bool, int, float, str, bytes):
         return value
@@ -263,13 +263,13 @@ def _plain(value: Any, where: str) -> Any:
         tensor = value.detach().contiguous()
         return tensor.clone() if tensor.untyped_storage().nbytes() > tensor.nbytes else tensor
     if isinstance(value, np.ndarray):
-        return _plain(torch.from_numpy(np.ascontiguousarray(value)), where)
+        return _to_plain(torch.from_numpy(np.ascontiguousarray(value)), where)
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):
-        return {_plain(k, where): _plain(v, f"{where}.{k}") for k, v in value.items()}
+        return {_to_plain(k, where): _to_plain(v, f"{where}.{k}") for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        items = [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
+        items = [_to_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
         return items if isinstance(value, list) else tuple(items)
     if isinstance(value, Path):
         return str(value)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 from torch import Tensor
@@ -38,6 +38,20 @@ class LeftOutRows:
     variance: Tensor
 
 
+class Moments(NamedTuple):
+    """Means of what is predicted, and variances (m,) after and before rows were learned from.
+
+    Attributes:
+        mean: any shape.
+        variance: of the prediction.
+        prior: the variance, or power, that is expected without any rows.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    prior: Tensor
+
+
 class ClosedForm(Method):
     """A method that can be conditioned on other rows, and predict rows from all others.
 
@@ -50,7 +64,7 @@ class ClosedForm(Method):
     forgets = False
 
     @property
-    def count(self) -> int:
+    def count_gaussians(self) -> int:
         """Number of Gaussians; 0 where a process is all there is."""
         return self.count_components()
 

@@ -73,7 +73,7 @@ def fit_or_resume(
         heeded.count_reads("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
-            return _restored(factory, data, fold, context, left / checkpoint.MODEL)
+            return _restore_fit(factory, data, fold, context, left / checkpoint.MODEL)
         # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
@@ -89,11 +89,11 @@ def fit_or_resume(
     return method, report
 
 
-def run_marks(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
+def run_extra(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
     """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
     report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
-    return {**report_fields, **Origin.from_fit(data, fold, context).marks()}
+    return {**report_fields, **Origin.from_fit(data, fold, context).to_extra()}
 
 
 def run_folder(path: Path, parts: str) -> Path:
@@ -104,7 +104,7 @@ def run_folder(path: Path, parts: str) -> Path:
     return next((one.parent for one in (inside, *inside.parents) if re.fullmatch(parts, one.name)), inside)
 
 
-def _restored(
+def _restore_fit(
     factory: MethodFactory, data: Measurements, fold: Fold, context: FitContext, file: Path
 ) -> tuple[Method, FitReport]:
     stored = checkpoint.read(file)
@@ -151,7 +151,7 @@ class Origin:
         auxiliary = content_hash({**directions, "uplink": data.uplink})
         return cls(data.site, auxiliary, hash_indices((fold,)), context.seed, context.config_yaml)
 
-    def marks(self) -> dict[str, Any]:
+    def to_extra(self) -> dict[str, Any]:
         """Return what a checkpoint has as `extra`; it holds the configuration itself."""
         return {"origin": {**self._hashes(), "seed": self.seed}}
 
@@ -171,24 +171,24 @@ class Origin:
             raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
         for name, group, what in _HASHED:
             if origin[name] != own[name]:
-                differing += _differences(before, now, (group,)) or [f"other {what}"]
+                differing += _list_differences(before, now, (group,)) or [f"other {what}"]
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
             facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
             differing += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
         if origin["seed"] != self.seed:
             differing.append(f"seed={origin['seed']} (here {self.seed})")
-        differing += _differences(before, now, DECIDING)
+        differing += _list_differences(before, now, DECIDING)
         if differing:
             raise ValueError(
                 f"ckpt_path={stored.path}: was trained with {list_first(differing)}: "
                 "go on with the same, or start again without ckpt_path"
             )
-        changed = _differences(before, now, CHANGEABLE)
+        changed = _list_differences(before, now, CHANGEABLE)
         if changed:
             log.warning("continuing from %s, which had %s", stored.path, list_first(changed))
 
 
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:
+def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:
     """`key=value (here other)` for every setting under `keys` that differs; none without a configuration."""
     if not before or not now:
         return []

@@ -15,8 +15,8 @@ from gsparc.data.schema import Measurements
 from gsparc.models.method import Method, import_path
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
-from gsparc.models.powers.own_terms import as_terms
-from gsparc.models.refined_places import errors_of
+from gsparc.models.powers.own_terms import to_terms
+from gsparc.models.refined_places import position_errors
 from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import EffectSettings, resolve_terms
@@ -102,13 +102,13 @@ class Gsparc(LearnsTogether):
         self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std, self._field = effects, position_std, field
-        self.own_terms = as_terms(terms)
+        self.own_terms = to_terms(terms)
 
     def create_for(self, data: Measurements) -> Method:
         """See `MethodFactory`; the log says what was chosen."""
         method = choose(data, self)
         if isinstance(method, ImageProcess):
-            errors_of(data, np.arange(len(data)), self.position_std, heeds=False)
+            position_errors(data, np.arange(len(data)), self.position_std, can_refine=False)
         log.info("%s is model=%s here", self.name, method.name)
         method.name = self.name
         return method

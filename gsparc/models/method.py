@@ -98,7 +98,7 @@ class MethodFactory(ABC):
             ValueError: this makes none of that class.
         """
 
-    def time_limit(self, site: Site, budget_s: float | None) -> str:
+    def describe_time_limit(self, site: Site, budget_s: float | None) -> str:
         """Say what ends a fit at a site before all that is counted; "" where nothing does."""
         return "" if budget_s is None else f"within {budget_s:g} s"
 
@@ -144,7 +144,7 @@ class Method(MethodFactory):
         return self.name
 
     @property
-    def made(self) -> str:
+    def description(self) -> str:
         """What was fitted, in words: under one name a method may be one thing here and another there."""
         return self.label
 
@@ -195,16 +195,16 @@ class Method(MethodFactory):
         return None
 
     def reduction_settings(self) -> tuple[str, ...]:
-        """Return names of the settings of `reduced` that mean something to what was fitted; here none."""
+        """Return names of the settings of `reduce` that mean something to what was fitted; here none."""
         return () if self.reducible is None else self.reducible.reduction_settings()
 
     def reduction_inputs(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return what must be known of training rows (n,) to reduce it; stored with the model."""
         return {} if self.reducible is None else self.reducible.reduction_inputs(data, rows)
 
-    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
+    def reduce(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """Return a method that answers with these settings; this one is left as it is."""
-        return self if self.reducible is None else self.reducible.reduced(settings, measured)
+        return self if self.reducible is None else self.reducible.reduce(settings, measured)
 
     def objects(self) -> SiteObjects:
         """Return what it found to stand in the site."""
@@ -215,7 +215,7 @@ class Method(MethodFactory):
         return {
             "model/num_gaussians": self.count_components() if self.has_gaussians else None,
             "model/class": type(self).__name__,
-            "model/made": self.made,
+            "model/made": self.description,
             "model/choices": None,
             "model/init": None,
             "model/steps": None,
@@ -235,16 +235,16 @@ def predict_in_batches(
     """
     order = np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
 
-    def asked() -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
+    def predict_batches() -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
         for start in range(0, len(rows), size):
             chosen = order[start : start + size]
             batch = data.batch(rows[chosen])
             yield chosen, batch, method.predict(batch)
 
     if data.site.freedom == "none":
-        yield from asked()
+        yield from predict_batches()
         return
-    told = list(asked())
+    told = list(predict_batches())
     moments, back = Snapshots.from_rows(data, rows), np.argsort(order)
     means = moments.arrange(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
     turns = align_factors(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
@@ -310,7 +310,7 @@ def predict_with_threads(method: Method, query: Query) -> Prediction:
 class Reconditions(Protocol):
     """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
 
-    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """Return a method of rows (n,) alone; None where more than settings would remember the others."""
 
 
@@ -349,11 +349,27 @@ class HasJoint(Protocol):
         ...
 
 
+class QueryPaths(NamedTuple):
+    """Paths to B places and A antennas of the moving end.
+
+    Attributes:
+        gain: (B, A, N) complex64 at the carrier, in stored units.
+        delay: (B, A, N) float64 [s].
+        unit: (B, N, 3) from the middle of the antennas to where a path comes from.
+        carrier_hz: of the gains [Hz].
+    """
+
+    gain: Tensor
+    delay: Tensor
+    unit: Tensor
+    carrier_hz: float
+
+
 @runtime_checkable
 class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> QueryPaths:
         """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival, the carrier [Hz].
 
         Raises:

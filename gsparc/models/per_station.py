@@ -32,7 +32,7 @@ from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
-from gsparc.models.powers.own_terms import over_stations
+from gsparc.models.powers.own_terms import combine_stations
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
 
 
-def by_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
+def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
     """Return what makes a method of all stations where there are several, else `factory` itself.
 
     Raises:
@@ -57,7 +57,7 @@ def by_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
     return factory
 
 
-def trained_stations(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
+def known_and_unheard(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
     """Return stations (T,) bool with training rows enough for `method`, and those of test rows without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
@@ -128,7 +128,7 @@ class PerStation(Method):
                 the method cannot take both ends for moving.
         """
         budget = context.time_budget()
-        numbers = self._numbers(data, fold, context)
+        numbers = self._station_numbers(data, fold, context)
         self.site, notes = data.site, list[str]()
         left = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
         resumable = self.factory.resumable and context.run_dir != Path()
@@ -138,7 +138,7 @@ class PerStation(Method):
         # In other processes stations run side by side: each may take all of the seconds.
         local = not uses_other_processes()
 
-        def fitted(turn: int) -> tuple[Method, FitReport]:
+        def fit_station(turn: int) -> tuple[Method, FitReport]:
             number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
             resume = None if left is None else left / folder
@@ -147,8 +147,8 @@ class PerStation(Method):
                 folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
             )
             if len(numbers) > 1:
-                log.info("station %d of %d: %s", turn + 1, len(numbers), self._name_of(number))
-            rows, part = self._part(data, number)
+                log.info("station %d of %d: %s", turn + 1, len(numbers), self._station_name(number))
+            rows, part = self._rows_and_measurements(data, number)
             # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             before = budget.by_clock.wall
@@ -161,27 +161,27 @@ class PerStation(Method):
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = fitting.run_marks(report, part, inner, own)
+                extra = fitting.run_extra(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             earlier = max(report.seconds - (budget.by_clock.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        fits = dict(run_each(fitted, range(len(numbers)), f"stations of {self.name}"))
+        fits = dict(run_each(fit_station, range(len(numbers)), f"stations of {self.name}"))
         reports = [fits[turn][1] for turn in range(len(numbers))]
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
-        learned = over_stations([note for one in heard for note in one.notes])
+        learned = combine_stations([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
-            name = "all stations" if numbers == [UNHEARD] else self._name_of(number)
+            name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
         limited = worst_clock(*(one.limited_by for one in reports))
         return FitReport(
             budget.by_clock.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())
         )
 
-    def _numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
+    def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.
 
         Raises:
@@ -199,7 +199,7 @@ class PerStation(Method):
         self._shared = together and joint
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
-        known, unheard = trained_stations(self.factory, data, fold)
+        known, unheard = known_and_unheard(self.factory, data, fold)
         names = list_first([stations.name[t] for t in np.flatnonzero(unheard)])
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
         if not together and unheard.any():
@@ -215,28 +215,28 @@ class PerStation(Method):
             )
         return numbers
 
-    def _name_of(self, number: int) -> str:
+    def _station_name(self, number: int) -> str:
         assert self.site is not None and self.site.stations is not None
         if number != UNHEARD:
             return self.site.stations.name[number]
         return "stations never heard"
 
-    def _part(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
+    def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""
         assert data.station is not None
         rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
-        return rows, data.subset(rows, self._site_of(data.site, number))
+        return rows, data.subset(rows, self._site_of_copy(data.site, number))
 
-    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; stations without rows among these are then as if never heard."""
         result = PerStation(self.factory)
         result.site, result._shared = data.site, self._shared
         for number, copy in self._copies.items():
-            own, part = self._part(data, number)
+            own, part = self._rows_and_measurements(data, number)
             chosen = np.flatnonzero(np.isin(own, rows))
             if len(chosen) < LEAST_ROWS:
                 continue
-            learned = copy.reconditioned(part, chosen) if isinstance(copy, Reconditions) else None
+            learned = copy.copy_conditioned(part, chosen) if isinstance(copy, Reconditions) else None
             # One copy that cannot, and the whole would answer from rows that were to be forgotten.
             if learned is None:
                 return None
@@ -247,11 +247,11 @@ class PerStation(Method):
         """See `Method.predict`; by each station's copy."""
         if self._shared:
             return self._copies[UNHEARD].predict(query)
-        stations = self._stations(query) if query.station is None else query.station
+        stations = self._stations_of_query(query) if query.station is None else query.station
         answers: list[tuple[Tensor, Prediction]] = []
         for number in stations.unique().tolist():
-            chosen, copy = (stations == number).nonzero()[:, 0], self.copy_for(number)
-            answers.append((chosen, copy.predict(_seen_by(copy.site, query.rows(chosen)))))
+            chosen, copy = (stations == number).nonzero()[:, 0], self.station_method(number)
+            answers.append((chosen, copy.predict(_to_station_query(copy.site, query.rows(chosen)))))
         # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
         return Prediction.joined(parts, torch.argsort(torch.cat(rows)))
@@ -260,7 +260,7 @@ class PerStation(Method):
         """See `Method.gradient_problem`; that of any copy."""
         return next(filter(None, (copy.gradient_problem() for copy in self._copies.values())), None)
 
-    def copy_for(self, number: int) -> Method:
+    def station_method(self, number: int) -> Method:
         """Return the copy that answers for a station.
 
         Raises:
@@ -278,11 +278,11 @@ class PerStation(Method):
         stations = None if self.site is None else self.site.stations
         return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
-    def _site_of(self, site: Site, number: int) -> Site:
+    def _site_of_copy(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
         return site if number == UNHEARD and self.factory.learns_jointly(site) else station_site(site, number)
 
-    def _stations(self, query: Query) -> Tensor:
+    def _stations_of_query(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
         # One pose may stand for all rows.
@@ -312,7 +312,7 @@ class PerStation(Method):
         for number, part in state["per_station"].items():
             self._copies[int(number)] = copy = self.factory.create_as(part["target"])
             copy.name = self.name
-            copy.restore(self._site_of(site, int(number)), part["state"])
+            copy.restore(self._site_of_copy(site, int(number)), part["state"])
 
     def objects(self) -> SiteObjects:
         """Return those of all copies: what stands in a site stands there for all its stations."""
@@ -329,7 +329,7 @@ class PerStation(Method):
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
             return super().facts()
-        return {name: _over([one[name] for one in result], name) for name in result[0]}
+        return {name: _combine_facts([one[name] for one in result], name) for name in result[0]}
 
     def __iter__(self) -> Iterator[tuple[int, Method]]:
         return iter(self._copies.items())
@@ -372,9 +372,9 @@ class AllStationsView(OneStationView):
         return Prediction(said.mean.view(-1, self.count), variance)
 
 
-def _over(values: list[Any], name: str) -> float | int | str | None:
+def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
     """A fact of all copies."""
-    known = [value for value in values if value is not None]
+    known = [value for value in facts if value is not None]
     if not known:
         return None
     if isinstance(known[0], str):
@@ -383,7 +383,7 @@ def _over(values: list[Any], name: str) -> float | int | str | None:
     return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
 
 
-def _seen_by(site: Site | None, query: Query) -> Query:
+def _to_station_query(site: Site | None, query: Query) -> Query:
     """Rows of one station as its copy sees them: one pose where the receiver is the station, no number."""
     assert site is not None
     if site.stations is not None:

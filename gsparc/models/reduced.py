@@ -25,7 +25,7 @@ Measured = dict[str, Tensor]
 
 def reduce_method(method: Method, settings: Settings, measured: Measured) -> Method:
     """Return the method with `settings`; itself when there are none."""
-    return method.reduced(settings, measured) if settings else method
+    return method.reduce(settings, measured) if settings else method
 
 
 def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> Iterator[dict[str, Any]]:
@@ -36,7 +36,7 @@ def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> I
     known = method.reduction_settings()
     axes = {knob: values for knob, values in grid.items() if knob in known and values is not None}
     if "stride" in axes:
-        axes["stride"] = _dividing(axes["stride"], method)
+        axes["stride"] = _dividing_strides(axes["stride"], method)
     together = [
         # A setting as trained changes nothing: dropped, so that equal combinations are seen to be equal.
         {k: v for k, v in zip(axes, chosen, strict=True) if AS_TRAINED.get(k) != v}
@@ -49,7 +49,7 @@ def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> I
             yield settings
 
 
-def _dividing(strides: Sequence[int], method: Method) -> list[int]:
+def _dividing_strides(strides: Sequence[int], method: Method) -> list[int]:
     grid = None if method.site is None else method.site.grid
     if grid is None:
         return list(strides)
@@ -87,7 +87,7 @@ class View(Method):
         """Return the inner method's."""
         return self.inner.objects()
 
-    def fit(self, *unused: Any, **named: Any) -> NoReturn:
+    def fit(self, *unused: Any, **options: Any) -> NoReturn:
         """Refused: `TypeError`."""
         raise TypeError("a view of a trained method is neither trained nor stored")
 

@@ -44,20 +44,22 @@ class Linearised:
     variance: Tensor
 
 
-def errors_of(data: Measurements, known: np.ndarray, asked: float | None, heeds: bool) -> np.ndarray | None:
+def position_errors(
+    data: Measurements, rows: np.ndarray, position_std: float | None, can_refine: bool
+) -> np.ndarray | None:
     """Return errors (n,) of all rows' coordinates [m]; None where no known row has one, or none is heeded.
 
     Args:
         data: says errors where nobody asks.
-        known: rows (n,) that are learned from.
-        asked: of every coordinate [m].
-        heeds: whether what is fitted can place rows anew; where not, a warning says so.
+        rows: rows (n,) that are learned from.
+        position_std: of every coordinate [m].
+        can_refine: whether what is fitted can place rows anew; where not, a warning says so.
     """
     with heeded.set_apart():
-        std = data.position_std if asked is None else np.full(len(data), asked)
-    if std is None or not std[known].any():
+        std = data.position_std if position_std is None else np.full(len(data), position_std)
+    if std is None or not std[rows].any():
         return None
-    if heeds:
+    if can_refine:
         heeded.count_reads("model.position_std")
         return std
     what = "channels with phases of the carrier and powers, of one end that moves"
@@ -105,7 +107,7 @@ def refine_places(
         std: (S,) [m] standard deviations of each coordinate.
     """
     try:
-        rows, seen = _linearised(field, data)
+        rows, seen = _linearise(field, data)
     except ValueError as error:
         none = np.zeros(0, np.int64)
         return none, data.moving[none], f"position_std is not used: {error}"
@@ -118,7 +120,7 @@ def refine_places(
     return rows, moved.numpy()[place], f"{note}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
 
 
-def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linearised]:
+def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linearised]:
     """Rows (n,) that the field was conditioned on, about their places.
 
     Raises:
@@ -135,7 +137,7 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
             return replace(batch, tx=places, rx=Pose(batch.rx.position.double(), turned))
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
-    def mean(places: Tensor) -> Tensor:
+    def predict_entries(places: Tensor) -> Tensor:
         return to_real_entries(in_error_unit(field.predict(batch_at(places)).mean, site))
 
     with torch.no_grad():
@@ -154,13 +156,13 @@ def _linearised(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Line
     if batch.mask is not None:
         spread = torch.where(batch.mask.flatten(1).repeat_interleave(parts, 1), spread, math.inf)
     axes = torch.eye(moving.shape[1]).to(moving)[:, None].expand(-1, *moving.shape).contiguous()
-    slope = [torch.func.jvp(mean, (moving,), (axis,))[1].detach() for axis in axes]
+    slope = [torch.func.jvp(predict_entries, (moving,), (axis,))[1].detach() for axis in axes]
     return left.rows, Linearised(residual, torch.stack(slope, -1), spread)
 
 
-def move_rows(data: Measurements, rows: np.ndarray, by: np.ndarray) -> Measurements:
+def move_rows(data: Measurements, rows: np.ndarray, offsets: np.ndarray) -> Measurements:
     """Return the moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
     name = "tx" if data.site.moving_end == "tx" else "rx_position"
     moved = getattr(data, name).copy()
-    moved[rows] += by
+    moved[rows] += offsets
     return replace(data, **{name: moved})

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # brings torch, which a list of choices does not need
 
 
 @cache
-def methods() -> dict[str, str]:
+def built_in_methods() -> dict[str, str]:
     """Return import paths of the methods of `conf/model`, by name."""
     files = (file for file in resources.files("gsparc.conf").joinpath("model").iterdir() if file.is_file())
     nodes = {file.name: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
@@ -38,13 +38,13 @@ def methods() -> dict[str, str]:
 
 def all_methods() -> dict[str, str]:
     """Return import paths of all methods by name: `methods()` and what plugins bring."""
-    return plugins("model") | methods()
+    return plugins("model") | built_in_methods()
 
 
 def method_class(name: str) -> type[MethodFactory]:
     """Return what makes the method `name`; `ValueError` with the nearest right name if there is none."""
-    if name in methods():  # before plugins, whose entry points take milliseconds to read
-        return get_class(methods()[name])
+    if name in built_in_methods():  # before plugins, whose entry points take milliseconds to read
+        return get_class(built_in_methods()[name])
     there = all_methods()
     if name not in there:
         raise ValueError(f"no method is called {name!r}{suggest_or_list(name, there)}")

@@ -49,17 +49,17 @@ class RelativeErrorRegression(Stored):
     largest: float
     smearing: float
 
-    def expected(self, columns: Tensor) -> Tensor:
+    def expected_error(self, columns: Tensor) -> Tensor:
         """Return the expected relative error |e|^2 / |h|^2 (m,) at columns (m, S)."""
         standard = (columns.clamp(self.low, self.high) - self.centre) / self.scale
-        logarithm = self.intercept + _quadratic(standard) @ self.weights
+        logarithm = self.intercept + _add_products(standard) @ self.weights
         return self.smearing * logarithm.clamp(self.least, self.largest).exp()
 
     @classmethod
     def from_rows(cls, columns: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
         """Fit to columns (n, S) float32, and |e|^2 / |h|^2 (n,) of rows that a fit did not see; n > 1."""
         centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(LEAST_SCALE)
-        terms = _quadratic((columns - centre) / scale).double().numpy()
+        terms = _add_products((columns - centre) / scale).double().numpy()
         target = relative_error.clamp_min(LEAST_ERROR).log().double().numpy()
         model = RidgeCV(RIDGES).fit(terms, target)
         # What is regressed goes anywhere beyond its data: answers stay within what training saw.
@@ -73,7 +73,7 @@ class RelativeErrorRegression(Stored):
         )  # fmt: skip
 
 
-def _quadratic(x: Tensor) -> Tensor:
+def _add_products(x: Tensor) -> Tensor:
     """Columns (n, S) and their products, (n, S + S (S + 1) / 2)."""
     first, second = torch.triu_indices(x.shape[1], x.shape[1])
     return torch.cat([x, x[:, first] * x[:, second]], 1)

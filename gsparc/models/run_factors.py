@@ -53,7 +53,7 @@ class RunFactors(Stored):
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
         return torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
 
-    def restore_run(self, answer: Prediction, run: Tensor | None) -> Prediction:
+    def apply_factors(self, answer: Prediction, run: Tensor | None) -> Prediction:
         """Return a prediction for the largest run in the phase and level of rows of runs (B,)."""
         if run is None or len(self) == 1:
             return answer
@@ -63,7 +63,7 @@ class RunFactors(Stored):
         explained = None if answer.explained is None else answer.explained * factor
         return replace(answer, mean=answer.mean * factor, variance=variance, explained=explained)
 
-    def align_channels(self, data: Measurements) -> Measurements:
+    def remove_factors(self, data: Measurements) -> Measurements:
         """Return the channels in the phase and level of the largest run, as of one run."""
         if data.run is None or len(self) == 1:
             return data
@@ -82,10 +82,10 @@ def fit_run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) ->
         run: (n,) int, numbers 0 to runs - 1, each of which occurs.
     """
     count = np.bincount(run)
-    return best_run_factors(run_quadratic(inverse, target, run), target.shape[1] * count)
+    return best_run_factors(factor_matrix(inverse, target, run), target.shape[1] * count)
 
 
-def run_quadratic(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
+def factor_matrix(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return M (runs, runs) complex128 of the module's text, of arguments as in `fit_run_factors`."""
     member = np.eye(int(run.max()) + 1)[run]
     return member.T @ (inverse * (target.conj() @ target.T)) @ member

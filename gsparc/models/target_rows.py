@@ -53,7 +53,7 @@ def decibels(power: Tensor) -> Tensor:
     return 10 * power.clamp_min(TINY_POWER).log10()
 
 
-def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
+def to_targets(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
     """Return float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
     if kind == "csi":
         return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
@@ -61,7 +61,7 @@ def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
     return (10 ** (rows / 10)) if kind == "rssi" else rows.clamp(0.0, 1.0)
 
 
-def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
+def to_entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry.
 
     Complex entries hold two real numbers; decibels are carried to linear power to first order.

@@ -60,11 +60,11 @@ class Terms:
 
 
 def resolve_terms(
-    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, distant: bool
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, falls: bool
 ) -> Terms:
     """Return the terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
 
-    `distant`: whether emissions fall with the distance, which makes them no linear read-out of an array.
+    `falls`: whether emissions fall with the distance, which makes them no linear read-out of an array.
 
     Raises:
         ValueError: a term that is asked for means nothing here.
@@ -73,7 +73,7 @@ def resolve_terms(
     networks = f"emission.hidden={hidden}" if hidden else None
     placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
     request = networks or placed  # asks for Gaussians that are rendered
-    distance = distant and init.name != "vectors"
+    distance = falls and init.name != "vectors"
     obstacles = {
         "array": array_obstacle(site, "rx", "the receiver moves")
         or (networks and f"{networks} asks for networks")
@@ -106,7 +106,7 @@ def resolve_terms(
 
 def _refuse_scene(
     data: Measurements, switches: EffectSettings, obstacles: dict[str, str | None], on: dict[str, bool],
-    count: int,
+    count: int
 ) -> None:  # fmt: skip
     """`ValueError` where known walls explain nothing."""
     site, why = data.site, None

@@ -137,14 +137,14 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
         return method.predict(query).mean * site.target_scale
     wanted = torch.from_numpy(np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64)))
     assert query.uplink is not None
-    return _require_paths(method).from_uplink_at(query.uplink, wanted).mean * site.target_scale
+    return _require_paths(method).predict_from_uplink(query.uplink, wanted).mean * site.target_scale
 
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """Return the sources of uplinks (B, U, L), physical units; see `uplink_query`."""
     query = uplink_query(method, site, uplink)
     assert query.uplink is not None and site.uplink_hz is not None
-    sources = _require_paths(method).sources(query.uplink)
+    sources = _require_paths(method).find_sources(query.uplink)
     # Delays of sources are in turns per tone: over the spacing they are seconds.
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
     gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()

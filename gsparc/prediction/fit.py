@@ -18,7 +18,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint, fitting
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -81,7 +81,7 @@ def fit(
         raise ValueError(
             f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
         )
-    factory = by_station(kind(**own), data)
+    factory = wrap_per_station(kind(**own), data)
     fold = _split_validation(data, VALIDATED if factory.takes_budget else 0.0, seed)
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
     method, report = fitting.fit_or_resume(factory, data, fold, context)

@@ -112,7 +112,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
         method, whole = (
-            one.copy_for(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
+            one.station_method(number) if isinstance(one, PerStation) else one
+            for one in (self.method, self._whole)
         )
         return self._copy_with(method, whole, station_site(self.site, number), self._unit)
 

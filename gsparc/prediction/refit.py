@@ -13,7 +13,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory, Reconditions
-from gsparc.models.per_station import PerStation, by_station, trained_stations
+from gsparc.models.per_station import PerStation, known_and_unheard, wrap_per_station
 from gsparc.training.context import FitContext
 
 
@@ -45,7 +45,7 @@ class Learned:
 
     def refit(self, fold: Fold, context: FitContext) -> Method:
         """Return the method fitted anew on a fold."""
-        return fitting.fit_or_resume(by_station(self.factory, self.data), self.data, fold, context)[0]
+        return fitting.fit_or_resume(wrap_per_station(self.factory, self.data), self.data, fold, context)[0]
 
     def unlearn(self, fold: Fold, split: SplitSettings | None = None) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
@@ -54,7 +54,7 @@ class Learned:
         """
         if isinstance(self.method, Reconditions):
             known = np.sort(np.concatenate([fold.train, fold.val]))
-            less = self.method.reconditioned(self.data, known)
+            less = self.method.copy_conditioned(self.data, known)
             if less is not None:
                 return less
         # Nobody goes on from this fit: its checkpoints and curves go with the folder.
@@ -67,6 +67,6 @@ class Learned:
         if not isinstance(self.method, PerStation):
             return fold
         # A station that was fitted on all rows may have too few of them in a fold.
-        known, _ = trained_stations(self.method.factory, self.data, fold)
+        known, _ = known_and_unheard(self.method.factory, self.data, fold)
         assert self.data.station is not None
         return replace(fold, test=fold.test[known[self.data.station[fold.test]]])

@@ -20,12 +20,12 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.models.method import MethodFactory
-from gsparc.models.registry import build, methods
+from gsparc.models.registry import build, built_in_methods
 
 CONF = Path(gsparc.conf.__path__[0])
 GROUPS = ("dataset", "split", "trainer", "callbacks", "logger")  # of train.yaml
 CHOICES = [sorted(f"{group}={file.stem}" for file in (CONF / group).glob("*.yaml")) for group in GROUPS]
-CHOICES += [[f"model={name}" for name in methods()]]
+CHOICES += [[f"model={name}" for name in built_in_methods()]]
 OWN = ["dataset=own", "dataset.file=x.npz"]
 NEEDED = {"dataset=own": OWN[1:], "dataset=newrf": OWN[1:], "split=file": ["split.path=split.json"]}
 

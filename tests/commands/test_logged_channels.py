@@ -31,7 +31,7 @@ def test_a_default_run_is_ahead_of_every_plain_method(logged, tmp_path):
     assert facts["test/nmse_aligned"] < 0.05 and facts["test/tone_rmse_db"] < 2.6  # at random, seed 0
     for name in ("mean", "nearest", "idw"):
         assert facts["test/nmse_aligned"] < facts[f"baseline/{name}/nmse_aligned"]
-    assert facts["test/nmse_scalar"] is not None and "aligned" in objects.methods[0].made
+    assert facts["test/nmse_scalar"] is not None and "aligned" in objects.methods[0].description
     predictor = gsparc.load(tmp_path / "model.ckpt")
     assert predictor.known == "up to a phase and a delay of each row"
     with pytest.raises(ValueError, match="to=taps: channels are known up to a phase and a delay"):

@@ -20,7 +20,7 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.answers import predict_file
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.models import checkpoint
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -32,7 +32,7 @@ def fitted(arrays, folder, name="gp", skip=()):
     """A model of arrays of the schema, stored and loaded; rows `skip` are not learned from."""
     data = from_arrays(arrays)
     rows = np.setdiff1d(np.arange(len(data)), skip)
-    method = by_station(method_class(name)(), data)
+    method = wrap_per_station(method_class(name)(), data)
     method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(folder))
     checkpoint.save(folder / "model.ckpt", method)
     return gsparc.load(folder / "model.ckpt")
@@ -189,7 +189,7 @@ def test_stations_at_unknown_places(tmp_path):
     assert [NAMES[t] for t in same.station[:3]] == ["mast", "roof-1", "roof-0"]
     data = from_arrays(arrays)
     rows = np.arange(len(data))
-    method = by_station(method_class("gp")(), data)
+    method = wrap_per_station(method_class("gp")(), data)
     with pytest.raises(ValueError, match="places of stations are unknown, it needs them; say stations=each"):
         method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(tmp_path, stations="together"))
     heard, name = rows[data.station[rows] != 1], data.site.stations.name[1]

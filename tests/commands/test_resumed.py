@@ -73,7 +73,7 @@ def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, w
     fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
     before, now = (Origin.from_fit(d, fold, FitContext()) for d in (data, change(data)))
     stored = checkpoint.read(halfway.checkpoints[0].with_name("last.ckpt"))
-    stored = replace(stored, config="", extra=before.marks())
+    stored = replace(stored, config="", extra=before.to_extra())
     before.require_same(stored)
     with pytest.raises(ValueError, match=f"was trained with {what}: go on"):
         now.require_same(stored)

@@ -14,7 +14,7 @@ from gsparc.data.tables.read import parse_table
 from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
 from gsparc.evaluation.scores import score_methods
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -36,7 +36,7 @@ def town(chosen=(0, 1, 2), **changes):
 def test_stations_in_another_order_were_answered_by_each_other(chosen):
     """One file lists the stations of a model in another order, or some of them: 31 dB off without a word."""
     data, other = town(), town(chosen)
-    method = by_station(method_class("idw")(), data)
+    method = wrap_per_station(method_class("idw")(), data)
     method.fit(data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext())
     same = align_to_site(other, data.site)
     assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]

@@ -128,6 +128,20 @@ def test_rows_that_were_learned_from_were_shown_like_unseen_ones(prefix):
     assert "eval_on=test" in remarks(facts, prefix)[0]
 
 
+def test_a_baseline_was_better_by_chance_or_by_nothing():
+    """At 1.42 against 1.42 dB a baseline had the better figure; 28.91 against 29.13 dB was no word."""
+    facts = {"dataset/kind": "rssi", "model/label": "gsparc", "test/rmse_db": 1.42}
+    facts |= {"baseline/gp/rmse_db": 1.42, "baseline/gp/ahead_db": 0.0, "baseline/gp/ahead_error_db": 0.0}
+    facts["baseline/gp/ahead_pairs"] = "24 test rows"
+    assert remarks(facts) == ["the baseline gp and gsparc have the same rmse_db over 24 test rows"]
+    assert remarks({**facts, "baseline/gp/ahead_db": -0.22, "baseline/gp/ahead_error_db": 0.14}) == [
+        "the baseline gp and gsparc do not differ in rmse_db (gsparc +0.22 ± 0.14 dB over 24 test rows)"
+    ]
+    ((said),) = remarks({**facts, "baseline/gp/ahead_db": 0.3, "baseline/gp/ahead_error_db": 0.1})
+    assert "(+0.30 ± 0.10 dB over 24 test rows): the better choice" in said
+    assert remarks({**facts, "baseline/gp/ahead_db": -0.3, "baseline/gp/ahead_error_db": 0.1}) == []
+
+
 def test_a_report_of_an_installed_wheel_was_made_at_commit_none():
     assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program_version({"git": None}))
     assert program_version({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")

@@ -26,7 +26,7 @@ class Interrupt(L.Callback):
 
 def run(tmp_path, *callbacks, steps: int = 20, overrides: tuple[str, ...] = (), **more):
     file, made = spectra(tmp_path / "own.npz"), {"callbacks": lambda: list(callbacks), "every": 5}
-    return trained(file, tmp_path / "run", steps, *overrides, **made, **more)[0].fitted().state_dict()
+    return trained(file, tmp_path / "run", steps, *overrides, **made, **more)[0].fitted_model().state_dict()
 
 
 @pytest.fixture(scope="module")

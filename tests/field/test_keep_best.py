@@ -43,7 +43,7 @@ def test_steps_that_pay_are_kept_and_a_resumed_run_keeps_the_same(measured, tmp_
     whole = fitted(measured, tmp_path / "whole", every=10)
     assert whole.steps >= 10 and held_out(whole, measured) < 0.9 * held_out(before, measured)
     again = fitted(measured, tmp_path / "again", every=10, resume=tmp_path / "whole" / "last.ckpt")
-    first, second = whole.fitted().state_dict(), again.fitted().state_dict()
+    first, second = whole.fitted_model().state_dict(), again.fitted_model().state_dict()
     same = [np.allclose(a, second[key]) for key, a in first.items() if isinstance(a, torch.Tensor)]
     assert all(same) and again.steps == whole.steps
 

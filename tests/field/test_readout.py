@@ -18,7 +18,7 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     data, fold = loaded(file)
     method = build(compose(*brief(file, "init=images", *more)).model).create_for(data)
     method.fit(data, fold, short(tmp_path, 0))
-    model, batch = method.fitted(), data.batch(fold.train[:8])
+    model, batch = method.fitted_model(), data.batch(fold.train[:8])
     densify = Densify(grad_threshold=0.5)
     densify.statistics = densify._zero_statistics(model)
     densify.statistics["gradient"][::20], densify.statistics["seen"] = 1.0, torch.ones(len(model.gaussians))
@@ -40,4 +40,4 @@ def test_emissions_of_networks_are_not_solved_again(tmp_path):
     data, fold = loaded(file)
     method = build(compose(*brief(file, "model.emission.hidden=4")).model).create_for(data)
     method.fit(data, fold, short(tmp_path, 1))
-    assert solve_readout(method.fitted(), None, data.batch(fold.train[:2])) is None
+    assert solve_readout(method.fitted_model(), None, data.batch(fold.train[:2])) is None

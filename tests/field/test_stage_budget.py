@@ -75,7 +75,7 @@ def test_a_field_whose_second_stage_was_cut_could_not_be_read_back(tmp_path, mon
     report = fitted(tmp_path, monkeypatch, 0.0, 0.0, budget_s=40.0, budget_clock="processor")
     assert report.limited_by == "processor"
     method, _ = loading.load(tmp_path / "model.ckpt")
-    assert len(method.fitted().gaussians) == 40
+    assert len(method.fitted_model().gaussians) == 40
 
 
 def test_a_run_that_seconds_ended_goes_on_without_them_to_its_end(tmp_path, monkeypatch):

@@ -28,7 +28,7 @@ def fitted(folder, autocast: bool) -> tuple[torch.Tensor, torch.Tensor]:
         batch = data.batch(np.arange(8))
         mean = method.predict(batch).mean
     assert mean.dtype == torch.float32 and mean.isfinite().all()
-    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in method.fitted().parameters())
+    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in method.fitted_model().parameters())
     return mean, batch.target
 
 

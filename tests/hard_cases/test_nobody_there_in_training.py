@@ -29,7 +29,7 @@ PRUNE = (
 def test_pruning_stops_at_the_floor(tmp_path):
     facts, objects = train(compose(*brief(spectra(tmp_path / "own.npz"), *PRUNE)), tmp_path / "run")
     assert facts["model/num_gaussians"] == 5 and np.isfinite(facts["test/psnr_db"])
-    opacities = objects.methods[0].fitted().gaussians.opacities
+    opacities = objects.methods[0].fitted_model().gaussians.opacities
     assert (opacities < 2.0).all()
 
 
@@ -55,4 +55,4 @@ def test_nobody_is_seen(tmp_path):
     method, data = trained(file, tmp_path, 10, "init=sphere", callbacks=lambda: [Sink()])
     batch = data.batch(np.arange(4))
     assert (method.predict(batch).mean == 0).all()
-    assert all(p.isfinite().all() for p in method.fitted().parameters())
+    assert all(p.isfinite().all() for p in method.fitted_model().parameters())

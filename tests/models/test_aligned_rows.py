@@ -99,13 +99,13 @@ def test_stations_that_are_missing_took_the_places_of_others():
     )  # fmt: skip
     away = np.linalg.norm(np.ones(3) - stations.position[1:], axis=1)
     expected = np.exp(-2j * np.pi / site.wavelength * away)
-    assert np.allclose(aligned_rows._direct(rows, site)[0, :, 0], expected)
+    assert np.allclose(aligned_rows._direct_wave(rows, site)[0, :, 0], expected)
 
 
 def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
     fold = packets.shares(logged, 0)
     method, _ = fitting.fit_or_resume(Gsparc(position_std=0.001), logged, fold, FitContext())
-    assert "position_std is not used" in caplog.text and method.made.startswith("aligned")
+    assert "position_std is not used" in caplog.text and method.description.startswith("aligned")
 
 
 def test_another_file_is_scored_after_the_freedom_of_the_model(logged):

@@ -94,7 +94,7 @@ def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
     report = method.fit(data, fold, context)
     checkpoint.save(
-        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.run_marks(report, data, fold, context)
+        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.run_extra(report, data, fold, context)
     )
     again, found = fitting.fit_or_resume(
         PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0")

@@ -27,7 +27,7 @@ from gsparc.models.method import Method
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.methods import Powers
-from gsparc.models.per_station import PerStation, by_station
+from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.registry import build, method_class
 from gsparc.models.splat.image_process import ImageProcess
 from gsparc.ops import Pose
@@ -83,7 +83,9 @@ def fit(
     try:
         context = short(folder, steps, validate_every=4, budget_s=seconds, budget_clock="processor", **more)
         began = time.process_time()
-        method, report = fitting.fit_or_resume(by_station(build(config.model), data), data, fold, context)
+        method, report = fitting.fit_or_resume(
+            wrap_per_station(build(config.model), data), data, fold, context
+        )
         spent = (time.process_time() - began) / torch.get_num_threads()
     finally:
         logger.removeHandler(kept)
@@ -218,7 +220,7 @@ def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_pat
     fitted = fit("channels", *few, budget_s=1e3)
     field = fitted.method
     assert sum(field.weights) == pytest.approx(1)
-    assert fitted.method.facts()["model/init"] == "diffuse+sources" and field.count
+    assert fitted.method.facts()["model/init"] == "diffuse+sources" and field.count_gaussians
     assert {"phase", "residual"} <= set(fitted.method.effects.split("+"))
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")

@@ -22,7 +22,7 @@ from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint, loading
 from gsparc.models.fitting import fit_or_resume
-from gsparc.models.per_station import PerStation, by_station, station_site, trained_stations
+from gsparc.models.per_station import PerStation, known_and_unheard, station_site, wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext
@@ -35,7 +35,7 @@ def town():
 
 
 def fitted(name, data, fold, folder=Path()):
-    method = by_station(method_class(name)(), data)
+    method = wrap_per_station(method_class(name)(), data)
     method.fit(data, fold, FitContext(folder))
     return method
 
@@ -102,7 +102,7 @@ def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_t
 
 def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
     fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
-    method = by_station(method_class("mean")(), town)
+    method = wrap_per_station(method_class("mean")(), town)
     method.fit(town, fold, FitContext(tmp_path, stations="together"))
     assert len(dict(method)) == 1 and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
     with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
@@ -112,9 +112,9 @@ def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
 def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
     walk = walked(40)
     data = from_arrays({"tx_position": walk, "rx_position": walk[::-1] + 1, "rssi_db": -walk[:, 0]})
-    assert by_station(method_class("idw")(), data).both_ends
+    assert wrap_per_station(method_class("idw")(), data).both_ends
     with pytest.raises(ValueError, match="both ends move here"):
-        by_station(method_class("array")(), data)
+        wrap_per_station(method_class("array")(), data)
 
 
 def test_a_station_that_heard_nothing_ended_the_run():
@@ -129,9 +129,9 @@ def test_rows_where_nothing_was_heard_did_not_count_for_gsparc():
     """It learns from them, as the processes do that it is compared with, of which a station had none."""
     data = heard(rssi_db=lambda far: free_space(far) - [40, 40, np.nan, 40], sensitivity_db=-80.0)
     for name in ("gsparc", "powers", "gp"):
-        assert trained_stations(method_class(name)(), data, fold_of(data))[0].all()
+        assert known_and_unheard(method_class(name)(), data, fold_of(data))[0].all()
     context = FitContext(stations="each", effort=0.1)
-    method, _ = fit_or_resume(by_station(method_class("gsparc")(), data), data, fold_of(data), context)
+    method, _ = fit_or_resume(wrap_per_station(method_class("gsparc")(), data), data, fold_of(data), context)
     assert method.predict(data.batch(fold_of(data).test)).mean.isfinite().all()
 
 
@@ -154,7 +154,7 @@ def test_the_place_of_a_single_station_was_sought():
     for end in ("tx", "rx"):
         data = heard(posts=POSTS[1:2], end=end)
         np.testing.assert_allclose(data.site.static_position + data.site.origin, POSTS[1])
-        fold, method = fold_of(data), by_station(method_class("distance_law")(), data)
+        fold, method = fold_of(data), wrap_per_station(method_class("distance_law")(), data)
         notes = method.fit(data, fold, FitContext()).notes
         assert len(notes) == 1 and "exponent 2" in notes[0]
         assert data.batch(fold.test).rx.batched == (end == "rx")
@@ -191,8 +191,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
 
 
 def test_seconds_of_stations_were_said_to_be_unused(town):
-    assert by_station(method_class("gsparc")(), town).takes_budget
-    assert not by_station(method_class("idw")(), town).takes_budget
+    assert wrap_per_station(method_class("gsparc")(), town).takes_budget
+    assert not wrap_per_station(method_class("idw")(), town).takes_budget
 
 
 def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
@@ -205,7 +205,7 @@ def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path
             return super().fit(data, fold, context)
 
     for context in (FitContext(), FitContext(tmp_path)):
-        by_station(Writes(), town).fit(town, fold, context)
+        wrap_per_station(Writes(), town).fit(town, fold, context)
     assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders
 
 
@@ -222,8 +222,8 @@ def test_a_station_at_an_unknown_place_answered_for_all(town, fold, tmp_path):
     """The distance to it was NaN, and the least of every row."""
     method = fitted("mean", town, fold, tmp_path)
     places = np.array(town.site.stations.position)
-    expected = method._stations(town.batch(fold.test))
+    expected = method._stations_of_query(town.batch(fold.test))
     places[1] = np.nan
     method.site = replace(town.site, stations=replace(town.site.stations, position=places))
     rows = fold.test[expected.numpy() != 1]
-    assert (method._stations(town.batch(rows)) == expected[expected != 1]).all()
+    assert (method._stations_of_query(town.batch(rows)) == expected[expected != 1]).all()

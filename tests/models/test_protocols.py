@@ -30,11 +30,11 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, suitable_threads
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import by_station
-from gsparc.models.registry import build, method_class, methods
+from gsparc.models.moving_array.triangulate import BearingSearchSettings
+from gsparc.models.per_station import wrap_per_station
+from gsparc.models.registry import build, built_in_methods, method_class
 from gsparc.models.splat.array import ArrayField
-from gsparc.models.uplink.search import SearchSettings as UplinkSearch
+from gsparc.models.uplink.search import UplinkSearchSettings as UplinkSearch
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -80,7 +80,7 @@ def unfitted(name: str) -> MethodFactory:
         few = ("init.searches=1", "init.search_rows=60", "init.max_sources=4")
         return build(compose(f"model={name}", *few).model)
     if name == "moving_array":
-        search = SearchSettings(sources=8, rows=30, candidates=1000, steps=20)
+        search = BearingSearchSettings(sources=8, rows=30, candidates=1000, steps=20)
         return MovingArrayField(search=search, components=32)
     return method_class(name)(**{**SMALL, **UPLINK}.get(name, {}))
 
@@ -146,7 +146,7 @@ def test_a_reduction_leaves_the_method_as_it_was(name, settings):
     assert set(settings) <= set(method.reduction_settings())
     query = ends(method, places(method).float())
     before = method.predict(query)
-    less = method.reduced(settings, method.reduction_inputs(data, fold.train))
+    less = method.reduce(settings, method.reduction_inputs(data, fold.train))
     assert not torch.equal(less.predict(query).mean, before.mean)
     after = method.predict(query)
     for part in ("mean", "confidence", "variance"):
@@ -172,7 +172,7 @@ def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.
     return predictor.predict_linear(**{data.site.moving_end: places}).mean / data.site.target_scale
 
 
-@pytest.mark.parametrize("name", [name for name in methods() if name != "calibrated_raytracer"])
+@pytest.mark.parametrize("name", [name for name in built_in_methods() if name != "calibrated_raytracer"])
 def test_what_is_scored_is_what_is_served(name):
     """`answer` of rows and `predict` of places were two ways, each with code of its own."""
     method, data, fold = fitted(name)
@@ -192,7 +192,7 @@ def test_what_is_scored_is_what_is_served(name):
 def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
     data = kinds.several(tmp_path)
     fold = fold_of(data)
-    method = by_station(method_class(name)(), data)
+    method = wrap_per_station(method_class(name)(), data)
     method.fit(data, fold, FitContext(tmp_path, stations=how))
     predictor = Predictor(method, data.site)
     for number in range(len(kinds.POSTS)):

@@ -18,7 +18,7 @@ from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.refined_places import Linearised, estimate_place_errors, move_rows, refine_places
 from gsparc.training.context import FitContext
 
@@ -126,7 +126,7 @@ def test_exact_places_stay_though_errors_are_claimed():
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
-    _, report = fitting.fit_or_resume(by_station(Gsparc(position_std=0.05), data), data, fold, BRIEF)
+    _, report = fitting.fit_or_resume(wrap_per_station(Gsparc(position_std=0.05), data), data, fold, BRIEF)
     assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
 
 

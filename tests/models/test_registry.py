@@ -10,10 +10,10 @@ from campaigns import compose
 from gsparc.data import instantiate
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import MethodFactory
-from gsparc.models.registry import build, method_class, methods
+from gsparc.models.registry import build, built_in_methods, method_class
 
 
-@pytest.mark.parametrize("name", methods())
+@pytest.mark.parametrize("name", built_in_methods())
 def test_choices_hold_defaults_of_their_class(name):
     """`baselines=[gsrf]` trained other settings than `model=gsrf`."""
     chosen, own = build(compose(f"model={name}").model), method_class(name)()

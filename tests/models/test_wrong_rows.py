@@ -15,7 +15,7 @@ from contexts import short
 from rooms import directed
 
 from gsparc.data.load import load, split_for
-from gsparc.models.registry import build, method_class, methods
+from gsparc.models.registry import build, built_in_methods, method_class
 from gsparc.training.context import FitContext
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi_db": powers}
@@ -123,4 +123,4 @@ def test_trained_methods_stay_finite_or_refuse(tmp_path, what, name, wrong):
 
 def test_no_method_is_forgotten():
     here = {name for names in (*QUICK.values(), *(names for _, names in MAKE.values())) for name in names}
-    assert here | {"calibrated_raytracer"} == set(methods())  # it needs a scene: tests/peers
+    assert here | {"calibrated_raytracer"} == set(built_in_methods())  # it needs a scene: tests/peers

@@ -29,8 +29,8 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings
-from gsparc.models.per_station import by_station
+from gsparc.models.moving_array.triangulate import BearingSearchSettings
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -112,7 +112,7 @@ class Case(NamedTuple):
     thin: bool = False
 
 
-SEARCH = SearchSettings(sources=8, rows=30, candidates=1000, steps=20)
+SEARCH = BearingSearchSettings(sources=8, rows=30, candidates=1000, steps=20)
 SOURCES = ("init.searches=1", "init.search_rows=60")
 CASES = {
     "gp, spectra": Case(method_class("gp"), kinds.images),
@@ -163,7 +163,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             for module in (gp, complex_gp, powers):
                 patch.setattr(module, "MOST_ROWS", 30)
             patch.setattr(complex_gp, "NEAREST", 20)
-        method = by_station(case.make(), data).create_for(data)
+        method = wrap_per_station(case.make(), data).create_for(data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
         budget = 0.5 if method.takes_budget else None
         method.fit(data, fold, short(Path(folder), 10, budget_s=budget))

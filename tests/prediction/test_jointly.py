@@ -9,7 +9,7 @@ from towns import town_file
 import gsparc
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -41,7 +41,7 @@ def test_who_knows_no_covariance_says_so():
 def test_a_plan_of_stations_learned_together_was_an_error_of_shapes(tmp_path):
     """`gsparc plan` of `model=gp stations=together` ended in "size of tensor a (3) must match b (0)"."""
     data = load_own(town_file(tmp_path / "town.npz"))
-    method, rows = by_station(method_class("gp")(), data), np.arange(0, len(data), 7)
+    method, rows = wrap_per_station(method_class("gp")(), data), np.arange(0, len(data), 7)
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, stations="together"))
     one = Predictor(method, data.site).select_station(data.site.stations.name[0])
     covariance, noise = one.covariance(**{data.site.moving_end: PLACES})

@@ -12,7 +12,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -129,7 +129,7 @@ def abroad(tmp_path):
             "rssi_db": rng.normal(0, 1, (40, 2)) - [50, 80],
         }
     )
-    method = by_station(GaussianProcess(), data)
+    method = wrap_per_station(GaussianProcess(), data)
     rows = np.arange(len(data))
     method.fit(data, Fold(rows, rows[:0], rows[:4]), FitContext(tmp_path))
     checkpoint.save(tmp_path / "gp.ckpt", method)

@@ -74,7 +74,7 @@ def test_a_search_that_the_clock_ended_says_so(tmp_path, seconds, limited):
 
 def test_searches_for_offsets_are_counted_by_the_same_clock_and_may_be_ended_by_it(tmp_path, monkeypatch):
     """They had 120 seconds of the wall each, and nothing told when these ended one."""
-    budgets, search = [], ImageSourceGP._search
+    budgets, search = [], ImageSourceGP._run_searches
 
     def ended(self, rows, settings, budget, *rest):
         found = search(self, rows, settings, budget, *rest)

@@ -73,7 +73,7 @@ def predict_channels(
         # What separates paths answers at any frequency; others are interpolated between measured tones.
         if isinstance(method, SeparatesPaths) and batch.uplink is not None:
             wanted = torch.from_numpy(frequency_hz)
-            answer = method.from_uplink_at(batch.uplink, wanted, batch.noise_variance, antennas)
+            answer = method.predict_from_uplink(batch.uplink, wanted, batch.noise_variance, antennas)
         else:
             answer = method.predict(batch)
             # The variance stays that of measured tones: interpolation is smooth between them.

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 
 from gsparc.data.instantiate import import_target, plugins
 from gsparc.evaluation.experiment.problem import Problem
-from gsparc.models.registry import methods
+from gsparc.models.registry import built_in_methods
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -76,7 +76,7 @@ def plugin_contenders() -> dict[str, Contender]:
     found = {}
     for name, path in plugins("model").items():
         kind = import_target(path)
-        if name not in methods() and kind is not None:  # one that cannot be imported is warned of
+        if name not in built_in_methods() and kind is not None:  # one that cannot be imported is warned of
             budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
             found[name] = Contender(name, (), budget, tuple(getattr(kind, "kinds", ())))
     return found
@@ -98,7 +98,7 @@ class Budget:
 
 
 def plan_cells(
-    problems: Sequence[Problem], methods: Mapping[str, Contender], budgets: Sequence[Budget],
+    problems: Sequence[Problem], built_in_methods: Mapping[str, Contender], budgets: Sequence[Budget],
     only: Sequence[str] = (),
 ) -> list[tuple[Problem, Cell]]:  # fmt: skip
     """All cells, the most useful first: every problem's table before further seeds and longer budgets.
@@ -112,7 +112,7 @@ def plan_cells(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
+    able = [(problem, [m for m in built_in_methods.values() if m.serves(problem)]) for problem in problems]
     # Methods without a budget first: they stand in the tables of all budgets.
     cells = [
         (p, Cell(p.dataset, p.split, m.name, None, p.draw))

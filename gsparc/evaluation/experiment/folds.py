@@ -22,7 +22,7 @@ from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 from gsparc.training.time_budget import Clock, worst_clock
@@ -124,7 +124,9 @@ def fit_folds(
         # process_time counts all threads of this process, waiting for others excluded.
         before = time.process_time()
         # Stations are counted in the data that are learned from, which `learned` may have changed.
-        method, report = fitting.fit_or_resume(by_station(factory, there), there, rows, contexts[number])
+        method, report = fitting.fit_or_resume(
+            wrap_per_station(factory, there), there, rows, contexts[number]
+        )
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}

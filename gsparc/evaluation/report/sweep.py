@@ -69,7 +69,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import make_sections, write_report
     from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again
-    from gsparc.evaluation.report.tables import table_of_seeds
+    from gsparc.evaluation.report.tables import has_draws, table_of_leads, table_of_seeds
 
     runs = find_runs([folder])
     if settings.retime:
@@ -86,5 +86,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
         plots.draw_distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
         console.print(table.without(*WIDE))
+        if has_draws(group):
+            console.print(table_of_leads(group))
     summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})
     console.print(f"written to {folder}", highlight=False)

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from gsparc.models.array_vectors.vector_gp import align_along_tree, refine_alignment
-from gsparc.models.splat.left_out_images import LeftOut, mean_log_error, predict_left_out
+from gsparc.models.splat.left_out_images import LeftOut, mean_log_error, means_and_variances
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, SmoothRough
 
@@ -79,31 +79,31 @@ def choose_kernel(
         length, noise = np.exp(np.clip(parameters, np.log(LEAST), np.log(LARGEST)))
         return Kernel.from_length(float(length * wavelength), float(noise), term=SmoothRough)
 
-    def inverse_of(kernel: Kernel) -> np.ndarray:
+    def inverse_gram(kernel: Kernel) -> np.ndarray:
         return Factor.from_gram(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
 
-    def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
+    def held_out_log_error(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
         kernel = kernel_at(parameters)
-        inverse = inverse_of(kernel)
-        predicted = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
-        return mean_log_error(samples.error(predicted))  # up to a factor, minus the PSNR
+        inverse = inverse_gram(kernel)
+        predicted = samples.predict(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
+        return mean_log_error(samples.squared_errors(predicted))  # up to a factor, minus the PSNR
 
     starts = [np.log([length, NOISE]) for length in LENGTHS]
     if len(positions) < FEW:
         return ChosenKernel(kernel_at(starts[0]), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
-    first = min(starts, key=objective)
-    refined = refine_alignment(aligned, inverse_of(kernel_at(first)), partner)
+    first = min(starts, key=held_out_log_error)
+    refined = refine_alignment(aligned, inverse_gram(kernel_at(first)), partner)
     optimum = minimize(
-        objective, first, args=(refined,), method="Nelder-Mead",
+        held_out_log_error, first, args=(refined,), method="Nelder-Mead",
         options={
             "maxfev": STEPS, "xatol": 0.03, "fatol": 1e-3,
             "initial_simplex": first + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, -1.0]]),
         },
     )  # fmt: skip
     kernel = kernel_at(optimum.x)
-    inverse = inverse_of(kernel)
-    unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
-    error = samples.error(predicted)
+    inverse = inverse_gram(kernel)
+    unknown, predicted = samples.predict(kernel, inverse, refine_alignment(refined, inverse, partner))
+    error = samples.squared_errors(predicted)
     seen = ~np.isnan(error)
     left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
     return ChosenKernel(kernel, unknown[seen], error[seen], left_out)
@@ -118,15 +118,15 @@ class _Samples:
     gaps: np.ndarray
     distance: np.ndarray
 
-    def predictions(
+    def predict(
         self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posterior variance (g, c) and spectra (g, c, P) of held-out samples; NaN where no other is left."""
-        mean, variance = predict_left_out(inverse, vectors, self.distance, self.centres, self.gaps)
+        mean, variance = means_and_variances(inverse, vectors, self.distance, self.centres, self.gaps)
         unknown = np.clip(variance - kernel.noise, 0.0, 1.0)
         power = np.abs(mean @ self.matrix) ** 2 + unknown[..., None] * self.background
         return unknown, np.sqrt(power)
 
-    def error(self, predicted: np.ndarray) -> np.ndarray:
+    def squared_errors(self, predicted: np.ndarray) -> np.ndarray:
         """(g, c) mean squared."""
         return ((predicted - self.images[self.centres]) ** 2).mean(-1)

@@ -50,13 +50,13 @@ class RecoveredVectors:
     expected: np.ndarray
 
     @property
-    def suspect(self) -> np.ndarray:
+    def is_suspect(self) -> np.ndarray:
         """(n,) bool: the array cannot have measured this image, or the solver did not converge."""
         return np.hypot(self.residual, self.floor) > SUSPECT * self.expected
 
 
 def recover_vectors(
-    site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, most: int = Effort.restarts
+    site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, max_restarts: int = Effort.restarts
 ) -> RecoveredVectors:
     """Return array vectors of spectra.
 
@@ -65,18 +65,21 @@ def recover_vectors(
         images: (n, H, W) uint8 (255 = 1) or float.
         positions: (n, 3) [m] of the transmitter; neighbours start each other's search.
         seed: of the random starts.
-        most: every row is solved once from its neighbours or from random starts; of restarts there are at
-            most so many, rows times starts, as spectra of another array never converge.
+        max_restarts: every row is solved once from its neighbours or from random starts; of restarts there
+            are at most so many, rows times starts, as spectra of another array never converge.
     """
     problem = _Problem.from_images(site, images)
     generator = torch.Generator().manual_seed(seed)
     n = len(images)
-    state, cost = torch.zeros(n, problem.unknowns, dtype=torch.float64), torch.full((n,), torch.inf).double()
+    state, cost = (
+        torch.zeros(n, problem.dimension, dtype=torch.float64),
+        torch.full((n,), torch.inf).double(),
+    )
     enough = (ENOUGH * problem.expected) ** 2
 
-    def keep(rows: Tensor, trial: tuple[Tensor, Tensor]) -> None:
-        better = trial[1] < cost[rows]
-        state[rows[better]], cost[rows[better]] = trial[0][better], trial[1][better]
+    def keep_better(rows: Tensor, solutions: tuple[Tensor, Tensor]) -> None:
+        better = solutions[1] < cost[rows]
+        state[rows[better]], cost[rows[better]] = solutions[0][better], solutions[1][better]
 
     every = torch.arange(n)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(n))
@@ -85,30 +88,30 @@ def recover_vectors(
         if turn == 0:
             unsolved = unsolved[: -(-n // SEEDED)]
         if turn > 1:
-            unsolved = unsolved[: most // starts]
-            most -= starts * len(unsolved)
+            unsolved = unsolved[: max_restarts // starts]
+            max_restarts -= starts * len(unsolved)
         if not len(unsolved):
             break
         for rows in unsolved.split(max(1, AT_ONCE // starts)):
-            keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
+            keep_better(rows, _minimise(problem, rows, problem.draw_starts(rows, starts, generator), enough))
         while len(rows := every[cost > enough]):
             solved = (cost <= enough).numpy()
-            near = _solved_neighbours(positions, rows.numpy(), solved)
+            near = _nearest_solved(positions, rows.numpy(), solved)
             if near is None:
                 break
             before = int(solved.sum())
             few = AT_ONCE // NEIGHBOURS
             for part, around in zip(rows.split(few), near.split(few), strict=True):
-                keep(part, _search(problem, part, state[around].flatten(0, 1), enough))
+                keep_better(part, _minimise(problem, part, state[around].flatten(0, 1), enough))
             if int((cost <= enough).sum()) - before < max(1, len(rows) // 20):
                 break
         log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
     for rows in every.split(AT_ONCE):
-        keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), SCREENING))
-    return problem.result(state, cost)
+        keep_better(rows, _minimise(problem, rows, state[rows], torch.zeros_like(enough), SCREENING))
+    return problem.to_vectors(state, cost)
 
 
-def _solved_neighbours(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
+def _nearest_solved(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
     """Rows (len(rows), <= NEIGHBOURS) of the nearest solved spectra; None when there is none."""
     known = np.flatnonzero(solved)
     if not len(known):
@@ -162,17 +165,17 @@ class _Problem:
         return _Problem(flat, z2, z1, projector.sum(0), floor, expected.clamp_min(1e-9), minmax)
 
     @property
-    def unknowns(self) -> int:
+    def dimension(self) -> int:
         return len(self.forms) + (1 if self.offsets else 0)
 
-    def random(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
+    def draw_starts(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
         """Starting points (len(rows) * starts, unknowns) of about the spectra's power."""
-        start = torch.randn(len(rows), starts, self.unknowns, generator=generator, dtype=torch.float64)
+        start = torch.randn(len(rows), starts, self.dimension, generator=generator, dtype=torch.float64)
         # z2[0] is the mean square of the image up to sign: the first whitened column is the constant.
         start *= (self.z2[rows, :1].abs() / len(self.forms)).sqrt()[:, :, None]
         return start.flatten(0, 1)
 
-    def residual(self, state: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def errors_and_slopes(self, state: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Errors (B, K) and their slopes (B, K, unknowns)."""
         v = state[:, : len(self.forms)]
         half = (v @ self.forms).view(len(v), -1, v.shape[1])
@@ -183,7 +186,7 @@ class _Problem:
         error = error - 2 * o * self.z1[rows] - o.square() * self.z0
         return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
 
-    def result(self, state: Tensor, cost: Tensor) -> RecoveredVectors:
+    def to_vectors(self, state: Tensor, cost: Tensor) -> RecoveredVectors:
         m = len(self.forms) // 2
         vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
@@ -191,8 +194,8 @@ class _Problem:
         return RecoveredVectors(vectors, offset, residual, floor, expected)
 
 
-def _search(
-    problem: _Problem, rows: Tensor, start: Tensor, enough: Tensor, iterations: int = ITERATIONS
+def _minimise(
+    problem: _Problem, rows: Tensor, start: Tensor, tolerance: Tensor, iterations: int = ITERATIONS
 ) -> tuple[Tensor, Tensor]:
     """Best of several starts per row: state (n, unknowns) and sum of squared errors (n,).
 
@@ -200,11 +203,11 @@ def _search(
     continue, and rows at the quantisation floor end.
     """
     n, starts = len(rows), len(start) // len(rows)
-    best = torch.zeros(n, problem.unknowns, dtype=torch.float64)
+    best = torch.zeros(n, problem.dimension, dtype=torch.float64)
     best_cost = torch.full((n,), torch.inf).double()
     owner = torch.arange(n).repeat_interleave(starts)
     state, damping = start.clone(), torch.full((len(start),), 1e-2, dtype=torch.float64)
-    error, slope = problem.residual(state, rows[owner])
+    error, slope = problem.errors_and_slopes(state, rows[owner])
     cost = error.square().sum(1)
     for iteration in range(iterations):
         normal = slope.transpose(1, 2) @ slope
@@ -212,7 +215,7 @@ def _search(
         normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
         step = Factor.from_gram(normal, "ignore").solve(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
         tried = state - step
-        new_error, new_slope = problem.residual(tried, rows[owner])
+        new_error, new_slope = problem.errors_and_slopes(tried, rows[owner])
         new_cost = new_error.square().sum(1)
         better = new_cost < cost
         state = torch.where(better[:, None], tried, state)
@@ -226,7 +229,7 @@ def _search(
         least = torch.nonzero(cost <= lowest[owner]).squeeze(1)
         first = torch.zeros(n, dtype=torch.int64).scatter_(0, owner[least], least)
         best[improved], best_cost[improved] = state[first[improved]], lowest[improved]
-        done = best_cost <= enough[rows]
+        done = best_cost <= tolerance[rows]
         going = ~done[owner] & ~stuck
         if iteration == SCREENING and starts > GOES_ON:
             # Ranks within each row's own starts: rows are set apart by more than any cost.

@@ -26,7 +26,7 @@ from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached, write_recovery_report
-from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_nearest, mirror_elements
+from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_nearest, index_mirror_elements
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
@@ -108,7 +108,7 @@ def learn_vector_process(
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         write_recovery_report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering_matrix(array, grid, wavelength).numpy()
-    partner, places = mirror_elements(array), data.tx[rows]
+    partner, places = index_mirror_elements(array), data.tx[rows]
     core = covering_rows(places, MOST_ROWS, seed)
     images = to_real(training_targets(data, rows[core]), "spectrum")
     tuned = choose_kernel(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)

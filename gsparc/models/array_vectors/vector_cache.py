@@ -24,12 +24,12 @@ NAMED = 8  # suspect images named in a log line
 
 
 @lru_cache(maxsize=1)
-def _kept(key: str) -> dict[int, tuple[Any, ...]]:
+def _solved_rows(key: str) -> dict[int, tuple[Any, ...]]:
     """By row of the data last asked for what is known of it: its parts of `RecoveredVectors`, and seconds."""
     return {}
 
 
-forget_vectors = _kept.cache_clear  # before what is to pay for its own work
+forget_vectors = _solved_rows.cache_clear  # before what is to pay for its own work
 
 
 def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[RecoveredVectors, Spent]:
@@ -43,7 +43,10 @@ def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple
         rows: (n,) sorted.
         seed: of the random starts.
     """
-    known, names = _kept(f"{identity_hash(data)} {seed}"), [one.name for one in fields(RecoveredVectors)]
+    known, names = (
+        _solved_rows(f"{identity_hash(data)} {seed}"),
+        [one.name for one in fields(RecoveredVectors)],
+    )
     missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
     if len(missing) < len(rows):
         log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))
@@ -66,8 +69,8 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
         writer.writerow(["row", "name", "residual", "outside_the_array", "quantisation", "suspect"])
         for i, row in enumerate(rows):
             figures = (result.residual[i], result.floor[i], result.expected[i])
-            writer.writerow([row, names[row], *(f"{v:.3e}" for v in figures), int(result.suspect[i])])
-    bad = rows[result.suspect]
+            writer.writerow([row, names[row], *(f"{v:.3e}" for v in figures), int(result.is_suspect[i])])
+    bad = rows[result.is_suspect]
     log.info(
         "array vectors of %d spectra: median residual %.1e, quantisation %.1e",
         len(rows), np.median(result.residual), np.median(result.expected),

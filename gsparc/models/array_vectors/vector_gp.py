@@ -32,7 +32,7 @@ def twin_vectors(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
     return vectors.conj()[..., partner]
 
 
-def mirror_elements(array: np.ndarray) -> np.ndarray | None:
+def index_mirror_elements(array: np.ndarray) -> np.ndarray | None:
     """Return indices (M,) of elements reflected through the array's centre; None of an asymmetric one."""
     centred = array - array.mean(0)
     distance = cdist(centred, -centred)

@@ -22,7 +22,7 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import entry_variance
+from gsparc.models.target_rows import to_entry_variance
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.powers import PowerRows
@@ -40,14 +40,14 @@ STARTS = 6  # of that search, drawn at random, beside two that the powers sugges
 PARAMETERS = 3  # a, n and the scale
 
 
-def _moment(corner: float) -> tuple[float, float]:
+def _mass_and_variance(corner: float) -> tuple[float, float]:
     """Integral of exp(-Huber's loss), and the variance of that density."""
     edge, middle = math.exp(-(corner**2) / 2), math.sqrt(2 * math.pi) * math.erf(corner / math.sqrt(2))
     mass = middle + 2 * edge / corner
     return mass, (middle - 2 * corner * edge + 2 * edge * (corner + 2 / corner + 2 / corner**3)) / mass
 
 
-MASS, VARIANCE = _moment(CORNER)
+MASS, VARIANCE = _mass_and_variance(CORNER)
 
 
 def law_variance(law: Law) -> float:
@@ -98,16 +98,16 @@ def fit_level_and_exponent(loss: np.ndarray, rows: PowerRows, start: np.ndarray)
     `loss` (n,) [dB] is that of exponent 1.
     """
 
-    def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
+    def neg_log_posterior(p: np.ndarray) -> tuple[float, np.ndarray]:
         value, slopes, _ = _posterior(p, loss, rows)
         return value, np.array(slopes)
 
     bounds = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB))]
-    result = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    result = minimize(neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=bounds)
     return float(result.fun), result.x
 
 
-def _start(loss: np.ndarray, rows: PowerRows) -> np.ndarray:
+def _initial_parameters(loss: np.ndarray, rows: PowerRows) -> np.ndarray:
     """Level and scale by medians for the usual exponent, from what was heard where anything was."""
     used = ~rows.silent if not rows.silent.all() else rows.silent
     levels = rows.decibels[used] + USUAL * loss[used]
@@ -116,20 +116,20 @@ def _start(loss: np.ndarray, rows: PowerRows) -> np.ndarray:
     return np.array([middle, USUAL, math.log(min(max(scale, 1.0), SPREADS_DB[1] / 2))])
 
 
-def fit_law(rows: PowerRows, place: np.ndarray | None) -> Law:
+def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
     """Return the law of largest likelihood; the floor is chosen by it too.
 
     Args:
         rows: at least one.
-        place: (3,) of the still end [m]; None where `rows.places` are of both ends.
+        end: (3,) of the still end [m]; None where `rows.places` are of both ends.
     """
-    at = None if place is None else (float(place[0]), float(place[1]), float(place[2]))
+    at = None if end is None else (float(end[0]), float(end[1]), float(end[2]))
     law = Law(0.0, USUAL, 0.0, 1.0, at)
     places = torch.from_numpy(np.ascontiguousarray(rows.places, np.float64))
     far = law.distance(places).numpy()
     # From the nearest row (no floor) to the median: beyond, half of the rows would tell nothing of n.
     low, high = np.maximum(np.quantile(far, [0.0, 0.5]), TINY_M)
-    start = at_best = _start(to_decibels(far), rows)
+    start = at_best = _initial_parameters(to_decibels(far), rows)
     best = np.inf
     for floor in np.unique(np.geomspace(low, high, FLOORS)):
         value, result = fit_level_and_exponent(to_decibels(np.maximum(far, floor)), rows, start)
@@ -157,7 +157,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, len(low))))
     tiny = (1e-3 * size) ** 2  # a row on the very place must not decide alone
 
-    def objective(p: np.ndarray) -> tuple[float, np.ndarray]:
+    def neg_log_posterior(p: np.ndarray) -> tuple[float, np.ndarray]:
         towards = (p[PARAMETERS:] * size) - rows.places
         squared = (towards**2).sum(1) + tiny
         value, slopes, slope = _posterior(p, to_decibels(squared) / 2, rows)
@@ -169,9 +169,11 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     for place in starts:
         place = place + 0.05 * size * (high - low <= 1e-3 * size)  # in the plane itself heights have no slope
         loss = to_decibels(((place - rows.places) ** 2).sum(1) + tiny) / 2
-        start = np.concatenate([_start(loss, rows), place / size])
+        start = np.concatenate([_initial_parameters(loss, rows), place / size])
         result.append(
-            minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late)
+            minimize(
+                neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late
+            )
         )
     return min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size
 
@@ -210,7 +212,7 @@ class DistanceLaw(Differentiable):
         )
         return tuple(f"distance_law: {note}" for note in (summary, *notes))
 
-    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
-        mean = self._decode(self.law.mean(queries)[:, None].to(dtype))
+    def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+        mean = self._to_targets(self.law.mean(queries)[:, None].to(dtype))
         variance = torch.full((len(queries),), law_variance(self.law), dtype=dtype)
-        return Prediction(mean, variance=entry_variance(variance, mean, self.kind))
+        return Prediction(mean, variance=to_entry_variance(variance, mean, self.kind))

@@ -21,9 +21,9 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
-from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, fit_power_process
+from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
-from gsparc.models.target_rows import entry_variance, power_rows, to_real
+from gsparc.models.target_rows import power_rows, to_entry_variance, to_real
 from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, fit_kernel_nearest
@@ -127,7 +127,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     stored = ("mean", "axes", "lost", "scores", "powers")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
-    count = 0  # type: ignore[assignment]
+    count_gaussians = 0  # type: ignore[assignment]
     powers: PowerProcess | None = None  # None: not powers
     scores: Posterior | None = None  # of what is not
 
@@ -171,7 +171,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         assert self.site is not None
-        self.powers, notes = fit_power_process(rows, self.site, self.about)
+        self.powers, notes = process_and_notes(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
     @property
@@ -183,7 +183,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         """See `HasProcess`."""
         return None if self.powers is None else self.powers.with_exact_posterior()
 
-    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
         if self.powers is None:
             return None
@@ -191,40 +191,40 @@ class GaussianProcess(Differentiable, ClosedForm):
         result.powers, _ = condition_on_powers(power_rows(data, rows), self.powers.posterior.prior, 0)
         return result
 
-    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+    def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         if self.powers is not None:
             decibels, spread, share = self.powers.answer(queries)
-            power = self._decode(decibels[:, None].to(dtype))
-            return Prediction(power, entry_variance(spread.to(dtype), power, self.kind), share.to(dtype))
+            power = self._to_targets(decibels[:, None].to(dtype))
+            return Prediction(power, to_entry_variance(spread.to(dtype), power, self.kind), share.to(dtype))
         assert self.scores is not None
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
-        mean = self._composed(result.mean, dtype)
+        mean = self._targets_of_scores(result.mean, dtype)
         # What the components leave out is an error of every prediction.
         variance = (kernel.amplitude * result.variance + self.lost).to(dtype)
         unknown = (result.variance / (1 + kernel.noise)).to(dtype)
-        return Prediction(mean, entry_variance(variance, mean, self.kind), unknown)
+        return Prediction(mean, to_entry_variance(variance, mean, self.kind), unknown)
 
     def mean_at(self, query: Query) -> Tensor:
         """Return the mean (B, ...) of `predict` alone: the variance is most of a prediction."""
         assert self.site is not None
         places, dtype = query.places(self.site), query.tx.dtype
         if self.powers is not None:
-            return self._decode(self.powers.mean_at(places)[:, None].to(dtype))
+            return self._to_targets(self.powers.mean_at(places)[:, None].to(dtype))
         assert self.scores is not None
-        return self._composed(self.scores.mean_at(places, dtype == torch.float64), dtype)
+        return self._targets_of_scores(self.scores.mean_at(places, dtype == torch.float64), dtype)
 
-    def _composed(self, scores: Tensor, dtype: torch.dtype) -> Tensor:
+    def _targets_of_scores(self, scores: Tensor, dtype: torch.dtype) -> Tensor:
         """Targets (B, ...) of components (B, P)."""
-        return self._decode(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
+        return self._to_targets(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
 
     def reduction_settings(self) -> tuple[str, ...]:
-        """See `Method.reduced`."""
+        """See `Method.reduce`."""
         if not isinstance(self.scores, Exact):
             return ("confidence",)
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
-    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Method.reduced`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
+    def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Method.reduce`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
         assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self

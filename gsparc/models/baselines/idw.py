@@ -55,7 +55,7 @@ class InverseDistance(Interpolator):
         result = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
         blend = torch.bmm(weight[:, None], result.view(*row.shape, -1))[:, 0]
         unknown = torch.from_numpy(-np.expm1(-distance[:, 0] / self.spacing)).float()
-        return Prediction(self._decode(blend), unknown=unknown)
+        return Prediction(self._to_targets(blend), unknown=unknown)
 
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)

@@ -13,7 +13,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import from_real, heard_rows, power_rows, training_targets, unheard_note
+from gsparc.models.target_rows import heard_rows, power_rows, to_targets, training_targets, unheard_note
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
@@ -68,16 +68,16 @@ class Interpolator(Method):
         """See `Method.predict`."""
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        return self._answered(query.places(self.site), query.tx.dtype)
+        return self._predict_at(query.places(self.site), query.tx.dtype)
 
-    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+    def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """Predict at (B, 3) float64 [m], or (B, 6); see `Differentiable`."""
         # NumPy has no autograd: methods with gradients are `Differentiable`.
         return self._look_up(queries.detach().numpy())
 
     def state(self) -> dict[str, Any]:
         """Return the target shape, the number of rows, and what the subclass learned."""
-        return {"shape": list(self.shape), "seen": self.seen, **self._learned()}
+        return {"shape": list(self.shape), "seen": self.seen, **self._stored_state()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
@@ -94,8 +94,8 @@ class Interpolator(Method):
         assert self.site is not None
         return self.site.kind
 
-    def _decode(self, rows: Tensor) -> Tensor:
-        return from_real(rows, self.kind, self.shape)
+    def _to_targets(self, rows: Tensor) -> Tensor:
+        return to_targets(rows, self.kind, self.shape)
 
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ class Interpolator(Method):
     def _look_up(self, queries: np.ndarray) -> Prediction:
         """Predict at (B, 3) float64 [m]."""
 
-    def _learned(self) -> dict[str, Any]:
+    def _stored_state(self) -> dict[str, Any]:
         return {name: to_plain(getattr(self, name, None)) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
@@ -126,8 +126,8 @@ class Differentiable(Interpolator):
         return None
 
     @abstractmethod
-    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+    def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """Predict at (B, 3) float64 [m], or (B, 6), as float32 or float64."""
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        return self._answered(torch.from_numpy(queries), torch.float32)
+        return self._predict_at(torch.from_numpy(queries), torch.float32)

@@ -22,7 +22,7 @@ from scipy.spatial.distance import cdist, pdist
 
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import entry_variance, to_real
+from gsparc.models.target_rows import to_entry_variance, to_real
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.stored import Stored
@@ -83,13 +83,13 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     distance = np.bincount(which[near], apart[near], len(edges) - 1)[filled] / number[filled]
     gamma = np.bincount(which[near], half[near], len(edges) - 1)[filled] / number[filled]
 
-    def law(r: np.ndarray, nugget: float, sill: float, length: float) -> np.ndarray:
+    def variogram(r: np.ndarray, nugget: float, sill: float, length: float) -> np.ndarray:
         return nugget + sill * -np.expm1(-r / length)
 
     low, high = [0, 0, limit * 1e-3], [spread * 3, spread * 10, limit * 10]
     start = [float(gamma[0]) / 2, spread, limit / 5]
     start = [min(max(s, a), b) for s, a, b in zip(start, low, high, strict=True)]
-    result, _ = curve_fit(law, distance, gamma, start, 1 / np.sqrt(number[filled]), bounds=(low, high))
+    result, _ = curve_fit(variogram, distance, gamma, start, 1 / np.sqrt(number[filled]), bounds=(low, high))
     return Variogram(*(float(v) for v in result))
 
 
@@ -108,20 +108,20 @@ class Kriging(Interpolator):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Repeated places would make the system singular: their mean is kriged.
-        decibels, self.channels = self._decibels(targets), None
+        decibels, self.channels = self._to_decibels(targets), None
         first, self.values, _ = mean_at_places(positions, decibels)
         self.positions = positions[first]
         if self.kind == "csi":
             self.channels = mean_at_places(positions, targets.reshape(len(targets), -1))[1]
         self.variogram = fit_variogram(positions, decibels)
-        self._solve()
+        self._factor_system()
         v = self.variogram
         few = (
             f"; of {len(self.positions)} places each query's nearest {NEAREST}" if self.system is None else ""
         )
         return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m{few}",)
 
-    def _decibels(self, targets: np.ndarray) -> np.ndarray:
+    def _to_decibels(self, targets: np.ndarray) -> np.ndarray:
         if self.kind == "csi":
             power = np.abs(targets.reshape(len(targets), -1)) ** 2
             floor = max(float(power.mean()) * 1e-8, SILENCE)
@@ -131,15 +131,15 @@ class Kriging(Interpolator):
             return rows  # already decibels
         return to_decibels(np.maximum(rows, np.float32(FLOOR)))
 
-    def _solve(self) -> None:
+    def _factor_system(self) -> None:
         """Factor the system of all places, or prepare to find the nearest of too many for that."""
         self.system, self.tree = None, None
         if len(self.positions) > WHOLE:
             self.tree = cKDTree(self.positions)
         else:
-            self.system = lu_factor(self._systems(cdist(self.positions, self.positions)))
+            self.system = lu_factor(self._kriging_matrix(cdist(self.positions, self.positions)))
 
-    def _systems(self, distance: np.ndarray) -> np.ndarray:
+    def _kriging_matrix(self, distance: np.ndarray) -> np.ndarray:
         """Of the weights of n places and the multiplier that makes them sum to one: (..., n + 1, n + 1)."""
         n = distance.shape[-1]
         system = np.ones((*distance.shape[:-2], n + 1, n + 1))
@@ -163,14 +163,14 @@ class Kriging(Interpolator):
         else:
             near = self.positions[place]
             apart = np.linalg.norm(near[:, :, None] - near[:, None], axis=-1)
-            solved = np.linalg.solve(self._systems(apart), right[..., None])[..., 0]
+            solved = np.linalg.solve(self._kriging_matrix(apart), right[..., None])[..., 0]
         left = np.clip(self.variogram.variance - (solved * right).sum(1), 0.0, None)
         return place, solved[:, :-1], left
 
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
-    def _block(self) -> int:
+    def _queries_per_block(self) -> int:
         """Queries answered at a time, of more."""
         return max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))
 
@@ -179,27 +179,27 @@ class Kriging(Interpolator):
         return "its systems are solved outside of autograd"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        if self.tree is not None and len(queries) > (block := self._block()):
+        if self.tree is not None and len(queries) > (block := self._queries_per_block()):
             parts = [self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)]
             return Prediction.joined(parts)
         place, weights, left = self._weights(queries)
         shares = torch.from_numpy(weights)
 
-        def weighed(values: np.ndarray, kind: torch.dtype) -> torch.Tensor:
+        def weighted_sum(values: np.ndarray, kind: torch.dtype) -> torch.Tensor:
             if self.tree is None:
                 return shares.to(kind) @ torch.from_numpy(values)
             return torch.einsum("qk,qkd->qd", shares.to(kind), torch.from_numpy(values[place]))
 
-        decibels, variance = weighed(self.values, torch.float32), torch.from_numpy(left).float()
+        decibels, variance = weighted_sum(self.values, torch.float32), torch.from_numpy(left).float()
         power = self.kind == "rssi"
         if self.channels is None:
-            mean = self._decode(decibels if power else from_decibels(decibels))
+            mean = self._to_targets(decibels if power else from_decibels(decibels))
         else:
-            towards = weighed(self.channels, torch.complex64)
+            towards = weighted_sum(self.channels, torch.complex64)
             mean = torch.polar(from_decibels(decibels / 2), towards.angle()).view(-1, *self.shape)
         unknown = (variance / self.variogram.variance).clamp(0, 1)
-        return Prediction(mean, entry_variance(variance, mean, "rssi") if power else None, unknown)
+        return Prediction(mean, to_entry_variance(variance, mean, "rssi") if power else None, unknown)
 
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)
-        self._solve()
+        self._factor_system()

@@ -29,4 +29,4 @@ class Mean(Interpolator):
         return "predictions are the same everywhere"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        return Prediction(self._decode(self.value.expand(len(queries), -1).contiguous()))
+        return Prediction(self._to_targets(self.value.expand(len(queries), -1).contiguous()))

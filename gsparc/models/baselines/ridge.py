@@ -36,12 +36,12 @@ class Ridge(UplinkMethod):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Solve the normal equations for each penalty and scaling, keep what validates best."""
         started = TimeBudget()
-        self.site = self._need_uplink(data)
+        self.site = self._require_uplink(data)
         best: tuple[float, float, bool] | None = None
         for unit in (True, False):
-            normal = self._normal(data, fold.train, unit)
+            normal = self._normal_equations(data, fold.train, unit)
             for penalty in PENALTIES:
-                self.maps, self.unit = _solve(*normal, penalty), unit
+                self.maps, self.unit = _solve_ridge(*normal, penalty), unit
                 batch = data.batch(fold.val if len(fold.val) else fold.train)
                 miss = self.predict(batch).mean - batch.target
                 # Mean of logarithms: a few channels in deep fades would decide a mean of ratios.
@@ -52,11 +52,11 @@ class Ridge(UplinkMethod):
         # Validation rows chose the penalty, and are learned from after that.
         every = np.concatenate([fold.train, fold.val])
         self.unit = best[2]
-        self.maps = _solve(*self._normal(data, every, self.unit), best[1])
+        self.maps = _solve_ridge(*self._normal_equations(data, every, self.unit), best[1])
         note = f"ridge: penalty {best[1]:g}, rows {'of unit power' if best[2] else 'as they are'}"
         return FitReport(started.spent, (note,))
 
-    def _normal(self, data: Measurements, rows: np.ndarray, unit: bool) -> tuple[Tensor, Tensor]:
+    def _normal_equations(self, data: Measurements, rows: np.ndarray, unit: bool) -> tuple[Tensor, Tensor]:
         """Gram matrices (M, F, F) and products with the targets (M, F, O)."""
         batch = data.batch(rows)
         assert batch.uplink is not None
@@ -86,7 +86,7 @@ class Ridge(UplinkMethod):
         self.site, self.maps, self.unit, self.inputs = site, state["maps"], state["unit"], state["inputs"]
 
 
-def _solve(gram: Tensor, product: Tensor, penalty: float) -> Tensor:
+def _solve_ridge(gram: Tensor, product: Tensor, penalty: float) -> Tensor:
     level = torch.diagonal(gram, dim1=1, dim2=2).real.mean(1)
     level = torch.where(level > 0, penalty * level, 1.0)  # a dead antenna has nothing to solve for
     ridge = level[:, None, None] * torch.eye(gram.shape[1])

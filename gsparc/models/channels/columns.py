@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import LIGHT, Measurements, Site
-from gsparc.models.run_factors import best_run_factors, run_quadratic
+from gsparc.models.run_factors import best_run_factors, factor_matrix
 from gsparc.ops import Pose
 from gsparc.ops.transforms import to_numpy
 from gsparc.physics.waves import NEAR_M
@@ -49,12 +49,12 @@ class Slot:
     element: Tensor
     wavenumber: float
 
-    def put(self, whole: Tensor, rows: Tensor, values: Tensor) -> None:
-        """Write values (n, D) to `rows` of `whole` (S, A, K)."""
+    def write_entries(self, target: Tensor, rows: Tensor, values: Tensor) -> None:
+        """Write values (n, D) to `rows` of `target` (S, A, K)."""
         antennas, tones = torch.tensor(self.antennas), torch.tensor(self.tones)
-        whole[rows[:, None, None], antennas[None, :, None], tones[None, None]] = values.reshape(
+        target[rows[:, None, None], antennas[None, :, None], tones[None, None]] = values.reshape(
             len(rows), len(antennas), len(tones)
-        ).to(whole.dtype)
+        ).to(target.dtype)
 
     def antenna_places(self, moving: Tensor, rotation: Tensor) -> Tensor:
         """Return the antenna's places (B, 3) float64 [m]; of the moving end's (B, 3) and turns (B, 3, 3)."""
@@ -106,17 +106,17 @@ class Group(SlotPlaces):
     def __len__(self) -> int:
         return len(self.places)
 
-    def take(self, index: Tensor) -> Group:
+    def select_rows(self, index: Tensor) -> Group:
         """Return the rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
-    def thin(self, rows: float) -> Group:
+    def thin_rows(self, limit: float) -> Group:
         """Return at most so many rows, drawn evenly."""
-        if len(self) <= rows:
+        if len(self) <= limit:
             return self
         # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
-        index = np.random.default_rng(0).permutation(len(self))[: int(rows)]
-        return self.take(torch.from_numpy(np.sort(index)))
+        index = np.random.default_rng(0).permutation(len(self))[: int(limit)]
+        return self.select_rows(torch.from_numpy(np.sort(index)))
 
     def _tensors(self) -> dict[str, Tensor]:
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
@@ -133,7 +133,7 @@ class Group(SlotPlaces):
         return cls(**{**state, "slot": Slot.read(state["slot"])})
 
     @cached_property
-    def displacements(self) -> bytes:
+    def displacement_key(self) -> bytes:
         """Equal for groups whose places differ by one displacement at most, to a micrometre."""
         return to_numpy((self.places - self.places[0]).mul(1e6).round()).tobytes()
 
@@ -144,17 +144,17 @@ def require_waves(site: Site) -> None:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
 
 
-def group_channels(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
+def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tuple[Group, ...]:
     """Return groups of the given rows (n,).
 
     Args:
         data: kind csi; one end is static, or there are several static stations, or both ends move.
         rows: measurements; those with a masked entry of a group are no rows of that group.
-        apart: whether antennas with places of their own and tones far apart are groups of their own; if not,
-            all columns of a station are one, measured at the moving end's place at the carrier.
+        by_antenna: whether antennas with places of their own and far tones are groups of their own; else
+            columns of a station are one, measured at the moving end's place at the carrier.
     """
     require_waves(data.site)
-    alike, order = np.zeros(len(rows), np.int64), _order_of(data)
+    alike, order = np.zeros(len(rows), np.int64), _order_in_station(data)
     run = alike if data.run is None else np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
     station = alike if data.station is None or data.site.stations is None else data.station[rows]
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
@@ -163,7 +163,7 @@ def group_channels(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[G
     groups = []
     for number in np.unique(station):
         mine = np.flatnonzero(station == number)
-        for slot in _slots(data, int(number), rows[mine], apart):
+        for slot in _slots_of_station(data, int(number), rows[mine], by_antenna):
             entries = np.ix_(mine, np.array(slot.antennas), np.array(slot.tones))
             measured = mine if data.mask is None else mine[data.mask[rows][entries].all((1, 2))]
             if not len(measured):
@@ -176,7 +176,7 @@ def group_channels(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[G
     return tuple(groups)
 
 
-def _order_of(data: Measurements) -> np.ndarray:
+def _order_in_station(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station."""
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
     order = np.empty(len(data))
@@ -186,11 +186,11 @@ def _order_of(data: Measurements) -> np.ndarray:
     return order
 
 
-def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> list[Slot]:
+def _slots_of_station(data: Measurements, station: int, rows: np.ndarray, by_antenna: bool) -> list[Slot]:
     site, (antennas, tones) = data.site, data.target.shape[1:]
-    centre, carrier = static_place(site, station), carrier_of(site, station)
+    centre, carrier = static_place(site, station), station_carrier(site, station)
     every = tuple(range(antennas))
-    if not apart:
+    if not by_antenna:
         return [Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)]
     # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
@@ -227,7 +227,7 @@ def static_place(site: Site, station: int) -> Tensor:
     return torch.from_numpy(np.asarray(site.static_position, np.float64))
 
 
-def carrier_of(site: Site, station: int) -> float:
+def station_carrier(site: Site, station: int) -> float:
     """Return the carrier [Hz] of a station."""
     if site.stations is not None and site.stations.carrier_hz is not None:
         return float(site.stations.carrier_hz[station])
@@ -264,7 +264,7 @@ def count_static_ends(groups: tuple[Group, ...]) -> int:
     return len({group.slot.station for group in groups})
 
 
-def fit_factors(
+def fit_run_factors(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
@@ -280,7 +280,7 @@ def fit_factors(
     """
     solved = [Factor.from_gram(covariance) for covariance in covariances]
     if factors is None:
-        factors = torch.ones(1, dtype=torch.complex128) if runs == 1 else _run_factors(groups, solved, runs)
+        factors = torch.ones(1, dtype=torch.complex128) if runs == 1 else _fit_factors(groups, solved, runs)
     known = []
     for group, factor in zip(groups, solved, strict=True):
         target = group.target / factors[group.run][:, None]
@@ -299,12 +299,12 @@ def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditione
     return nll
 
 
-def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
+def _fit_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) -> Tensor:
     quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
         # In units of its own power, as groups have scales of their own.
-        own = run_quadratic(factor.inverse.numpy(), group.target.numpy(), run) / max(level, TINY)
+        own = factor_matrix(factor.inverse.numpy(), group.target.numpy(), run) / max(level, TINY)
         quadratic[: len(own), : len(own)] += own
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)
@@ -314,10 +314,10 @@ def _run_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     return measured / measured.abs() if count_static_ends(groups) > 1 else measured
 
 
-def thin_groups(groups: tuple[Group, ...], columns: int, rows: float = math.inf) -> tuple[Group, ...]:
-    """Return at most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
+def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: float = math.inf) -> tuple[Group, ...]:
+    """Return at most `max_groups` groups, spread over all, of at most `max_rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.
     """
-    chosen = np.unique(np.linspace(0, len(groups) - 1, min(columns, len(groups))).round().astype(int))
-    return tuple(groups[number].thin(rows) for number in chosen)
+    chosen = np.unique(np.linspace(0, len(groups) - 1, min(max_groups, len(groups))).round().astype(int))
+    return tuple(groups[number].thin(max_rows) for number in chosen)

@@ -12,6 +12,7 @@ from gsparc.models.channels.columns import Group, Slot, SlotPlaces
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Direct
 from gsparc.models.channels.terms.spherical import Spherical
+from gsparc.models.closed_form import Moments
 from gsparc.processes.density import TINY
 
 
@@ -35,9 +36,9 @@ class SharedGains:
         """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
-            waves, power, away = _waves(prior, group)
+            waves, power, away = _waves_and_powers(prior, group)
             gains.append(away * power * (waves.conj() @ alpha).mean(1))
-            levels.append(scale * float(_away(prior, group.slot)) ** 2)
+            levels.append(scale * float(_distance_to_middle(prior, group.slot)) ** 2)
         each = torch.stack(gains)
         count, gain = len(each), each.mean(0)
         whole, mean = each.abs().square().mean(0), gain.abs().square()
@@ -51,27 +52,27 @@ class SharedGains:
         reliability[:1], explained[:1] = 1.0, steady[:1] - spread[:1]
         return SharedGains(gain * reliability, explained, sum(levels) / count)
 
-    def mean_and_variance(self, prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
+    def predict(self, prior: ChannelPrior, at: SlotPlaces) -> Moments:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
-        before = self.level / _away(prior, at.slot) ** 2 * prior.variance(at)
-        waves, _, away = _waves(prior, at)
+        before = self.level / _distance_to_middle(prior, at.slot) ** 2 * prior.variance(at)
+        waves, _, away = _waves_and_powers(prior, at)
         waves = waves / away[:, None]
         after = before - self.explained @ waves.abs().square()
-        return self.gain @ waves, after.clamp_min(0), before
+        return Moments(self.gain @ waves, after.clamp_min(0), before)
 
 
-def _waves(prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
+def _waves_and_powers(prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
     """Waves (J, n) of an end and its images, powers (J,) of fixed gains and distances to the middle (J,)."""
     terms = [term for term in prior.terms if isinstance(term, Spherical)]
     if not terms:
         none = at.places.new_zeros(0)
         return at.places.new_zeros(0, len(at.places), dtype=torch.complex128), none, none
-    each = [(term.waves(at), term.gains[0], term.away(at.slot)) for term in terms]
+    each = [(term.waves(at), term.split_powers[0], term.source_distances(at.slot)) for term in terms]
     waves, power, away = (torch.cat(parts) for parts in zip(*each, strict=True))
     return waves, power, away
 
 
-def _away(prior: ChannelPrior, slot: Slot) -> Tensor:
+def _distance_to_middle(prior: ChannelPrior, slot: Slot) -> Tensor:
     """Distance () [m] of the end to the places' middle; 1 where no wave of it is known."""
-    direct = prior.get(Direct)
-    return torch.ones((), dtype=torch.float64) if direct is None else direct.away(slot)[0]
+    direct = prior.find_term(Direct)
+    return torch.ones((), dtype=torch.float64) if direct is None else direct.source_distances(slot)[0]

@@ -22,7 +22,7 @@ from gsparc.data.blocks import take
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import Group, Slot, fit_factors, negative_log_likelihood
+from gsparc.models.channels.columns import Group, Slot, fit_run_factors, negative_log_likelihood
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
@@ -60,7 +60,7 @@ class ComplexGP(ClosedForm):
 
     name = "complex_gp"
     both_ends = True
-    count = 0  # type: ignore[assignment]
+    count_gaussians = 0  # type: ignore[assignment]
 
     def __init__(self) -> None:
         self.site: Site | None = None
@@ -74,7 +74,7 @@ class ComplexGP(ClosedForm):
     @property
     def kernel(self) -> Kernel:
         """Its length, noise and power."""
-        return self._fitted().prior.kernel
+        return self._posterior().prior.kernel
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
@@ -85,12 +85,12 @@ class ComplexGP(ClosedForm):
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
         one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
         many = len(known) > MOST_ROWS and one_run
-        notes = self._fit_many(data, known) if many else self._fit_whole(data, known)
+        notes = self._fit_by_neighbours(data, known) if many else self._fit_one_factor(data, known)
         length, noise = float(self.kernel.length), self.kernel.noise
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
         return FitReport(started.spent, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
-    def _kernels(self, places: Tensor, values: Tensor) -> Iterator[Kernel]:
+    def _candidate_kernels(self, places: Tensor, values: Tensor) -> Iterator[Kernel]:
         """Candidates for values (n, R) at places (n, D) [m]; two lengths beside `neighbours`."""
         assert self.site is not None and self.site.wavelength is not None
         if self.site.phase_reference == "neighbours":
@@ -106,7 +106,7 @@ class ComplexGP(ClosedForm):
                 waves = IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber)
                 yield Kernel((waves, WhiteNoise(noise)))
 
-    def _fit_whole(self, data: Measurements, known: np.ndarray) -> list[str]:
+    def _fit_one_factor(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
@@ -114,20 +114,20 @@ class ComplexGP(ClosedForm):
             np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
         )
         rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
-        few = rows.thin(CHOSEN_ON)
+        few = rows.thin_rows(CHOSEN_ON)
         if len(few) < len(rows):
             notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
-        kernels = self._kernels(few.places, few.target)
-        kernel = min(kernels, key=lambda one: negative_log_likelihood(*_aligned(one, few, len(names))))
-        factors, ((_, told),) = _aligned(kernel, rows, len(names))
+        kernels = self._candidate_kernels(few.places, few.target)
+        kernel = min(kernels, key=lambda one: negative_log_likelihood(*_fit_factors(one, few, len(names))))
+        factors, ((_, told),) = _fit_factors(kernel, rows, len(names))
         prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
         self.posterior = Exact.from_values(prior, places, told.values, None, told.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
-            notes.append(self._factors_note(names, run))
+            notes.append(self._describe_factors(names, run))
         return notes
 
-    def _fit_many(self, data: Measurements, known: np.ndarray) -> list[str]:
+    def _fit_by_neighbours(self, data: Measurements, known: np.ndarray) -> list[str]:
         """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours.
 
         A hundred nearest rows of one place, where a robot waited, tell of no other: its mean is taken once.
@@ -137,16 +137,16 @@ class ComplexGP(ClosedForm):
         values = PlaceValues(
             data.moving[known[first]], torch.from_numpy(means), torch.from_numpy(count).double()
         )
-        squares = mean_at_places(data.moving[known], _power(targets))[1]
-        scatter = torch.from_numpy((count * (squares - _power(means))).clip(0))
+        squares = mean_at_places(data.moving[known], _mean_square(targets))[1]
+        scatter = torch.from_numpy((count * (squares - _mean_square(means))).clip(0))
         near = Neighbourhood.from_places(values.places, 0)
         row = covering_rows(values.places, TRIED_ON, 0)
         rows = np.c_[row, near.nearest_rows(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
         at = torch.from_numpy(values.places)
         sample = at[rows], values.values[rows][..., entries], values.count[rows], scatter[row]
-        kernels = self._kernels(at, values.values)
-        kernel = min(kernels, key=lambda one: _density(one, *sample))
+        kernels = self._candidate_kernels(at, values.values)
+        kernel = min(kernels, key=lambda one: _neighbour_nll(one, *sample))
         power = max(float(sample[1][:, 0].abs().square().mean()), TINY)
         prior = Prior(replace(kernel, amplitude=power))
         self.posterior = condition_on_nearest(prior, values, 0, neighbours=NEAREST)
@@ -155,7 +155,7 @@ class ComplexGP(ClosedForm):
         by = f"each query is predicted from the {NEAREST} nearest {of} {len(known)} rows (Vecchia)"
         return [by, f"settings chosen on {len(row)} of them, each given its nearest"]
 
-    def _factors_note(self, names: np.ndarray, run: np.ndarray) -> str:
+    def _describe_factors(self, names: np.ndarray, run: np.ndarray) -> str:
         """A note of the factors of runs (n,), numbers into `names` (runs,)."""
         factors = self.runs.factors.numpy()[:NAMED]
         listed = ", ".join(
@@ -169,20 +169,24 @@ class ComplexGP(ClosedForm):
         """See `Method.predict`."""
         assert self.site is not None
         dtype, kernel = query.tx.dtype, self.kernel
-        posterior = self._fitted().answer(query.places(self.site), dtype == torch.float64)
+        posterior = self._posterior().answer(query.places(self.site), dtype == torch.float64)
         share = posterior.variance / (1 + kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
         told = Prediction(mean, (kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
-        return self.runs.restore_run(told, query.run)
+        return self.runs.apply_factors(told, query.run)
 
-    def _fitted(self) -> Posterior:
+    def _posterior(self) -> Posterior:
         if self.posterior is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
         return self.posterior
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"posterior": to_plain(self._fitted()), "runs": to_plain(self.runs), "shape": list(self.shape)}
+        return {
+            "posterior": to_plain(self._posterior()),
+            "runs": to_plain(self.runs),
+            "shape": list(self.shape),
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
@@ -194,19 +198,19 @@ class ComplexGP(ClosedForm):
         return 0 if self.posterior is None else len(self.posterior.places)
 
 
-def _power(channels: np.ndarray) -> np.ndarray:
+def _mean_square(channels: np.ndarray) -> np.ndarray:
     """Mean square (n,) float64 of channels (n, R)."""
     return (np.abs(channels) ** 2).mean(1, dtype=np.float64)
 
 
-def _aligned(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
+def _fit_factors(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """See `columns.fit_factors`; of a kernel of unit power."""
     gram = kernel.correlations(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
-    return fit_factors((rows,), [gram], runs)
+    return fit_run_factors((rows,), [gram], runs)
 
 
-def _density(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
+def _neighbour_nll(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
     """Negative log density of rows given their neighbours at the best power, visits to one place included.
 
     Args:

@@ -26,7 +26,7 @@ def sample_stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     for group in thin_groups(groups, COLUMNS):
         order = torch.argsort(group.order, stable=True)
         start = max(len(order) - STRETCH, 0) // 2
-        stretches.append(group.take(order[start : start + STRETCH]))
+        stretches.append(group.select_rows(order[start : start + STRETCH]))
     return tuple(stretches)
 
 

@@ -60,11 +60,11 @@ class BasisGroup:
         return BasisGroup(group, basis, pieces, design, target, rest)
 
     @property
-    def is_whole(self) -> bool:
+    def is_uncompressed(self) -> bool:
         """Whether places tell so many waves apart that nothing is compressed."""
         return len(self.target) == len(self.group)
 
-    def own(self, prior: ChannelPrior) -> Tensor:
+    def powers(self, prior: ChannelPrior) -> Tensor:
         """Return powers (P,) as this end has them."""
         return (self.design @ learned_parameters(prior)).exp()
 
@@ -112,7 +112,7 @@ def compress_groups(
     # Relative to the diffuse field: eigenvalues of its correlation far below are lost in the noise.
     noise = prior.noise / float(prior[Isotropic].power)
     for group in groups:
-        key = group.displacements, group.slot.wavenumber, prior.frame.envelope, noise
+        key = group.displacement_key, group.slot.wavenumber, prior.frame.envelope, noise
         alike = partial(prior[Isotropic].correlation, group, group)
         basis = get_or_make(cache, key, partial(Basis.from_matrix, key, group.places, alike, noise, cache))
         pieces = tuple(piece for term in prior.signals for piece in term.covariances_in_basis(group, basis))
@@ -121,20 +121,20 @@ def compress_groups(
     return tuple(parts)
 
 
-def without_rows(part: BasisGroup, left_out: Tensor) -> BasisGroup:
-    """Return the rows but those of `left_out` (n,) bool, from the same matrices."""
-    rest = torch.nonzero(~left_out).flatten()
+def drop_rows(part: BasisGroup, mask: Tensor) -> BasisGroup:
+    """Return the rows but those of `mask` (n,) bool, from the same matrices."""
+    rest = torch.nonzero(~mask).flatten()
     # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
     pieces = tuple(piece.change_basis(mixed) for piece in part.pieces)
-    return BasisGroup.from_group(part.group.take(rest), basis, pieces, part.design)
+    return BasisGroup.from_group(part.group.select_rows(rest), basis, pieces, part.design)
 
 
 def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
-    powers = power[:-1].split([piece.count for piece in part.pieces])
+    powers = power[:-1].split([piece.count_powers for piece in part.pieces])
     for piece, level in zip(part.pieces, powers, strict=True):
         covariance = piece.add_to(covariance, level)
     covariance.diagonal().add_(noise)
@@ -155,12 +155,12 @@ def power_gradient(part: BasisGroup, power: Tensor, at: SolvedGroup) -> Tensor:
     noise = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[-1]
     # Slope of `rest / (scale noise)`, the quadratic form outside the basis.
     noise = noise - part.rest / (at.scale * power[-1] ** 2)
-    return torch.cat([*(piece.traces(weight) for piece in part.pieces), noise[None]]) * power
+    return torch.cat([*(piece.traces_of_products(weight) for piece in part.pieces), noise[None]]) * power
 
 
 def negative_log_evidence(parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> float:
     """Return the negative log marginal likelihood of all groups [nats]."""
-    return sum(solve_group(part, part.own(prior)).nll for part in parts)
+    return sum(solve_group(part, part.powers(prior)).nll for part in parts)
 
 
 def fit_powers(
@@ -187,14 +187,14 @@ def fit_terms(
     begin = torch.cat([term.parameters() for term in terms]).clamp(low, high)
     sizes = [len(term.parameters()) for term in terms]
 
-    def penalty(at: Tensor) -> Tensor:
+    def negative_log_prior(at: Tensor) -> Tensor:
         each = zip(terms, at.split(sizes), strict=True)
         own = torch.stack([term.penalty(part, shrinkage) for term, part in each]).sum()
         return own + WEAK * (at - begin).square().sum()
 
-    def told(point: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost_and_slopes(point: np.ndarray) -> tuple[float, np.ndarray]:
         at = torch.from_numpy(point).requires_grad_()
-        value = penalty(at)
+        value = negative_log_prior(at)
         (gradient,) = torch.autograd.grad(value, at)
         at, total = at.detach(), float(value.detach())
         for part in parts:
@@ -205,7 +205,7 @@ def fit_terms(
         return total, gradient.numpy()
 
     optimum = minimize(
-        told, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, callback=stop_when_late,
+        cost_and_slopes, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, callback=stop_when_late,
         options={"maxiter": steps, "ftol": SETTLED},
     )  # fmt: skip
     found = torch.from_numpy(optimum.x)

@@ -19,7 +19,7 @@ from gsparc.models.channels.columns import (
     Group,
     Slot,
     SlotPlaces,
-    fit_factors,
+    fit_run_factors,
     group_channels,
     query_ends,
     static_place,
@@ -116,13 +116,13 @@ class ChannelField(ClosedForm):
         return FitReport(budget.by_clock.wall, notes, budget.limited_by)
 
     @property
-    def apart(self) -> bool:
+    def by_antenna(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
-        return self.prior.get(Direct) is not None or self.count_components() > 0
+        return self.prior.find_term(Direct) is not None or self.count_components() > 0
 
     def count_components(self) -> int:
         """Return the number of images."""
-        images = self.prior.get(Images)
+        images = self.prior.find_term(Images)
         return 0 if images is None else len(images.planes)
 
     @property
@@ -132,7 +132,7 @@ class ChannelField(ClosedForm):
 
     def objects(self) -> SiteObjects:
         """Return the mirror planes that static ends share."""
-        images = self.prior.get(Images)
+        images = self.prior.find_term(Images)
         return SiteObjects.from_arrays(planes=None if images is None else images.planes.numpy())
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -147,14 +147,14 @@ class ChannelField(ClosedForm):
             )
         self.rows = np.asarray(rows)
         runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
-        self._solve(group_channels(data, self.rows, self.apart), runs, None)
+        self._condition_groups(group_channels(data, self.rows, self.by_antenna), runs, None)
 
-    def _solve(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
+    def _condition_groups(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
         prior = self.prior
-        both = zip(prior.of_groups(groups), groups, strict=True)
+        both = zip(prior.signal_covariances(groups), groups, strict=True)
         covariances = [signal + prior.disturbance(group) for signal, group in both]
-        factors, told = fit_factors(groups, covariances, len(runs), factors)
+        factors, told = fit_run_factors(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
         self.weights = tuple(Weights(group, given, max(given.power, TINY), *rest) for group, given in told)
@@ -172,13 +172,13 @@ class ChannelField(ClosedForm):
         row was learned of, what ends have in common answers (`SharedGains`).
         """
         # The longest group's covariance with a chunk is the largest matrix of an answer.
-        longest = max(len(each.group) for each in self._conditioned())
+        longest = max(len(each.group) for each in self._require_weights())
         moving, static, turned, station = query_ends(self.site, query.tx, query.rx)
         if query.station is not None and self.site.stations is not None:
             station = query.station.cpu()
         dtype, device = query.tx.dtype, query.tx.device
         parts = [
-            self._answer(moving[part], static[part], turned[part], station[part], dtype)
+            self._predict_part(moving[part], static[part], turned[part], station[part], dtype)
             for part in torch.arange(len(moving)).split(max(ENTRIES // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
@@ -188,36 +188,36 @@ class ChannelField(ClosedForm):
             (after / before.clamp_min(TINY)).clamp(0, 1).to(dtype).to(device),
             share.to(device) if self.count_components() else None,
         )
-        return self.runs.restore_run(told, query.run)
+        return self.runs.apply_factors(told, query.run)
 
-    def _answer(
-        self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor, dtype: torch.dtype
+    def _predict_part(
+        self, moving: Tensor, static: Tensor, rotation: Tensor, station: Tensor, dtype: torch.dtype
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
-        prior, images, size = self.prior, self.prior.get(Images), math.prod(self.channel)
+        prior, images, size = self.prior, self.prior.find_term(Images), math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
         # Without images it is not told, and needs no memory of its own.
         share = mean if images is None else torch.zeros_like(mean)
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
 
-        def tell(slot: Slot, here: Tensor, said: Tensor, variance: Tensor, whole: Tensor) -> None:
-            slot.put(mean, here, said)
-            for total, part in ((after, variance), (before, whole)):
+        def add_slot(slot: Slot, rows: Tensor, values: Tensor, variance: Tensor, power: Tensor) -> None:
+            slot.write_entries(mean, rows, values)
+            for total, part in ((after, variance), (before, power)):
                 # Variances are means over all A K entries, of which this slot has so many.
-                total.index_add_(0, here, part * (said.shape[1] / size))
+                total.index_add_(0, rows, part * (values.shape[1] / size))
 
-        for alike in self._by_places(moving, turned, station):
+        for alike in self._group_by_places(moving, rotation, station):
             asked = [SlotPlaces(known.group.slot, places) for known, _, places in alike]
             crosses = prior.end_covariances(asked, [known.group for known, _, _ in alike])
             for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
                 if images is not None:
-                    at.slot.put(share, here, known.given.mean(images.covariance(at, known.group)))
+                    at.slot.write_entries(share, here, known.given.mean(images.covariance(at, known.group)))
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
                 removed = known.given.explained_variance(cross) if exact else known.explained_variance(cross)
                 whole = prior.variance(at) + prior.disturbance_variance
                 left = known.scale * (whole - removed).clamp_min(0)
-                tell(at.slot, here, known.given.mean(cross), left, known.scale * whole)
+                add_slot(at.slot, here, known.given.mean(cross), left, known.scale * whole)
         unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
         for place in static[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (static == place).all(1)).flatten()
@@ -227,13 +227,13 @@ class ChannelField(ClosedForm):
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
                 slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
-                at = SlotPlaces(slot, slot.antenna_places(moving[here], turned[here]))
-                common, left, whole = self.common.mean_and_variance(prior, at)
-                tell(slot, here, common[:, None].expand(-1, outputs), left, whole)
+                at = SlotPlaces(slot, slot.antenna_places(moving[here], rotation[here]))
+                common, left, whole = self.common.predict(prior, at)
+                add_slot(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
 
-    def _by_places(
-        self, moving: Tensor, turned: Tensor, station: Tensor
+    def _group_by_places(
+        self, moving: Tensor, rotation: Tensor, station: Tensor
     ) -> list[list[tuple[Weights, Tensor, Tensor]]]:
         """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
         alike: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
@@ -241,9 +241,9 @@ class ChannelField(ClosedForm):
             here = torch.nonzero(station == number).flatten()
             for known in self.stations.get(number, ()):
                 slot, learned = known.group.slot, known.group
-                places = slot.antenna_places(moving[here], turned[here])
+                places = slot.antenna_places(moving[here], rotation[here])
                 here_and_there = (to_numpy(one).tobytes() for one in (places, learned.places[:1]))
-                key = slot.wavenumber, learned.displacements, *here_and_there
+                key = slot.wavenumber, learned.displacement_key, *here_and_there
                 alike.setdefault(key, []).append((known, here, places))
         return list(alike.values())
 
@@ -254,27 +254,27 @@ class ChannelField(ClosedForm):
         """
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
-        for known in self._conditioned():
+        for known in self._require_weights():
             group, outputs = known.group, known.group.target.shape[1]
             other = self.prior.disturbance(group).to(torch.complex128)
             residual, error = known.given.left_out_signal(other)
             assert error is not None
             predicted = group.target - residual
-            group.slot.put(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
+            group.slot.write_entries(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
             # Weighed by entries of the group, as the sum is divided by those of all groups.
             level = known.scale * outputs * self.runs.factors[group.run].abs().square()
             variance.index_add_(0, group.rows, error * level)
             entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
         return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())
 
-    def _conditioned(self) -> tuple[Weights, ...]:
+    def _require_weights(self) -> tuple[Weights, ...]:
         if not self.weights:
             raise ValueError("waves: not conditioned yet; call fit or condition first")
         return self.weights
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`; factors are computed again by `restore`."""
-        groups = [each.group for each in self._conditioned()]
+        groups = [each.group for each in self._require_weights()]
         return {
             "prior": self.prior.state(), "channel": list(self.channel), "rows": torch.from_numpy(self.rows),
             "runs": to_plain(self.runs), "groups": [group.state(self.runs.factors) for group in groups],
@@ -286,4 +286,4 @@ class ChannelField(ClosedForm):
         self.site, self.channel = site, (antennas, tones)
         self.prior, self.rows = ChannelPrior.read(state["prior"]), state["rows"].numpy()
         runs = from_plain(state["runs"])
-        self._solve(tuple(map(Group.read, state["groups"])), runs.runs, runs.factors)
+        self._condition_groups(tuple(map(Group.read, state["groups"])), runs.runs, runs.factors)

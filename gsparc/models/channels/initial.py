@@ -21,7 +21,7 @@ from gsparc.models.channels import drift
 from gsparc.models.channels.columns import (
     Group,
     count_static_ends,
-    fit_factors,
+    fit_run_factors,
     group_channels,
     negative_log_likelihood,
     thin_groups,
@@ -31,13 +31,13 @@ from gsparc.models.channels.evidence import (
     BasisGroup,
     Grouping,
     compress_groups,
+    drop_rows,
     fit_powers,
     left_out_errors,
     negative_log_evidence,
     normalise_power,
-    without_rows,
 )
-from gsparc.models.channels.kernels import bisected_cells, isotropic_correlation, spread_directions
+from gsparc.models.channels.kernels import isotropic_correlation, number_cells_by_bisection, spread_directions
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import find_static_offset
@@ -134,19 +134,19 @@ def find_terms(
     Raises:
         ValueError: the data are no channels of a known carrier with one static end.
     """
-    start, factors, note = _isotropic(data, rows, budget)
+    start, factors, note = _fit_isotropic(data, rows, budget)
     every = group_channels(data, rows, True)
     every = tuple(normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
     most = budget.effort.term_rows
     groups, cache = thin_groups(every, COLUMNS, most), Cache()
-    if compress_groups(groups[:1], start, cache)[0].is_whole:
+    if compress_groups(groups[:1], start, cache)[0].is_uncompressed:
         groups = thin_groups(every, DENSE_COLUMNS, min(most, DENSE_ROWS))
     notes, wavelength = [note], 2 * math.pi / every[0].slot.wavenumber
     search = _Search(replace(settings, rows=most), groups, every, wavelength, cache)
-    steps = [search._measured(start, search._compressed(start))]
+    steps = [search._measure(start, search._compress(start))]
     try:
         with cancel_when(budget.is_spent):  # what the seconds end is as if it had not been tried
-            search.grow(steps, notes)
+            search.add_terms(steps, notes)
     except Cancelled:
         notes.append("waves: the time limit ended the search for terms")
     return steps[-1].prior, tuple(notes)
@@ -158,13 +158,17 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudge
     few = ChannelSettings(directions=False, correlated=False, mirrors=0)
     prior, _ = find_terms(data, rows, few, budget)
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
-    both = zip(prior.of_groups(groups), groups, strict=True)
+    both = zip(prior.signal_covariances(groups), groups, strict=True)
     runs = np.unique(np.asarray(data.run)[rows])
-    factors, _ = fit_factors(groups, [signal + prior.disturbance(group) for signal, group in both], len(runs))
+    factors, _ = fit_run_factors(
+        groups, [signal + prior.disturbance(group) for signal, group in both], len(runs)
+    )
     return RunFactors(runs, factors)
 
 
-def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[ChannelPrior, Tensor, str]:
+def _fit_isotropic(
+    data: Measurements, rows: np.ndarray, budget: TimeBudget
+) -> tuple[ChannelPrior, Tensor, str]:
     """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
     groups = group_channels(data, rows, False)
     looked = thin_groups(groups, COLUMNS, budget.effort.chosen_on)
@@ -178,7 +182,7 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
             if tried and budget.is_spent():
                 break
             eye = [noise * torch.eye(len(each), dtype=each.dtype) for each in bounded]
-            factors, told = fit_factors(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
+            factors, told = fit_run_factors(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
             tried.append((negative_log_likelihood(factors, told), factors, length * wavelength, noise))
     _, factors, length, noise = min(tried, key=lambda t: t[0])
     everywhere = torch.cat([group.places for group in groups])
@@ -190,7 +194,7 @@ def _isotropic(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tupl
     return ChannelPrior((Isotropic(frame, one), Noise(frame, noise * one))), factors, note
 
 
-def _strongest(prior: ChannelPrior) -> ChannelPrior:
+def _drop_weak_directions(prior: ChannelPrior) -> ChannelPrior:
     """What all directions have in common, and weak ones, made part of the isotropic field."""
     isotropic, directions = prior[Isotropic], prior[Directions]
     beyond = directions.power - directions.power.min()
@@ -202,15 +206,15 @@ def _strongest(prior: ChannelPrior) -> ChannelPrior:
     )
 
 
-def _groupings(places: Tensor) -> list[Grouping]:
+def _left_out_groupings(places: Tensor) -> list[Grouping]:
     """Rows (n,) left out one by one, then in the cells of each of `DEPTHS`."""
-    deep = [rows_of_groups(bisected_cells(places.numpy(), depth)) for depth in DEPTHS]
+    deep = [rows_of_groups(number_cells_by_bisection(places.numpy(), depth)) for depth in DEPTHS]
     return [None, *(groups if len(groups) < len(places) else None for groups in deep)]
 
 
-def _left_out(part: BasisGroup, prior: ChannelPrior) -> np.ndarray:
+def _left_out_squares(part: BasisGroup, prior: ChannelPrior) -> np.ndarray:
     """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
-    errors = left_out_errors(part, part.own(prior), _groupings(part.group.places))
+    errors = left_out_errors(part, part.powers(prior), _left_out_groupings(part.group.places))
     return np.stack([error.abs().square().mean(1).numpy() for error in errors])
 
 
@@ -224,31 +228,31 @@ class _Search:
     wavelength: float
     cache: Cache
 
-    def grow(self, steps: list[Candidate], notes: list[str]) -> None:
+    def add_terms(self, steps: list[Candidate], notes: list[str]) -> None:
         """Append what each further term makes of the last of `steps`."""
         wanted = self.settings
 
-        def step(after: Candidate, name: str) -> None:
-            steps.append(self._step(steps[-1], after, name, notes))
+        def append_better(after: Candidate, name: str) -> None:
+            steps.append(self._choose(steps[-1], after, name, notes))
 
-        step(self._fitted(steps[-1].prior), "powers by likelihood")
-        one_end = self.one_end  # where both move, what waves have in common is not known
+        append_better(self._refit(steps[-1].prior), "powers by likelihood")
+        one_end = self.has_static_end  # where both move, what waves have in common is not known
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (known or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
-            step(self._with_fixed(steps[-1], direct), "leakage and direct wave")
-        if wanted.mirrors and steps[-1].prior.get(Direct) and count_static_ends(self.every) > 1:
-            mirrored = self._with_mirrors(steps[-1])
+            append_better(self._add_leakage_and_direct(steps[-1], direct), "leakage and direct wave")
+        if wanted.mirrors and steps[-1].prior.find_term(Direct) and count_static_ends(self.every) > 1:
+            mirrored = self._add_mirrors(steps[-1])
             if mirrored is not None:
-                step(mirrored, f"mirror planes of all ends ({len(mirrored.prior[Images].planes)})")
+                append_better(mirrored, f"mirror planes of all ends ({len(mirrored.prior[Images].planes)})")
         if wanted.directions and one_end:
-            step(self._with_directions(steps[-1]), "directions")
+            append_better(self._add_directions(steps[-1]), "directions")
         if count_static_ends(self.every) > 1:
-            self._of_all_ends(steps, known, notes)
+            self._refit_on_all_ends(steps, known, notes)
         if wanted.correlated:
-            steps.append(self._with_drift(steps[-1], notes))
+            steps.append(self._add_drift(steps[-1], notes))
 
-    def _step(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
+    def _choose(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
         keep = after.beats(before)
         ratio = after.errors / before.errors
         gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
@@ -258,32 +262,32 @@ class _Search:
         )
         return after if keep else before
 
-    def _compressed(self, prior: ChannelPrior) -> tuple[BasisGroup, ...]:
+    def _compress(self, prior: ChannelPrior) -> tuple[BasisGroup, ...]:
         return compress_groups(self.groups, prior, self.cache)
 
-    def _measured(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
+    def _measure(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
         """With what left-out rows say."""
-        errors = np.mean([_left_out(part, prior).mean(1) for part in parts], axis=0)
+        errors = np.mean([_left_out_squares(part, prior).mean(1) for part in parts], axis=0)
         numbers = sum(2 * group.target.numel() for group in self.groups)
         # What the terms beside the isotropic field must gain [nats].
         worth = 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
         return Candidate(prior, negative_log_evidence(parts, prior) + worth, errors)
 
-    def _fitted(self, prior: ChannelPrior) -> Candidate:
+    def _refit(self, prior: ChannelPrior) -> Candidate:
         """With powers of largest evidence; measured."""
-        parts = self._compressed(prior)
-        return self._measured(fit_powers(parts, prior, SHRINKAGE)[0], parts)
+        parts = self._compress(prior)
+        return self._measure(fit_powers(parts, prior, SHRINKAGE)[0], parts)
 
     @property
-    def one_end(self) -> bool:
+    def has_static_end(self) -> bool:
         """Whether one end stands."""
         return not has_both_ends(self.every[0].places)
 
-    def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
+    def _add_leakage_and_direct(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; lengths by a short fit each, then powers."""
         prior, frame = before.prior, before.prior.frame
         level = NEW * prior[Isotropic].power
-        if self.settings.constant and self.one_end:
+        if self.settings.constant and self.has_static_end:
             prior = prior.with_terms(Leakage(frame, level))
         if direct:
             prior = prior.with_terms(Direct(frame, level.repeat(2)))
@@ -291,61 +295,63 @@ class _Search:
         for bound in sorted({frame.envelope, LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if direct else GAINS[:1]:
                 trial = prior.change_frame(envelope=bound, gain=gain * self.wavelength)
-                tried.append(fit_powers(self._compressed(trial), trial, 0.0, SHORT))
-        return self._moved(self._fitted(min(tried, key=lambda each: each[1])[0]))
+                tried.append(fit_powers(self._compress(trial), trial, 0.0, SHORT))
+        return self._move_static_ends(self._refit(min(tried, key=lambda each: each[1])[0]))
 
-    def _moved(self, candidate: Candidate) -> Candidate:
+    def _move_static_ends(self, candidate: Candidate) -> Candidate:
         """With static ends where they really are."""
         prior = candidate.prior
-        if prior.get(Direct) is None or not self.one_end:
+        if prior.find_term(Direct) is None or not self.has_static_end:
             return candidate
-        offset = find_static_offset(self._compressed(prior), prior, self.wavelength)
+        offset = find_static_offset(self._compress(prior), prior, self.wavelength)
         if offset is None:
             return candidate
-        moved = self._fitted(prior.change_frame(offset=offset))
+        moved = self._refit(prior.change_frame(offset=offset))
         return moved if moved.nll < candidate.nll else candidate
 
-    def _with_mirrors(self, before: Candidate) -> Candidate | None:
+    def _add_mirrors(self, before: Candidate) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
         prior = before.prior
-        rough = replace(self, groups=thin_groups(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(prior)
+        rough = replace(self, groups=thin_groups(self.every, ROUGH_ENDS, ROUGH_ROWS))._compress(prior)
         wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
         most = self.settings.mirrors
-        planes = find_mirrors(rough, wide._compressed(prior), prior, self.wavelength, most)
+        planes = find_mirrors(rough, wide._compress(prior), prior, self.wavelength, most)
         if not len(planes):
             return None
         images = Images.from_planes(prior.frame, planes, NEW * float(prior[Isotropic].power))
-        mirrored = self._fitted(prior.with_terms(images))
+        mirrored = self._refit(prior.with_terms(images))
         images, power = mirrored.prior[Images], mirrored.prior.power
         heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return mirrored
-        return self._fitted(mirrored.prior.with_terms(images.select(heard)))
+        return self._refit(mirrored.prior.with_terms(images.select_planes(heard)))
 
-    def _with_directions(self, before: Candidate) -> Candidate:
+    def _add_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
-        prior = self._directed(before.prior, self.settings.angles, CONCENTRATION)
-        parts = self._compressed(prior)
-        errors = self._crossed(parts, prior)
+        prior = self._set_directions(before.prior, self.settings.angles, CONCENTRATION)
+        parts = self._compress(prior)
+        errors = self._cross_validate(parts, prior)
         prior, _ = fit_powers(parts, prior, SHRINKAGE, 2 * SHORT)
-        after = self._fitted(_strongest(prior))
+        after = self._refit(_drop_weak_directions(prior))
         return replace(after, errors=np.maximum(after.errors, errors))
 
-    def _of_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
+    def _refit_on_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
         wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
-        steps.append(wide._fitted(steps[-1].prior))
-        steps.append(wide._moved(steps[-1]))
+        steps.append(wide._refit(steps[-1].prior))
+        steps.append(wide._move_static_ends(steps[-1]))
         if known and self.settings.directions:
             wanted = self.settings
-            tied = wide._fitted(self._directed(steps[-1].prior, wanted.tied, wanted.narrow, wanted.knots))
-            steps.append(wide._step(steps[-1], tied, "directions by angles to ends", notes))
+            tied = wide._refit(
+                self._set_directions(steps[-1].prior, wanted.tied, wanted.narrow, wanted.knots)
+            )
+            steps.append(wide._choose(steps[-1], tied, "directions by angles to ends", notes))
 
-    def _directed(
+    def _set_directions(
         self, prior: ChannelPrior, count: int, concentration: float, knots: int = 0
     ) -> ChannelPrior:
         """With so many directions in place of those there are, of equal powers and factors."""
-        group, isotropic, old = max(self.groups, key=len), prior[Isotropic], prior.get(Directions)
+        group, isotropic, old = max(self.groups, key=len), prior[Isotropic], prior.find_term(Directions)
         angles = spread_directions(group.places, group.slot.wavenumber, count)
         level = isotropic.power if old is None else isotropic.power + old.power.sum()
         power = ((1 - SHARED) * level / len(angles)).repeat(len(angles))
@@ -353,32 +359,32 @@ class _Search:
         fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
         return prior.with_terms(replace(isotropic, power=SHARED * level), fresh)
 
-    def _crossed(self, parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> np.ndarray:
+    def _cross_validate(self, parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
-        number = [bisected_cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
+        number = [number_cells_by_bisection(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
         errors = np.zeros(1 + len(DEPTHS))
         for fold in range(FOLDS):
             in_fold = [np.equal(each, fold) for each in number]
             both = zip(parts, in_fold, strict=True)
-            rest = tuple(without_rows(part, torch.from_numpy(left)) for part, left in both if not left.all())
+            rest = tuple(drop_rows(part, torch.from_numpy(left)) for part, left in both if not left.all())
             # Of few rows all may be of one fold: then nothing tells powers.
             learned = fit_powers(rest, prior, SHRINKAGE, 2 * SHORT)[0] if rest else prior
             for part, left in zip(parts, in_fold, strict=True):
-                errors += _left_out(part, learned)[:, left].sum(1) / len(left) / len(parts)
+                errors += _left_out_squares(part, learned)[:, left].sum(1) / len(left) / len(parts)
         return errors
 
-    def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
+    def _add_drift(self, before: Candidate, notes: list[str]) -> Candidate:
         groups = drift.sample_stretches(self.every)
-        known = before.prior.of_groups(groups)
+        known = before.prior.signal_covariances(groups)
         prior, gain = drift.fit_drift(groups, known, before.prior)
         errors = np.zeros((2, 1 + len(DEPTHS)))
         for group, signal in zip(groups, known, strict=True):
             for sums, at in zip(errors, (before.prior, prior), strict=True):
                 other = at.disturbance(group).to(torch.complex128)
                 given = Conditioned.from_gram(signal + other, group.target)
-                left = [given.left_out_signal(other, rows)[0] for rows in _groupings(group.places)]
+                left = [given.left_out_signal(other, rows)[0] for rows in _left_out_groupings(group.places)]
                 sums += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         after = Candidate(prior, worth - gain, errors[1])
         start = replace(before, nll=0.0, errors=errors[0])
-        return after if self._step(start, after, "noise correlated over rows", notes) is after else before
+        return after if self._choose(start, after, "noise correlated over rows", notes) is after else before

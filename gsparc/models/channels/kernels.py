@@ -102,7 +102,7 @@ def spread_directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
     return half @ basis.T
 
 
-def bisected_cells(places: np.ndarray, depth: int) -> np.ndarray:
+def number_cells_by_bisection(places: np.ndarray, depth: int) -> np.ndarray:
     """Return numbers (n,) of 2^depth cells of near places (n, 3), halved across the widest axis."""
     number = np.zeros(len(places), np.int64)
     for _ in range(depth):

@@ -49,15 +49,18 @@ class _Searcher:
         self.ends = torch.stack([probe.group.slot.end for probe in probes])
         self.planes, self.risen = torch.zeros(0, 4, dtype=torch.float64), 0.0
 
-    def likelihood_gains(
-        self, probes: Probes, planes: Tensor, known: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision
+    def plane_gains(
+        self,
+        probes: Probes,
+        planes: Tensor,
+        precision: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
     ) -> Tensor:
         """Rise of the log likelihood (W, levels) of each plane alone."""
 
-        def waves(probe: Probe, chunk: Tensor) -> Tensor:
+        def image_waves(probe: Probe, chunk: Tensor) -> Tensor:
             return Images.from_planes(self.frame, planes[chunk]).waves(probe.group)
 
-        return likelihood_gains(probes, len(planes), waves, LEVELS, known)
+        return likelihood_gains(probes, len(planes), image_waves, LEVELS, precision)
 
     def add_plane(self, plane: Tensor, level: float, gain: float) -> None:
         """One more plane (4,)."""
@@ -68,12 +71,12 @@ class _Searcher:
             for each in (self.rough, self.probes)
         )
 
-    def initial_planes(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
+    def separate_planes(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
         """The best planes whose images of the ends are apart."""
         chosen: list[Tensor] = []
         for number in scores.argsort(descending=True).tolist():
             tried = Images.from_planes(self.frame, torch.stack([*chosen, grid[number]]))
-            placed = tried.mirror(self.ends)
+            placed = tried.mirror_ends(self.ends)
             away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
             if not bool((away < APART * self.wavelength).any()):
                 chosen.append(grid[number])
@@ -97,7 +100,7 @@ class _Searcher:
             turned = turned / turned.norm(dim=1, keepdim=True)
             shifted = away - normal @ middle + share * shift * moves[:, 2]
             tried = torch.cat([turned, (shifted + turned @ middle)[:, None]], 1)
-            gains = self.likelihood_gains(self.probes, tried)
+            gains = self.plane_gains(self.probes, tried)
             best = int(gains.argmax()) // len(LEVELS)
             plane, level = tried[best], LEVELS[int(gains[best].argmax())]
             (normal, away), gain = (plane[:-1], plane[-1]), float(gains[best].max())
@@ -106,7 +109,7 @@ class _Searcher:
 
 def find_mirrors(
     coarse: tuple[BasisGroup, ...], parts: tuple[BasisGroup, ...], prior: ChannelPrior,
-    wavelength: float, most: int,
+    wavelength: float, max_planes: int,
 ) -> Tensor:  # fmt: skip
     """Return planes (W, 4) float64, local; none where all together are not worth it.
 
@@ -115,20 +118,20 @@ def find_mirrors(
         parts: of all ends.
         prior: the terms beside.
         wavelength: [m].
-        most: planes.
+        max_planes: planes.
     """
     rough, probes = (tuple(Probe.from_group(part, prior) for part in each) for each in (coarse, parts))
     search = _Searcher(rough, probes, prior.frame, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
-    grid, turn = candidate_planes(rough, prior.frame, wavelength)
-    while len(search.planes) < most:
+    grid, turn = planes_and_azimuth_step(rough, prior.frame, wavelength)
+    while len(search.planes) < max_planes:
         raise_if_cancelled()
-        scores = search.likelihood_gains(search.rough, grid, _about).max(1).values
+        scores = search.plane_gains(search.rough, grid, _approximate_precision).max(1).values
         if not len(search.planes):
             top = scores.topk(min(PROMISING, len(grid))).indices
             grid, scores = grid[top], scores[top]
-        moved = [search.refine_plane(start, turn / 2) for start in search.initial_planes(grid, scores)]
+        moved = [search.refine_plane(start, turn / 2) for start in search.separate_planes(grid, scores)]
         plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:
             break
@@ -136,7 +139,7 @@ def find_mirrors(
     return search.planes if 2 * search.risen > LEAST * numbers else search.planes[:0]
 
 
-def candidate_planes(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
+def planes_and_azimuth_step(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
     """Return upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
     places = torch.cat([probe.group.places for probe in probes])
     points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset])
@@ -157,7 +160,7 @@ def candidate_planes(probes: Probes, frame: Frame, wavelength: float) -> tuple[T
     return torch.cat(planes), turn
 
 
-def _about(probe: Probe, waves: Tensor) -> Tensor:
+def _approximate_precision(probe: Probe, waves: Tensor) -> Tensor:
     """`Probe.wave_precision` by that of a few: an isotropic field knows waves from everywhere alike."""
     size = waves.abs().square().sum(1)
     few = torch.linspace(0, len(waves) - 1, min(LOOKED_AT, len(waves))).long()

@@ -23,12 +23,12 @@ class ChannelPrior(Stored):
 
     terms: tuple[ChannelTerm, ...]
 
-    def get(self, kind: type[T]) -> T | None:
+    def find_term(self, kind: type[T]) -> T | None:
         """Return the term of a kind, where there is one."""
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def __getitem__(self, kind: type[T]) -> T:
-        found = self.get(kind)
+        found = self.find_term(kind)
         if found is None:
             raise KeyError(kind.__name__)
         return found
@@ -81,11 +81,11 @@ class ChannelPrior(Stored):
             # From the first part on: `0 + tensor` would copy a matrix for nothing.
             yield sum(parts[1:], parts[0]).to(torch.complex128)
 
-    def of_groups(self, groups: Sequence[Group]) -> list[Tensor]:
+    def signal_covariances(self, groups: Sequence[Group]) -> list[Tensor]:
         """Return covariances (n, n) complex128 of groups' signals; what equal places share is made once."""
         alike: dict[tuple[bytes, float], list[int]] = {}
         for number, group in enumerate(groups):
-            alike.setdefault((group.displacements, group.slot.wavenumber), []).append(number)
+            alike.setdefault((group.displacement_key, group.slot.wavenumber), []).append(number)
         result: list[Tensor] = [torch.empty(0)] * len(groups)
         for numbers in alike.values():
             here = [groups[number] for number in numbers]

@@ -17,6 +17,7 @@ from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.places import ORIGIN
+from gsparc.processes.worker import raise_if_cancelled
 
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
@@ -47,7 +48,7 @@ class Probe:
     @staticmethod
     def from_group(part: BasisGroup, prior: ChannelPrior) -> Probe:
         """Factor a group's covariance with its own powers."""
-        at, basis, noise = solve_group(part, part.own(prior)), part.basis.to(torch.complex128), prior.noise
+        at, basis, noise = solve_group(part, part.powers(prior)), part.basis.to(torch.complex128), prior.noise
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
         root = basis @ Factor.from_gram(inverse + 1e-12 * torch.eye(len(inverse))).lower
@@ -61,13 +62,13 @@ class Probe:
         outside = waves.abs().square().sum(1) - basis
         return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
-    def likelihood_gain(self, waves: Tensor, level: float, known: Tensor | None = None) -> Tensor:
+    def likelihood_gain(self, waves: Tensor, level: float, precision: Tensor | None = None) -> Tensor:
         """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power.
 
-        `known` (m,) stands in for `known(waves)`.
+        `precision` (m,) stands in for `known(waves)`.
         """
         inner = (waves.conj() @ self.alpha).abs().square().sum(1)
-        size = 1 + level * (self.wave_precision(waves) if known is None else known)
+        size = 1 + level * (self.wave_precision(waves) if precision is None else precision)
         return level * inner / size / self.scale - self.alpha.shape[1] * size.log()
 
     def add_wave(self, wave: Tensor, level: float) -> Probe:
@@ -80,15 +81,16 @@ class Probe:
 
 
 def likelihood_gains(
-    probes: Sequence[Probe], count: int, waves: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
-    known: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
+    probes: Sequence[Probe], count: int, waves_of: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
+    wave_precision: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
 ) -> Tensor:  # fmt: skip
-    """Return log likelihood gains (count, levels) of all groups; `waves` (m, n) are of numbers (m,)."""
+    """Return log likelihood gains (count, levels) of all groups; `waves_of` (m, n) are of numbers (m,)."""
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
         for chunk in torch.arange(count).split(max(ENTRIES // len(probe.group), 1)):
-            each = waves(probe, chunk)
-            size = known(probe, each)
+            raise_if_cancelled()
+            each = waves_of(probe, chunk)
+            size = wave_precision(probe, each)
             total[chunk] += torch.stack([probe.likelihood_gain(each, level, size) for level in levels], 1)
     return total
 
@@ -104,19 +106,19 @@ def find_static_offset(
     none = prior.with_terms(replace(direct, power=torch.full_like(direct.power, TINY)))
     probes, level = [Probe.from_group(part, none) for part in parts], float(direct.power.sum())
 
-    def gain(offsets: Tensor) -> Tensor:
-        def waves(probe: Probe, chunk: Tensor) -> Tensor:
+    def log_posterior_gain(offsets: Tensor) -> Tensor:
+        def direct_waves(probe: Probe, chunk: Tensor) -> Tensor:
             moved = (replace(direct, frame=replace(direct.frame, offset=offset)) for offset in offsets[chunk])
             return torch.cat([at.waves(probe.group) for at in moved])
 
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        return likely + likelihood_gains(probes, len(offsets), waves, (level,))[:, 0]
+        return likely + likelihood_gains(probes, len(offsets), direct_waves, (level,))[:, 0]
 
     best, step = ORIGIN, REACH * wavelength / COARSE
     near = torch.arange(-1, 2, dtype=torch.float64)
     coarse = torch.arange(-COARSE, COARSE + 1, dtype=torch.float64)
     for axis in (coarse, *(near / 2**halving for halving in range(1, REFINED + 1))):
         grid = best + step * torch.cartesian_prod(axis, axis, axis)
-        best = grid[gain(grid).argmax()]
-    unmoved, best_gain = gain(torch.stack([ORIGIN, best])).tolist()
+        best = grid[log_posterior_gain(grid).argmax()]
+    unmoved, best_gain = log_posterior_gain(torch.stack([ORIGIN, best])).tolist()
     return best if math.isfinite(best_gain) and best_gain > unmoved else None

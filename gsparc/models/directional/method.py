@@ -17,12 +17,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
+from gsparc.models.closed_form import LeftOutRows, Moments, from_containers, to_containers
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
 from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
-from gsparc.models.image_sources.frame import Frame, SourcesInFrame, require_static_phase
+from gsparc.models.image_sources.frame import Frame, SourcePaths, SourcesInFrame, require_static_phase
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import point_wave, wave_over_band
@@ -71,7 +71,7 @@ class DirectionalGP(SourcesInFrame):
             places, [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
         )
         clusters = triangulate(rays, self.seed)
-        seen = torch.from_numpy(clusters.seen(rays))
+        seen = torch.from_numpy(clusters.seen_points(rays))
         sources = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
         if not len(sources):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
@@ -91,7 +91,7 @@ class DirectionalGP(SourcesInFrame):
         )
         self.site = data.site
         self._refine_positions()
-        self._refit()
+        self._refit_powers_and_kernel()
         changed = self._update_visibility()
         self.posterior.precompute()
         note = (
@@ -101,22 +101,22 @@ class DirectionalGP(SourcesInFrame):
         )
         return FitReport(started.spent, (note,))
 
-    def _few(self, limit: int) -> SightedSources:
+    def _thin_posterior(self, limit: int) -> SightedSources:
         """Every so many-th row, at most `limit`."""
         whole = self.posterior
         some = torch.arange(0, len(whole.rows), max(1, -(-len(whole.rows) // limit)))
-        return replace(whole, rows=whole.rows.take(some), observer=whole.observer[some])
+        return replace(whole, rows=whole.rows.select_rows(some), observer=whole.observer[some])
 
     def _refine_positions(self) -> None:
         """Refine positions by the phases of the channels, where directions leave them uncertain."""
-        few = self._few(REFINEMENT_ROWS)
+        few = self._thin_posterior(REFINEMENT_ROWS)
         correlation = few.kernel.correlation(few.rows.position, few.rows.position)
-        refined = PositionRefinement(few.rows, few.seen, few.positions, correlation).run()
+        refined = PositionRefinement(few.rows, few.seen_by_rows, few.positions, correlation).run()
         self.posterior = replace(self.posterior, positions=refined)
 
-    def _refit(self) -> None:
+    def _refit_powers_and_kernel(self) -> None:
         """Powers and kernel."""
-        few = self._few(SearchSettings.search_rows).fit()
+        few = self._thin_posterior(SearchSettings.search_rows).fit_powers_and_kernel()
         self.posterior = replace(self.posterior, power=few.power, kernel=few.kernel)
 
     def _update_visibility(self) -> int:
@@ -128,13 +128,13 @@ class DirectionalGP(SourcesInFrame):
         if len(rows.unique()) < len(rows):
             return 0
         rays, probability = visibility.seen.float(), visibility.left_out.float()
-        rates = RayErrorRates.initial(rays)
+        rates = RayErrorRates.from_rays(rays)
         for turn in range(VISIBILITY_UPDATES):
             if turn % REFIT_EVERY == REFIT_EVERY - 1:
-                self._refit()
+                self._refit_powers_and_kernel()
             now = self.posterior
-            one = now.gains(now.at_rows(probability)) * now.unobstructed_waves[:, :, None]
-            seen, odds = visibility.seen.float(), rates.odds(rays, probability)
+            one = now.mean_gains(now.arrival_at_rows(probability)) * now.unobstructed_waves[:, :, None]
+            seen, odds = visibility.seen.float(), rates.log_odds_seen(rays, probability)
             flip = entries_to_flip(seen[rows], odds[rows], *now.conditioned.left_out(), one)
             if not bool(flip.any()):
                 break
@@ -146,36 +146,36 @@ class DirectionalGP(SourcesInFrame):
         if changed:
             again = VisibilityGP.from_visibility(visibility.places, visibility.seen)
             self.posterior = replace(self.posterior, visibility=again)
-            self._refit()
+            self._refit_powers_and_kernel()
         return changed
 
-    def sources(self) -> Found:
+    def points_and_amplitudes(self) -> Found:
         """Return places [m], local, and amplitudes of the sources, to start a search from."""
-        return self.posterior.positions.points + self._fitted().middle, self.posterior.power.sqrt()
+        return self.posterior.positions.points + self._fitted_frame().middle, self.posterior.power.sqrt()
 
     # ---- answers ----
-    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`."""
-        process = self.posterior.exact if float64 else self.posterior
+        process = self.posterior.in_float64 if float64 else self.posterior
         at = process.arrival_at(places, torch.tensor(self.frame.carrier_hz))
-        gains = at.probability[:, :, None] * process.gains(at)
+        gains = at.probability[:, :, None] * process.mean_gains(at)
         mean = gains.mT @ wave_over_band(at.away, tones, process.power.dtype)
-        return mean, *process.variance(at, self.frame.carrier_hz)
+        return Moments(mean, *process.error_and_power(at, self.frame.carrier_hz))
 
-    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """See `SourcesInFrame`."""
         at = self.posterior.arrival_at(places, torch.tensor(self.frame.carrier_hz))
         gain = at.probability * point_wave(at.away, self.frame.carrier_hz)
-        gain = self.posterior.gains(at) * gain[:, :, None]
-        return gain.mT, at.away, self.posterior.positions.points
+        gain = self.posterior.mean_gains(at) * gain[:, :, None]
+        return SourcePaths(gain.mT, at.away, self.posterior.positions.points)
 
     def left_out(self) -> LeftOutRows:
         """Return receivers, each predicted from all others; its own visibility is left out, too."""
-        return self._fitted().left_out(self.posterior.rows, self.posterior.left_out())
+        return self._fitted_frame().to_left_out_rows(self.posterior.rows, self.posterior.predict_left_out())
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"frame": self._fitted().state(), "posterior": to_containers(self.posterior)}
+        return {"frame": self._fitted_frame().state(), "posterior": to_containers(self.posterior)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

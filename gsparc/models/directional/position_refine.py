@@ -58,7 +58,7 @@ class UncertainPositions:
     covariance: Tensor
 
     @cached_property
-    def lower(self) -> Tensor:
+    def covariance_factors(self) -> Tensor:
         """(K, 3, 3), Cholesky factors of the covariances."""
         jitter = torch.full_like(self.points, JITTER_M2).diag_embed()
         return Factor.from_gram(self.covariance + jitter, "raise").lower
@@ -66,13 +66,13 @@ class UncertainPositions:
     def phase_vectors(self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
         """Return (K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
         slope = wave_vectors(self.points, places, frequency)
-        return (slope @ self.lower).to(dtype)
+        return (slope @ self.covariance_factors).to(dtype)
 
-    def only(self, index: Tensor) -> UncertainPositions:
+    def select(self, index: Tensor) -> UncertainPositions:
         """Return a subset of the sources."""
         return UncertainPositions(self.points[index], self.covariance[index])
 
-    def uncertain(self, places: Tensor, frequency: Tensor) -> Tensor:
+    def incoherent(self, places: Tensor, frequency: Tensor) -> Tensor:
         """Return indices of the sources that are not coherent over these places."""
         phase_vectors = self.phase_vectors(places, frequency)
         spread = (phase_vectors - phase_vectors.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
@@ -114,10 +114,10 @@ class PositionRefinement:
 
     def run(self) -> UncertainPositions:
         """Return positions and covariances given rays and channels."""
-        uncertain = self.prior.uncertain(self.rows.position, self.rows.frequency)
+        uncertain = self.prior.incoherent(self.rows.position, self.rows.frequency)
         if not len(uncertain):
             return self.current  # directions were exact: nothing to refine
-        self.terms = torch.stack([self._covariance_of(k) for k in range(len(self.prior.points))])
+        self.terms = torch.stack([self._source_covariance(k) for k in range(len(self.prior.points))])
         mean_power = float(self.terms.diagonal(dim1=1, dim2=2).real.sum(0).mean())
         self.power = torch.full((len(self.terms),), 1 / max(mean_power, TINY))
         self.resolved = torch.zeros(len(self.terms), dtype=torch.bool)
@@ -127,14 +127,14 @@ class PositionRefinement:
             self._update_powers()
             before = self.current.points
             for k in order:
-                self._refine(k)
+                self._refine_source(k)
             if float((self.current.points - before).norm(dim=1).max()) < TOLERANCE_M:
                 break
         return self.current
 
-    def _covariance_of(self, k: int) -> Tensor:
+    def _source_covariance(self, k: int) -> Tensor:
         """Covariance (n, n) of the rows by source k of unit power."""
-        one = self.current.only(torch.tensor([k]))
+        one = self.current.select(torch.tensor([k]))
         wave = spherical_waves(self.rows, one.points)[:, 0] * self.visible[:, k]
         phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
         return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
@@ -159,14 +159,14 @@ class PositionRefinement:
             ratio = residual / (outputs * float(given.factor.inverse.diagonal().real.sum()))
             self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
 
-    def _refine(self, k: int) -> None:
+    def _refine_source(self, k: int) -> None:
         """Position and covariance of source k given its rays, the channels and all other sources."""
         conditional = ConditionalLikelihood(self, k)
         if self.resolved[k]:
             places = self.current.points[k][None]
         else:
-            places = conditional.best_separated(self._draws(k), CELL / 2 * self.wavelength)
-        places, spreads = conditional.refined(places)
+            places = conditional.select_separated(self._draw_positions(k), CELL / 2 * self.wavelength)
+        places, spreads = conditional.refine(places)
         log_posterior = conditional.log_posterior(places) + 0.5 * torch.linalg.slogdet(spreads)[1]
         best = int(log_posterior.argmax())
         offset = places - places[best]
@@ -177,16 +177,16 @@ class PositionRefinement:
         points, covariance = self.current.points.clone(), self.current.covariance.clone()
         points[k], covariance[k], self.resolved[k] = places[best], spreads[best], True
         self.current = UncertainPositions(points, covariance)
-        self.terms[k] = self._covariance_of(k)
+        self.terms[k] = self._source_covariance(k)
 
-    def _draws(self, k: int) -> Tensor:
+    def _draw_positions(self, k: int) -> Tensor:
         """Draws (m, 3) from the prior of source k, its mean first."""
         width = torch.linalg.eigvalsh(self.prior.covariance[k]).clamp_min(0).sqrt()
         cells = float((1 + SAME_SIGMAS * width / (CELL * self.wavelength)).prod())
         count = int(min(max(DRAWS_PER_CELL * cells, MIN_DRAWS), MAX_DRAWS))
         draw = torch.randn(count, len(width), generator=self.generator, dtype=width.dtype)
         draw[0] = 0
-        return self.prior.points[k] + draw @ self.prior.lower[k].T
+        return self.prior.points[k] + draw @ self.prior.covariance_factors[k].T
 
 
 class ConditionalLikelihood:
@@ -204,7 +204,7 @@ class ConditionalLikelihood:
         rows, prior = refinement.rows, refinement.prior
         given = condition_with_noise(refinement.sum_source_covariances(k), refinement.noise, rows.target)
         in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
-        self.rows, self.alpha = rows.take(in_view), given.weights[in_view]
+        self.rows, self.alpha = rows.select_rows(in_view), given.weights[in_view]
         self.inverse = given.factor.inverse[in_view[:, None], in_view]
         self.power, self.centre = float(refinement.power[k]), prior.points[k]
         self.precision = torch.linalg.inv(prior.covariance[k])
@@ -218,7 +218,7 @@ class ConditionalLikelihood:
         rays = 0.5 * ((offset @ self.precision) * offset).sum(1)
         return (self.power * matched / scale - self.alpha.shape[1] * scale.log()).double() - rays
 
-    def best_separated(self, points: Tensor, distance: float) -> Tensor:
+    def select_separated(self, points: Tensor, distance: float) -> Tensor:
         """Return the best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
         log_posterior = self.log_posterior(points)
         best: list[Tensor] = []
@@ -227,20 +227,20 @@ class ConditionalLikelihood:
             log_posterior[(points - best[-1]).norm(dim=1) < distance] = -torch.inf
         return torch.stack(best)
 
-    def refined(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def refine(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return positions (m, 3) after Gauss-Newton steps at the best gain, and covariances (m, 3, 3)."""
         best, step_scale = self.log_posterior(points), torch.ones(len(points), dtype=torch.float64)
         for _ in range(STEPS):
-            step, _ = self._step(points)
+            step, _ = self._steps_and_covariances(points)
             tried = points + step_scale[:, None] * step
             log_posterior = self.log_posterior(tried)
             better = log_posterior > best
             points = torch.where(better[:, None], tried, points)
             best = torch.where(better, log_posterior, best)
             step_scale = torch.where(better, 1.0, step_scale / 3)
-        return points, self._step(points)[1]
+        return points, self._steps_and_covariances(points)[1]
 
-    def _step(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def _steps_and_covariances(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3) by Fisher information."""
         waves = spherical_waves(self.rows, points)  # (n, m)
         whitened = self.inverse @ waves

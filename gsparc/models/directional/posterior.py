@@ -95,7 +95,7 @@ class SightedSources:
     kernel: GainKernel
 
     @property
-    def seen(self) -> Tensor:
+    def seen_by_rows(self) -> Tensor:
         """(n, K) float32 of zeros and ones."""
         return self.visibility.seen[self.observer].float()
 
@@ -107,24 +107,24 @@ class SightedSources:
     @cached_property
     def waves(self) -> Tensor:
         """The same, zero where a receiver does not see a source."""
-        return self.unobstructed_waves * self.seen
+        return self.unobstructed_waves * self.seen_by_rows
 
     @cached_property
-    def uncertain(self) -> Tensor:
+    def incoherent(self) -> Tensor:
         """Indices (K',) of the sources that are not coherent over the rows."""
-        return self.positions.uncertain(self.rows.position, self.rows.frequency)
+        return self.positions.incoherent(self.rows.position, self.rows.frequency)
 
     @cached_property
     def phase_vectors(self) -> Tensor:
         """(K', n, 3) of uncertain sources, see `UncertainPositions.phase_vectors`."""
-        return self.positions.only(self.uncertain).phase_vectors(self.rows.position, self.rows.frequency)
+        return self.positions.select(self.incoherent).phase_vectors(self.rows.position, self.rows.frequency)
 
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows given their covariance."""
-        covariance = self._cross(self.waves, self._coherence(), self.power)
+        covariance = self._cross_covariance(self.waves, self._coherence(), self.power)
         return condition_with_noise(
-            covariance * self._correlation(self.kernel), self.kernel.noise, self.rows.target
+            covariance * self._gain_correlation(self.kernel), self.kernel.noise, self.rows.target
         )
 
     @cached_property
@@ -134,7 +134,7 @@ class SightedSources:
         return torch.view_as_real(weights).contiguous()
 
     @cached_property
-    def exact(self) -> SightedSources:
+    def in_float64(self) -> SightedSources:
         """The same in float64, of what was computed in float32."""
         return to_double(self.precompute())
 
@@ -143,14 +143,14 @@ class SightedSources:
         assert len(self.dual_weights) == len(self.rows)
         return self
 
-    def fit(self) -> SightedSources:
+    def fit_powers_and_kernel(self) -> SightedSources:
         """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
         power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, TINY)), self.kernel
-        coherent, correlation = self._coherence(), {each: self._correlation(each) for each in KERNELS}
+        coherent, correlation = (self._coherence(), {each: self._gain_correlation(each) for each in KERNELS})
         for _ in range(ROUNDS):
-            covariance = self._cross(self.waves, coherent, power)
+            covariance = self._cross_covariance(self.waves, coherent, power)
             tried = {
                 each: condition_with_noise(covariance * shared, each.noise, self.rows.target)
                 for each, shared in correlation.items()
@@ -166,43 +166,44 @@ class SightedSources:
     def arrival_at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
         """Return geometry of places (m, 3) [m], frequencies (m,) or () [Hz]; probability (m, K) if known."""
         dtype = self.power.dtype
-        probability = self.visibility.probability(places) if probability is None else probability
+        probability = self.visibility.probability_seen(places) if probability is None else probability
         retained = torch.zeros(0, len(places), len(self.rows), dtype=dtype)
-        if len(self.uncertain):
-            several = self.positions.only(self.uncertain)
+        if len(self.incoherent):
+            several = self.positions.select(self.incoherent)
             retained = coherence(several.phase_vectors(places, frequency, dtype), self.phase_vectors)
         correlation = self.kernel.correlation(places, self.rows.position, dtype)
         return Arrival(ranges(places, self.positions.points), probability.to(dtype), correlation, retained)
 
-    def at_rows(self, probability: Tensor) -> Arrival:
+    def arrival_at_rows(self, probability: Tensor) -> Arrival:
         """Return the rows' own geometry, with the probability (receivers, K) that each sees each source."""
         return self.arrival_at(self.rows.position, self.rows.frequency, probability[self.observer])
 
-    def gains(self, at: Arrival) -> Tensor:
+    def mean_gains(self, at: Arrival) -> Tensor:
         """Return the posterior mean gains (m, K, R) where they are seen."""
         weights = self.dual_weights
         gain = (at.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
-        if len(self.uncertain):
+        if len(self.incoherent):
             retained = at.retained * at.correlation
-            gain[:, self.uncertain] = torch.einsum("kmn,nkrc->mkrc", retained, weights[:, self.uncertain])
+            gain[:, self.incoherent] = torch.einsum("kmn,nkrc->mkrc", retained, weights[:, self.incoherent])
         return torch.view_as_complex(gain)
 
-    def variance(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
+    def error_and_power(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
         """Return the expected squared error and expected power (m,); of gains, noise and visibility."""
         probability, noise = at.probability, self.kernel.noise
         arriving = point_wave(at.away, carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
-        cross = self._cross(arriving * probability, at.retained, self.power) * at.correlation
+        cross = self._cross_covariance(arriving * probability, at.retained, self.power) * at.correlation
         gains = (powers * probability.square()).sum(1) - self.conditioned.explained_variance(cross)
         # Variance p (1 - p) of a source that is seen or not, times its power.
         of_visibility = (powers * probability * (1 - probability)).sum(1)
         return gains.clamp_min(0) + of_visibility + noise, (powers * probability).sum(1) + noise
 
-    def left_out(self) -> Tensor:
+    def predict_left_out(self) -> Tensor:
         """Return the rows (n, R), each receiver and its own visibility left out."""
-        at = self.at_rows(self.visibility.left_out)
+        at = self.arrival_at_rows(self.visibility.left_out)
         cross = (
-            self._cross(self.unobstructed_waves * at.probability, at.retained, self.power) * at.correlation
+            self._cross_covariance(self.unobstructed_waves * at.probability, at.retained, self.power)
+            * at.correlation
         )
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in rows_of_groups(self.observer.numpy()):
@@ -211,15 +212,15 @@ class SightedSources:
             predicted[group] -= cross[group] @ (inverse[:, group] @ own)
         return predicted
 
-    def _correlation(self, kernel: GainKernel) -> Tensor:
+    def _gain_correlation(self, kernel: GainKernel) -> Tensor:
         return kernel.correlation(self.rows.position, self.rows.position)
 
     def _coherence(self) -> Tensor:
         return coherence(self.phase_vectors, self.phase_vectors)
 
-    def _cross(self, waves: Tensor, retained: Tensor, power: Tensor) -> Tensor:
+    def _cross_covariance(self, waves: Tensor, retained: Tensor, power: Tensor) -> Tensor:
         """Covariance (m, n) of waves (m, K) with the rows, before the correlation over places."""
-        uncertain = self.uncertain
+        uncertain = self.incoherent
         # Certain sources together in one product; each uncertain one has a coherence of its own.
         exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
         total = (waves * exact) @ self.waves.mH

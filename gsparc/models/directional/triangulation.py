@@ -60,7 +60,7 @@ class Rays:
     def __len__(self) -> int:
         return len(self.owner)
 
-    def take(self, mask: np.ndarray) -> Rays:
+    def select_rays(self, mask: np.ndarray) -> Rays:
         """Return a subset, of the same receivers."""
         return Rays(self.places, self.direction[mask], self.owner[mask])
 
@@ -87,7 +87,7 @@ class RayClusters:
     responsibility: np.ndarray
     error: float
 
-    def seen(self, rays: Rays) -> np.ndarray:
+    def seen_points(self, rays: Rays) -> np.ndarray:
         """Return (n, K), 1 where a receiver has a ray from a point, else 0."""
         table = np.zeros((len(rays.places), len(self.points)))
         k, ray = np.nonzero(self.responsibility > 0.5)
@@ -105,7 +105,7 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
     points: list[np.ndarray] = []
     free = np.ones(len(rays), bool)
     for _ in range(ROUNDS):
-        new = _matching_round(rays, free, error, rng)
+        new = _find_points(rays, free, error, rng)
         if not new:
             break
         points += new
@@ -119,7 +119,7 @@ def fit_by_em(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
     """Run expectation maximisation over points and rays, without duplicates and points of weak evidence."""
     while True:
         responsibility = np.zeros((0, len(rays)))
-        covariance = _steps(rays, points[:0], responsibility, error)[1]
+        covariance = _step_points(rays, points[:0], responsibility, error)[1]
         rate: np.ndarray | float = 1.0
         for turn in range(EM_ITERATIONS if len(points) else 0):
             squared_error = rays.squared_error(points)
@@ -130,7 +130,7 @@ def fit_by_em(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
             assigned = max(responsibility.sum(), MIN_RESPONSIBILITY)
             error = math.sqrt((responsibility * squared_error).sum() / (2 * assigned))
             error = min(max(error, MIN_ERROR), MAX_ERROR)
-            points, covariance = _steps(rays, points, responsibility, error)
+            points, covariance = _step_points(rays, points, responsibility, error)
             if turn >= MIN_EM_ITERATIONS and abs(math.log(error / before)) < EM_TOLERANCE:
                 break
         evidence = _evidence(responsibility, covariance)
@@ -138,7 +138,7 @@ def fit_by_em(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
         points, covariance, responsibility, evidence = (
             v[order] for v in (points, covariance, responsibility, evidence)
         )
-        mask = _distinct(points, covariance)
+        mask = _are_distinct(points, covariance)
         if mask.all():
             mask = evidence >= MIN_EVIDENCE
         if mask.all():
@@ -146,14 +146,14 @@ def fit_by_em(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
         points = points[mask]
 
 
-def _gain(squared_error: np.ndarray, error: float) -> np.ndarray:
+def _log_ratio(squared_error: np.ndarray, error: float) -> np.ndarray:
     """Log likelihood ratio of a ray from a point to an outlier [nats]."""
     return math.log(2 / error**2) - squared_error / (2 * error**2)
 
 
 def _responsibility(squared_error: np.ndarray, error: float, rate: np.ndarray | float = 1.0) -> np.ndarray:
     """Probability (K, N) that rays come from points with `rate` times as many rays as there are outliers."""
-    gain = _gain(squared_error, error) + np.log(rate)
+    gain = _log_ratio(squared_error, error) + np.log(rate)
     top = np.maximum(gain.max(0), 0)
     weight = np.exp(gain - top)
     return weight / (weight.sum(0) + np.exp(-top))
@@ -166,7 +166,7 @@ def _evidence(responsibility: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return place - np.log1p(-np.minimum(responsibility, 1 - 1e-12)).sum(1)
 
 
-def _steps(
+def _step_points(
     rays: Rays, points: np.ndarray, responsibility: np.ndarray, error: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (K, 3) after a Gauss-Newton step on their rays, and their covariances (K, 3, 3)."""
@@ -184,7 +184,7 @@ def _steps(
     return points + np.einsum("kcd,kd->kc", covariance, pull), covariance
 
 
-def _distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _are_distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whether each point (K,) differs from all before it by more than their errors."""
     mask = np.ones(len(points), bool)
     for k in range(1, len(points)):
@@ -198,43 +198,45 @@ def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
     """Sigma [rad] of the rays of the point of largest evidence, or None without one."""
     found: list[tuple[float, float]] = []
     if len(rays) > ERROR_SAMPLE:
-        rays = rays.take(np.sort(rng.choice(len(rays), ERROR_SAMPLE, replace=False)))
+        rays = rays.select_rays(np.sort(rng.choice(len(rays), ERROR_SAMPLE, replace=False)))
     for error in ERRORS:
-        proposed = _propose(rays, error, rng, PAIRS // 2, CANDIDATES // 4)
+        proposed = _midpoints(rays, error, rng, PAIRS // 2, CANDIDATES // 4)
         if not len(proposed):
             continue
         squared_error = rays.squared_error(proposed)
-        top = int(np.maximum(_gain(squared_error, error), 0).sum(1).argmax())
-        evidence = _refined(rays, proposed[top], error)[1]
+        top = int(np.maximum(_log_ratio(squared_error, error), 0).sum(1).argmax())
+        evidence = _refine_point(rays, proposed[top], error)[1]
         if evidence > MIN_EVIDENCE:
             found.append((evidence, error))
     return max(found)[1] if found else None
 
 
-def _refined(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarray, float]:
+def _refine_point(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarray, float]:
     """One point after `STEPS` Gauss-Newton steps, and its evidence [nats]."""
     points = point[None]
     for _ in range(STEPS):
-        points, covariance = _steps(rays, points, _responsibility(rays.squared_error(points), error), error)
+        points, covariance = _step_points(
+            rays, points, _responsibility(rays.squared_error(points), error), error
+        )
     return points[0], float(_evidence(_responsibility(rays.squared_error(points), error), covariance)[0])
 
 
-def _matching_round(rays: Rays, free: np.ndarray, error: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """New points of the unassigned rays."""
-    left = rays.take(free)
-    proposed = _propose(left, error, rng, PAIRS, CANDIDATES)
+def _find_points(rays: Rays, mask: np.ndarray, error: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """New points of the mask rays."""
+    left = rays.select_rays(mask)
+    proposed = _midpoints(left, error, rng, PAIRS, CANDIDATES)
     if not len(proposed):
         return []
-    gain = np.maximum(_gain(left.squared_error(proposed), error), 0).astype(np.float32)
+    gain = np.maximum(_log_ratio(left.squared_error(proposed), error), 0).astype(np.float32)
     score, points, failed = gain.sum(1), [], 0
     while failed < MAX_FAILURES and score.max() > MIN_EVIDENCE:
         top = int(score.argmax())
-        near = left.take(left.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
-        point, evidence = _refined(near, proposed[top], error)
+        near = left.select_rays(left.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
+        point, evidence = _refine_point(near, proposed[top], error)
         assigned = gain[top] > 0
         if evidence >= MIN_EVIDENCE:
             points.append(point)
-            assigned |= _gain(left.squared_error(point[None])[0], error) > 0
+            assigned |= _log_ratio(left.squared_error(point[None])[0], error) > 0
         else:
             failed += 1
         score -= gain[:, assigned].sum(1)
@@ -243,7 +245,7 @@ def _matching_round(rays: Rays, free: np.ndarray, error: float, rng: np.random.G
     return points
 
 
-def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, most: int) -> np.ndarray:
+def _midpoints(rays: Rays, error: float, rng: np.random.Generator, pairs: int, limit: int) -> np.ndarray:
     """Midpoints (m, 3) of rays of two receivers that pass each other within their errors."""
     order = np.argsort(rays.owner, kind="stable")
     owners, starts = np.unique(rays.owner[order], return_index=True)
@@ -261,6 +263,6 @@ def _propose(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mos
         points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)
     midpoints = np.concatenate([rays.places[:0], *points])
     midpoints = midpoints[np.linalg.norm(midpoints - rays.places.mean(0), axis=1) < REACH_M]
-    if len(midpoints) > most:
-        midpoints = midpoints[rng.choice(len(midpoints), most, replace=False)]
+    if len(midpoints) > limit:
+        midpoints = midpoints[rng.choice(len(midpoints), limit, replace=False)]
     return midpoints

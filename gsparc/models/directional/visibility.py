@@ -70,9 +70,9 @@ class VisibilityGP:
                 left_out[:, better] = predicted[:, better]
         return VisibilityGP(places, seen, length, weights, left_out)
 
-    def probability(self, places: Tensor) -> Tensor:
+    def probability_seen(self, places: Tensor) -> Tensor:
         """Return the probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
-        lengths, weights = self._by_length
+        lengths, weights = self._lengths_and_weights
         correlation = matern32_of_squares(
             (distances(places, self.places)[:, None] / lengths).square()
         ).flatten(1)
@@ -83,7 +83,7 @@ class VisibilityGP:
         return self.seen.mean(0)
 
     @cached_property
-    def _by_length(self) -> tuple[Tensor, Tensor]:
+    def _lengths_and_weights(self) -> tuple[Tensor, Tensor]:
         """Lengths (L, 1) [m] that occur, and the weights (L n, K), zero but for those of a source's own."""
         lengths = self.length.unique()[:, None]
         return lengths, torch.where(lengths[:, None] == self.length, self.weights, 0.0).flatten(0, 1)
@@ -102,7 +102,7 @@ class RayErrorRates:
     spurious: float
 
     @staticmethod
-    def initial(rays: Tensor) -> RayErrorRates:
+    def from_rays(rays: Tensor) -> RayErrorRates:
         """Return initial rates from rays (n, K), as if all receivers saw the source with most rays."""
         return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
@@ -113,7 +113,7 @@ class RayErrorRates:
         spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
         return RayErrorRates(*(min(max(rate, MIN_RATE), 1 - MIN_RATE) for rate in (missed, spurious)))
 
-    def odds(self, rays: Tensor, probability: Tensor) -> Tensor:
+    def log_odds_seen(self, rays: Tensor, probability: Tensor) -> Tensor:
         """Log odds (n, K) that a source is seen, by rays and the neighbours' probability (n, K)."""
         probability = (probability / (1 - self.missed)).clamp(MIN_PROBABILITY, 1 - MIN_PROBABILITY)
         detected = math.log((1 - self.missed) / self.spurious)

@@ -31,7 +31,7 @@ STEPS, STEP_M = 25, 0.02  # of the ascent
 ImagesOfAntennas = Callable[[Tensor], Tensor]
 
 
-def likelihood_gain(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
+def gains_and_amplitudes(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
@@ -43,7 +43,7 @@ def likelihood_gain(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, T
     return gained / conditioned.weights.shape[1], (gained / power / conditioned.weights.shape[1]).sqrt()
 
 
-def rough_likelihood_gain(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
+def rough_gains(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     """Return `|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building.
 
     Candidates are (m, 3), or (E, m, 3) as in `likelihood_gain`.
@@ -78,18 +78,18 @@ def rough_likelihood_gain(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tens
 
 def find_sources_in_box(
     posterior: Posterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
-    spread: ImagesOfAntennas,
+    images: ImagesOfAntennas,
 ) -> list[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
     """Return the best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
 
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
-    `spread` gives the images of the static end's antennas, as `likelihood_gain` takes them.
+    `images` gives the images of the static end's antennas, as `likelihood_gain` takes them.
     """
     low, high = box
     candidates = draw_in_box(low, high, CANDIDATES, generator)
-    rough = rough_likelihood_gain(posterior.rows, spread(candidates), posterior.conditioned.weights)
+    rough = rough_gains(posterior.rows, images(candidates), posterior.conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
-    exact = torch.cat([likelihood_gain(posterior, spread(part))[0] for part in candidates.split(BLOCK)])
+    exact = torch.cat([gains_and_amplitudes(posterior, images(part))[0] for part in candidates.split(BLOCK)])
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     polished = best.clone().requires_grad_()
     optimizer = torch.optim.Adam([polished], betas=BETAS)
@@ -97,10 +97,10 @@ def find_sources_in_box(
         raise_if_cancelled()
         optimizer.param_groups[0]["lr"] = STEP_M * (1 - 0.8 * step / STEPS)
         optimizer.zero_grad()
-        (-likelihood_gain(posterior, spread(polished))[0].log().sum()).backward()
+        (-gains_and_amplitudes(posterior, images(polished))[0].log().sum()).backward()
         optimizer.step()
     polished = polished.detach()
-    scores, amplitude = likelihood_gain(posterior, spread(polished))
+    scores, amplitude = gains_and_amplitudes(posterior, images(polished))
     chosen = select_separated(polished, scores, min_distance, limit)
     return list(zip(polished[chosen], scores[chosen], amplitude[chosen], strict=True))
 

@@ -72,43 +72,43 @@ def run_searches(
     errors: dict[int, float] = {}
     stopped = threading.Event()
 
-    def ends(share: float) -> Callable[[], bool]:
+    def is_share_spent(share: float) -> Callable[[], bool]:
         """Whether so much of a search's effort, from now, or all of the seconds are spent."""
         counted = step_limit(round(share * budget.effort.evaluations))
         return lambda: counted() or budget.is_spent()
 
-    def unwanted(number: int) -> bool:
+    def is_unwanted(number: int) -> bool:
         """Whether those before it are all that is wanted."""
         before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
         return stopped.is_set() or reached_noise_floor(before, noise_floor)
 
-    def solve(number: int) -> Member:
+    def run_search(number: int) -> Member:
         """Sources, their phases, and the clutter that the noise does not hide."""
-        rows, ended = row_sets[number], ends(ROUNDS_SHARE)
+        rows, ended = row_sets[number], is_share_spent(ROUNDS_SHARE)
 
-        def last_round() -> bool:
+        def is_last_round() -> bool:
             if look is not None and number == 0:
                 look(rows, estimate_phases(rows, search.scene, QUADRATURE, noise_floor))
             return ended()
 
-        search = Search(rows, transmitter, settings, number, last_round, start)
+        search = Search(rows, transmitter, settings, number, is_last_round, start)
         scene = estimate_phases(rows, search.run(), QUADRATURE, noise_floor)
         scene = refine_scene(rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS)
         if look is not None and number == 0:
             look(rows, scene)
         error = left_out_nmse(rows, scene)
         hidden = scene.quadrature == 1 or reached_noise_floor([error], noise_floor, 1)
-        if settings.clutter and not hidden and shares_occlusion(rows):
+        if settings.clutter and not hidden and occludes_antennas_alike(rows):
             scene = find_clutter(rows, scene, torch.Generator().manual_seed(settings.seed + number))
             error = left_out_nmse(rows, scene)
         return Member(scene, error, number)
 
-    def search(number: int) -> Member | None:
-        if unwanted(number) or (number > 0 and budget.is_spent()):
+    def run_unless_unwanted(number: int) -> Member | None:
+        if is_unwanted(number) or (number > 0 and budget.is_spent()):
             return None
         try:
-            with cancel_when(partial(unwanted, number)), end_when(ends(1.0)):
-                member = solve(number)
+            with cancel_when(partial(is_unwanted, number)), end_when(is_share_spent(1.0)):
+                member = run_search(number)
         except Cancelled:
             return None
         scene = member.scene
@@ -124,9 +124,9 @@ def run_searches(
     torch.set_num_threads(1)
     pool = ThreadPoolExecutor(max(1, min(threads, len(row_sets))))
     try:
-        running = [pool.submit(search, number) for number in range(len(row_sets))]
+        running = [pool.submit(run_unless_unwanted, number) for number in range(len(row_sets))]
         wait(running, return_when=FIRST_EXCEPTION)
-        members = [m for number, one in enumerate(running) if (m := one.result()) and not unwanted(number)]
+        members = [m for number, one in enumerate(running) if (m := one.result()) and not is_unwanted(number)]
     finally:
         stopped.set()
         pool.shutdown(cancel_futures=True)  # waits for the step of each search
@@ -142,18 +142,18 @@ def refine_member(rows: Rows, member: Member) -> Member:
 
 def left_out_nmse(rows: Rows, scene: Scene) -> float:
     """Return the NMSE of the rows, each receiver predicted from the others."""
-    error = rows.target - Posterior(rows, scene).left_out()
+    error = rows.target - Posterior(rows, scene).predict_left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 
-def shares_occlusion(rows: Rows) -> bool:
+def occludes_antennas_alike(rows: Rows) -> bool:
     """Whether the static end's antennas are near enough to be occluded alike."""
     return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
 
 
-def reached_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
-    """Whether `least` searches have reached the noise floor."""
-    return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
+def reached_noise_floor(left_out: Sequence[float], noise_floor: float, count: int = 2) -> bool:
+    """Whether `count` searches have reached the noise floor."""
+    return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= count
 
 
 def member_weights(members: list[Member]) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,9 +14,9 @@ from torch.nn.functional import normalize
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows, Moments
 from gsparc.models.image_sources.rows import Rows, channel_places, static_array
-from gsparc.models.method import Prediction
+from gsparc.models.method import Prediction, QueryPaths
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.places import moving_end
 
@@ -60,7 +60,7 @@ class Frame:
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows, position=rows.position - self.middle, target=flat)
 
-    def places(self, query: Query) -> tuple[Tensor, int]:
+    def places_and_count(self, query: Query) -> tuple[Tensor, int]:
         """Return antennas of the moving end (B E, 3) float64 in the frame, and B.
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
@@ -73,7 +73,7 @@ class Frame:
         places = channel_places(self.site, self.antennas, position, rotation)
         return places.flatten(0, 1), len(query)
 
-    def left_out(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
+    def to_left_out_rows(self, rows: Rows, predicted: Tensor) -> LeftOutRows:
         """Turn normalised predictions (n, R) of the rows back; of one channel per receiver."""
         scale = (self.carrier_hz / rows.frequency).float()[:, None] * self.scale
         # NaN: who needs a variance takes that of a prediction at the place.
@@ -83,6 +83,20 @@ class Frame:
     def state(self) -> dict[str, Any]:
         """Return what makes it again, of the same site."""
         return {name: value for name, value in vars(self).items() if name != "site"}
+
+
+class SourcePaths(NamedTuple):
+    """Paths from N sources to m places.
+
+    Attributes:
+        gain: (m, R, N) complex at the carrier, normalised.
+        away: (m, N) [m], their lengths.
+        sources: (N, 3) [m].
+    """
+
+    gain: Tensor
+    away: Tensor
+    sources: Tensor
 
 
 class SourcesInFrame(ClosedForm):
@@ -97,14 +111,14 @@ class SourcesInFrame(ClosedForm):
     factors = torch.ones(1, dtype=torch.complex64)
 
     @abstractmethod
-    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
 
         Normalised; the prior is the power that is expected without any rows.
         """
 
     @abstractmethod
-    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """Gains (m, R, N) at the carrier, normalised, ranges (m, N) and sources (N, 3) [m]."""
 
     def predict(self, query: Query) -> Prediction:
@@ -113,10 +127,10 @@ class SourcesInFrame(ClosedForm):
         The variance is of gains, noise, visibility and between searches; the confidence is the explained
         share of the expected power.
         """
-        frame = self._fitted()
-        places, count = frame.places(query)
+        frame = self._fitted_frame()
+        places, count = frame.places_and_count(query)
         tones = torch.from_numpy(frame.site.tones())
-        mean, variance, prior = self._answer(places, tones, query.tx.dtype == torch.float64)
+        mean, variance, prior = self._predict_normalised(places, tones, query.tx.dtype == torch.float64)
         mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
         # Targets were multiplied by the antennas' factors before the fit.
         mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
@@ -125,7 +139,7 @@ class SourcesInFrame(ClosedForm):
         variance, prior = (part.view(count, each).mean(1) for part in (variance, prior))
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> QueryPaths:
         """Return the paths that `predict` sums, one per source, which several searches may have found.
 
         Returns:
@@ -133,40 +147,32 @@ class SourcesInFrame(ClosedForm):
             vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
             the carrier [Hz].
         """
-        frame = self._fitted()
-        places, count = frame.places(query)
-        gain, away, sources = self._paths(places)
+        frame = self._fitted_frame()
+        places, count = frame.places_and_count(query)
+        gain, away, sources = self._normalised_paths(places)
         gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
         ends = moving_end(places)
         unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
-        return *merge_equal_paths(gain, delay, unit, frame.carrier_hz), frame.carrier_hz
+        return merge_equal_paths(QueryPaths(gain, delay, unit, frame.carrier_hz))
 
-    def _fitted(self) -> Frame:
+    def _fitted_frame(self) -> Frame:
         if self.site is None or not self.count_components():
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.frame
 
 
-def merge_equal_paths(
-    gain: Tensor, delay: Tensor, unit: Tensor, carrier_hz: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first.
-
-    Args:
-        gain: (B, A, N) complex.
-        delay: (B, A, N) [s].
-        unit: (B, N, 3) towards the sources.
-        carrier_hz: of the gains [Hz].
-    """
+def merge_equal_paths(paths: QueryPaths) -> QueryPaths:
+    """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first."""
+    gain, delay, unit, carrier_hz = paths
     if not len(gain):
-        return gain, delay, unit
+        return paths
     # A source is where the first query sees it: it stands still.
     places = unit[:1] * (LIGHT * delay[:1].mean(1))[..., None]
     first = (torch.cdist(places, places) < LIGHT / carrier_hz / 2).int().argmax(2).flatten()
     kept, number = first.unique(return_inverse=True)
     summed = gain.new_zeros(*gain.shape[:2], len(kept)).index_add_(2, number, gain)
-    return summed, delay[..., kept], unit[:, kept]
+    return QueryPaths(summed, delay[..., kept], unit[:, kept], carrier_hz)
 
 
 def require_static_phase(site: Site, name: str) -> None:

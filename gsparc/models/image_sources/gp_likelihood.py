@@ -151,7 +151,7 @@ class Posterior:
         """(n, K) complex64, turned by the phases."""
         return self.scene.waves(self.rows)
 
-    def gains(self) -> CircularGains:
+    def empty_covariance(self) -> CircularGains:
         """Return the covariance of no source yet."""
         if self.scene.phase is None:
             return CircularGains(self.rows)
@@ -160,7 +160,7 @@ class Posterior:
     @cached_property
     def source_gram(self) -> CircularGains:
         """Covariance of all sources, without noise until `conditioned` adds it."""
-        gains, scaled = self.gains(), self.waves * self.scene.log_amplitude.exp()
+        gains, scaled = self.empty_covariance(), self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
             gains.add_source(scaled[:, k], self.scene.visibility.correlation(self.rows.places, source))
         return gains
@@ -205,7 +205,7 @@ class Posterior:
         constant = float(self.scene.visibility.constant)
         return constant * self.dual_weights.sum(1) * self.scene.phase_factors[:, None]
 
-    def left_out(self) -> Tensor:
+    def predict_left_out(self) -> Tensor:
         """Return leave-one-receiver-out predictions (n, R) complex64.
 
         Rasmussen and Williams (2006), eq. 5.12, in blocks.

@@ -17,12 +17,13 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.field.initial import Snapshot
-from gsparc.models.closed_form import LeftOutRows, from_containers, to_containers
+from gsparc.models.closed_form import LeftOutRows, Moments, from_containers, to_containers
 from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path_scene, find_element_factors
 from gsparc.models.image_sources.ensemble import Look, Member
 from gsparc.models.image_sources.frame import (
     Frame,
+    SourcePaths,
     SourcesInFrame,
     require_fixed_rotation,
     require_static_phase,
@@ -104,47 +105,47 @@ class ImageSourceGP(SourcesInFrame):
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
         if calibrated:
             # Against the direct wave first, as a search needs aligned antennas; again against what it found.
-            start = self._searched_rows(data, seen, 0)
-            data = self._calibrated(
-                data, start, direct_path_scene(start, self._transmitter(), self.noise_floor)
+            start = self._draw_search_rows(data, seen, 0)
+            data = self._calibrate_antennas(
+                data, start, direct_path_scene(start, self._transmitter_in_frame(), self.noise_floor)
             )
         if settings.offsets != "none":
-            data = self._without_offsets(data, seen, budget)
+            data = self._align_offsets(data, seen, budget)
             notes.append(
                 f"{self.name}: {settings.offsets} offset of every snapshot estimated; predictions have none"
             )
-        row_sets = self._row_sets(data, seen)
+        row_sets = self._draw_row_sets(data, seen)
         look = None
         if self._groups and context.race is not None:
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
-            look = partial(self._looked, context.race, group, data.batch(group), [math.inf])
+            look = partial(self._log_look, context.race, group, data.batch(group), [math.inf])
         given = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
-        members = self._search(row_sets, settings, budget, look, given)
+        members = self._run_searches(row_sets, settings, budget, look, given)
         if calibrated:
-            again = self._calibrated(data, row_sets[members[0].number], members[0].scene)
+            again = self._calibrate_antennas(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
-                data, row_sets = again, self._row_sets(again, seen)
+                data, row_sets = again, self._draw_row_sets(again, seen)
                 # Factors change little the second time: a refinement does, no other search.
                 members = [ensemble.refine_member(row_sets[one.number], one) for one in members]
-        rows = self._rows(data, seen)
-        self._become(rows, members)
-        self.held = self._left_out_rows(data, seen, members, len(rows))
-        notes += self._described(members, budget)
+        rows = self._draw(data, seen)
+        self._set_members(rows, members)
+        self.held = self._predict_left_out(data, seen, members, len(rows))
+        notes += self._describe_search(members, budget)
         return FitReport(budget.by_clock.wall, tuple(notes), budget.limited_by)
 
-    def _conditioned(self, rows: Rows, scenes: list[Scene]) -> None:
+    def _set_posteriors(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
         self.members = tuple(Posterior(rows, scene) for scene in scenes)
         self.query = EnsembleMeans(self.members)
 
-    def _become(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
+    def _set_members(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights."""
-        self._conditioned(rows, [member.scene for member in members])
+        self._set_posteriors(rows, [member.scene for member in members])
         self.weights = ensemble.member_weights(members)
         return self
 
-    def _described(self, members: list[Member], budget: TimeBudget) -> list[str]:
+    def _describe_search(self, members: list[Member], budget: TimeBudget) -> list[str]:
         """What was found, and what ended the search."""
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
@@ -163,7 +164,7 @@ class ImageSourceGP(SourcesInFrame):
             )
         return [f"{self.name}: {note}" for note in notes]
 
-    def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
+    def _calibrate_antennas(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
         factors = find_element_factors(rows, scene)
         if factors is None:
@@ -171,72 +172,72 @@ class ImageSourceGP(SourcesInFrame):
         self.factors = self.factors * factors
         return replace(data, target=data.target * factors.numpy()[:, None])
 
-    def _search(
+    def _run_searches(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
         look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
         """What `run_searches` finds about the static end, best first."""
-        still, floor = self._transmitter(), self.noise_floor
+        still, floor = self._transmitter_in_frame(), self.noise_floor
         return ensemble.run_searches(row_sets, still, settings, floor, budget, look, start)
 
-    def _looked(
+    def _log_look(
         self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene
     ) -> None:
         """Look at a search's scene by a batch of rows `group` (n,) that it left out; `Behind` ends it."""
         # On a copy: `predict` reads the method's own processes, which are not found yet.
-        mean = copy.copy(self)._become(rows, [Member(scene, 1.0)]).predict(batch).mean
+        mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
         errors.append(race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
 
-    def _rows(self, data: Measurements, index: np.ndarray, most: int | None = None, number: int = 0) -> Rows:
+    def _draw(self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
-        most = self.settings.rows if most is None else most
-        return self.frame.normalise(draw_rows(data, index, most, self.settings.seed + number))
+        limit = self.settings.rows if limit is None else limit
+        return self.frame.normalise(draw_rows(data, rows, limit, self.settings.seed + number))
 
-    def _searched_rows(self, data: Measurements, known: np.ndarray, number: int) -> Rows:
+    def _draw_search_rows(self, data: Measurements, known: np.ndarray, number: int) -> Rows:
         """Rows of a search by its number."""
-        return self._rows(data, self._kept(known, number), self.settings.search_rows, number)
+        return self._draw(data, self._rows_of_search(known, number), self.settings.search_rows, number)
 
-    def _row_sets(self, data: Measurements, known: np.ndarray) -> list[Rows]:
+    def _draw_row_sets(self, data: Measurements, known: np.ndarray) -> list[Rows]:
         """Rows of each search."""
-        return [self._searched_rows(data, known, number) for number in range(self.settings.searches)]
+        return [self._draw_search_rows(data, known, number) for number in range(self.settings.searches)]
 
-    def _kept(self, known: np.ndarray, number: int) -> np.ndarray:
+    def _rows_of_search(self, known: np.ndarray, number: int) -> np.ndarray:
         """What a search by its number learns from: all but the group whose turn it is."""
         groups = self._groups
         return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
 
-    def _left_out_rows(
-        self, data: Measurements, known: np.ndarray, members: list[Member], most: int
+    def _predict_left_out(
+        self, data: Measurements, known: np.ndarray, members: list[Member], limit: int
     ) -> LeftOutRows | None:
-        """Rows of every group predicted by the searches that left it out, from at most `most` others."""
+        """Rows of every group predicted by the searches that left it out, from at most `limit` others."""
         rows, means = [], []
         for turn, group in enumerate(self._groups):
             if mine := [one for one in members if one.number % len(self._groups) == turn]:
                 # As many rows as the process that answers has: fewer would err more than it does.
-                apart = self._rows(data, self._kept(known, turn), most)
+                apart = self._draw(data, self._rows_of_search(known, turn), limit)
                 rows.append(group)
-                means.append(copy.copy(self)._become(apart, mine).predict(data.batch(group)).mean)
+                means.append(copy.copy(self)._set_members(apart, mine).predict(data.batch(group)).mean)
         if not rows:
             return None
         mean = torch.cat(means)
         return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
 
-    def _transmitter(self) -> Tensor:
+    def _transmitter_in_frame(self) -> Tensor:
         assert self.site is not None and self.site.static_position is not None
         return torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
 
-    def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
+    def _align_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        direct = Scene.from_static_end(self._transmitter(), torch.zeros(1))
+        direct = Scene.from_static_end(self._transmitter_in_frame(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
-            rows = self._searched_rows(aligned, known, 0)
-            scene = self._search([rows], few, budget)[0].scene
+            rows = self._draw_search_rows(aligned, known, 0)
+            scene = self._run_searches([rows], few, budget)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
-                gains = Posterior(self._searched_rows(aligned, known, 0), scene).mean_gains
+                gains = Posterior(self._draw_search_rows(aligned, known, 0), scene).mean_gains
                 aligned = self._remove_offsets(data, known, scene, gains)
         return aligned
 
@@ -259,35 +260,36 @@ class ImageSourceGP(SourcesInFrame):
         target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)
 
-    def _answer(self, places: Tensor, tones: Tensor, float64: bool) -> tuple[Tensor, Tensor, Tensor]:
+    def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""
-        stack, variance, prior = (self.query.in_float64 if float64 else self.query).means(places, tones)
+        stack, variance, prior = (self.query.in_float64 if float64 else self.query).predict(places, tones)
         weight = self.weights[:, None, None, None]
         mean = (weight * stack).sum(0)  # of (members, B E, R, K)
-        return mean, variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1), prior
+        spread = (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
+        return Moments(mean, variance + spread, prior)
 
-    def _paths(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """See `SourcesInFrame`."""
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
         away = self.query.ranges(places)
         gain = self.query.gains(places) * weight[:, None, None]
         gain = gain * point_wave(away, self.frame.carrier_hz).T[..., None]
-        return gain.movedim(0, -1), away, self.query.sources
+        return SourcePaths(gain.movedim(0, -1), away, self.query.sources)
 
     def left_out(self) -> LeftOutRows:
         """Return receivers, each predicted from all others."""
-        frame = self._fitted()
-        each = torch.stack([member.left_out() for member in self.members])
+        frame = self._fitted_frame()
+        each = torch.stack([member.predict_left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)
-        return frame.left_out(self.members[0].rows, predicted)
+        return frame.to_left_out_rows(self.members[0].rows, predicted)
 
     def reduction_settings(self) -> tuple[str, ...]:
         """See `Method.reduction_settings`."""
         return ("searches", "confidence")
 
     @torch.no_grad()
-    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Method.reduced`: `searches` of largest weight, no variance; no source can be spared."""
+    def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Method.reduce`: `searches` of largest weight, no variance; no source can be spared."""
         twin = copy.copy(self)
         count = min(int(settings.get("searches", len(self.members))), len(self.members))
         chosen = self.weights.topk(count).indices.sort().values
@@ -300,7 +302,7 @@ class ImageSourceGP(SourcesInFrame):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            "frame": self._fitted().state(),
+            "frame": self._fitted_frame().state(),
             "factors": self.factors,
             "weights": self.weights,
             "rows": to_containers(self.members[0].rows),
@@ -311,7 +313,7 @@ class ImageSourceGP(SourcesInFrame):
         """See `Method.restore`."""
         self.site, self.frame = site, Frame(site, **state["frame"])
         self.factors, self.weights = state["factors"], state["weights"]
-        self._conditioned(
+        self._set_posteriors(
             from_containers(Rows, state["rows"]), [from_containers(Scene, scene) for scene in state["scenes"]]
         )
 
@@ -333,7 +335,7 @@ class ImageSourceGP(SourcesInFrame):
         """See `ClosedForm`; offsets of snapshots were estimated with the gains, which stay."""
         if self.settings.offsets == "none":
             data = replace(data, target=data.target * self.factors.numpy()[:, None])
-            self._conditioned(self._rows(data, rows), [member.scene for member in self.members])
+            self._set_posteriors(self._draw(data, rows), [member.scene for member in self.members])
 
     def count_components(self) -> int:
         """Return the number of sources of the largest scene."""

@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gsparc.models.closed_form import Moments
 from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances
 from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
@@ -97,36 +98,36 @@ class EnsembleMeans:
         """The same in float64."""
         return to_double(self)
 
-    def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def predict(self, queries: Tensor, tones: Tensor) -> Moments:
         """Return means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,).
 
         Variance and the power expected without any rows hold at the middle of the band; 0 and 1 where no
         variance is computed.
         """
-        parts = [self._part(part, tones) for part in queries.split(CHUNK)]
+        parts = [self._predict_part(part, tones) for part in queries.split(CHUNK)]
         if len(parts) == 1:
             return parts[0]
         means, variances, priors = zip(*parts, strict=True)
-        return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
+        return Moments(torch.cat(means, 1), torch.cat(variances), torch.cat(priors))
 
-    def _part(self, part: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        gains, varying, seen = self._gains(part)
+    def _predict_part(self, part: Tensor, tones: Tensor) -> Moments:
+        gains, varying, seen = self._gains_and_shares(part)
         waves = wave_over_band(self.ranges(part), tones, varying.dtype)  # (m, K, F)
         split = zip(gains.permute(1, 2, 0).split(self.counts, 2), waves.split(self.counts, 1), strict=True)
         means = torch.stack([gain @ each for gain, each in split])
         if self.variance is None:
-            return means, torch.zeros(len(part)), torch.ones(len(part))
+            return Moments(means, torch.zeros(len(part)), torch.ones(len(part)))
         first = self.counts[0]
         arriving = waves[:, :first, len(tones) // 2]
         if seen is not None:
             arriving = arriving * seen[:first].T
-        return means, *self.variance(arriving, varying[:first])
+        return Moments(means, *self.variance(arriving, varying[:first]))
 
     def gains(self, queries: Tensor) -> Tensor:
         """Return complex gains (K, m, R) of the sources of all processes at queries."""
-        return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
+        return torch.cat([self._gains_and_shares(part)[0] for part in queries.split(CHUNK)], 1)
 
-    def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    def _gains_and_shares(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Gains (K, m, R), see `Means.varying_correlations`, and visible shares (K, m)."""
         varying, seen = self.varying_correlations(part), self.visible_share(part)
         real = torch.baddbmm(self.level, varying, self.weights)
@@ -146,7 +147,7 @@ class RowVariance:
     def __init__(self, member: Posterior, place_of: Tensor, count: int) -> None:
         few = torch.linspace(0, len(member.rows) - 1, min(count, len(member.rows))).long()
         if len(few) < len(member.rows):
-            member = Posterior(member.rows.take(few), member.scene)
+            member = Posterior(member.rows.select_rows(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility
         self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.contiguous()
         self.phasor, self.power = scene.phase_factors, scene.log_amplitude.mul(2).exp()

@@ -52,7 +52,7 @@ def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None)
                 scene.visibility.correlation(rows.places, one) for one in _scene_at(scene, values).sources
             )
             correlation = torch.stack([*seen])
-        value, gradient = _objective(rows, scene, values, correlation, cost)
+        value, gradient = _cost_and_gradient(rows, scene, values, correlation, cost)
         if value < lowest:
             lowest, best = value, _scene_at(scene, [v.clone() for v in values])
         if step == steps or out_of_time():
@@ -72,7 +72,7 @@ def _scene_at(scene: Scene, values: list[Tensor]) -> Scene:
     )  # fmt: skip
 
 
-def _objective(
+def _cost_and_gradient(
     rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor, cost: Cost | None = None
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and prior, and derivatives by the values: `d nll = trace(G dK)`."""
@@ -80,7 +80,7 @@ def _objective(
     moved = _scene_at(scene, leaves)
     waves = moved.unobstructed_waves(rows) * scene.visible_share(rows.position)
     amplitude, noise = moved.log_amplitude.detach().exp(), math.exp(moved.log_noise)
-    scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).gains()
+    scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).empty_covariance()
     for k, one in enumerate(correlation):
         gains.add_source(scaled[:, k], one)
     conditioned = gains.condition(noise + scene.noise_floor)
@@ -112,11 +112,11 @@ def learn_visibility(
         steps: of Adam.
     """
     shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
-    about, value = (kernel.parameters(least, *shares) for kernel in (centre, scene.visibility))
+    about, value = (kernel.to_parameters(least, *shares) for kernel in (centre, scene.visibility))
     width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * wide
     optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=BETAS)
 
-    def current() -> Scene:
+    def current_scene() -> Scene:
         trial = replace(scene, visibility=KernelVisibility.from_parameters(value.detach()).to_floats())
         if scene.quadrature == 1:
             return trial
@@ -125,8 +125,8 @@ def learn_visibility(
     for _ in range(steps):
         if out_of_time():
             break
-        posterior = Posterior(rows, current())
-        slope, gains = posterior.conditioned.nll_gradient, posterior.gains()
+        posterior = Posterior(rows, current_scene())
+        slope, gains = posterior.conditioned.nll_gradient, posterior.empty_covariance()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
             gains.quadrature = torch.sigmoid(value[-1])
         scaled = posterior.waves * scene.log_amplitude.exp()
@@ -137,4 +137,4 @@ def learn_visibility(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return current()
+    return current_scene()

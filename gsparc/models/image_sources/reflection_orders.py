@@ -33,7 +33,7 @@ def drop_planes(rows: Rows, scene: Scene, tolerance: float) -> Scene:
     """Try to remove planes until `out_of_time`: sequences become the nearest over others [tolerance: m]."""
     index = 0
     while index < len(scene.planes) and not out_of_time():
-        shorter = _without_plane(scene, index, tolerance)
+        shorter = _remove_plane(scene, index, tolerance)
         if shorter is not None:
             shorter = refine_scene(rows, shorter, ROUND_STEPS)
             if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + ALLOWANCE:
@@ -43,7 +43,7 @@ def drop_planes(rows: Rows, scene: Scene, tolerance: float) -> Scene:
     return scene
 
 
-def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
+def _remove_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     """The scene without one plane; None when its strongest source has no other sequence."""
     users = [i for i, sequence in enumerate(scene.sequences) if index in sequence]
     rest = {sequence for i, sequence in enumerate(scene.sequences) if i not in users}
@@ -52,7 +52,7 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     candidates = [sequence for sequence in all_sequences(indices, order) if sequence not in rest]
     if not candidates or not users:
         return None
-    distance = _distances(scene, candidates, scene.sources[users])
+    distance = _penalised_distances(scene, candidates, scene.sources[users])
     nearest = distance.argmin(1).tolist()
     strength = (
         scene.log_amplitude[users] - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
@@ -69,7 +69,7 @@ def _without_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     return replace(scene, sequences=tuple(sequences)).select_sources(sorted(numbers))
 
 
-def _distances(scene: Scene, sequences: list[Reflections], places: Tensor) -> Tensor:
+def _penalised_distances(scene: Scene, sequences: list[Reflections], places: Tensor) -> Tensor:
     """Distances (places, sequences) [m], plus a penalty on the order."""
     position = images(scene.transmitter, scene.planes, sequences)
     order = torch.tensor([len(sequence) for sequence in sequences])
@@ -113,7 +113,7 @@ def find_orthogonal_walls(scene: Scene) -> Tensor | None:
     along one normal only gives a plane. None when no two planes are perpendicular. The sequences of the
     scene's sources may be wrong.
     """
-    triad = _triad(scene)
+    triad = _wall_axes(scene)
     if triad is None:
         return None
     sources = scene.sources
@@ -132,7 +132,7 @@ def find_orthogonal_walls(scene: Scene) -> Tensor | None:
     chosen, explained = scene.planes[:0], 1.0
     for _ in range(MOST_WALLS):
         tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
-        gains = [_explained(scene, planes, allowed) for planes in tried]
+        gains = [_count_explained(scene, planes, allowed) for planes in tried]
         if not gains or max(gains) < explained + 0.8:
             break
         best = gains.index(max(gains))
@@ -140,7 +140,7 @@ def find_orthogonal_walls(scene: Scene) -> Tensor | None:
     return chosen if len(chosen) else None
 
 
-def _triad(scene: Scene) -> Tensor | None:
+def _wall_axes(scene: Scene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
     used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
     normals, _ = hesse_form(scene.planes)
@@ -153,11 +153,11 @@ def _triad(scene: Scene) -> Tensor | None:
     return torch.stack([normals[i], second, torch.linalg.cross(normals[i], second)])
 
 
-def _explained(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
+def _count_explained(scene: Scene, planes: Tensor, tolerance: Tensor) -> float:
     """Number of sources with a sequence over the planes, weighted by distance and order."""
     sequences: list[Reflections] = [(), *all_sequences(list(range(len(planes))), 2)]
     position = images(scene.transmitter, planes, sequences)
-    distance = torch.cdist(scene.sources, position) / allowed[:, None]
+    distance = torch.cdist(scene.sources, position) / tolerance[:, None]
     worth = (1 - 0.5 * distance.square()).clamp_min(0) * torch.tensor(
         [0.95 ** len(sequence) for sequence in sequences]
     )
@@ -170,7 +170,7 @@ def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     tolerance = 2.5 * _wall_tolerance(sources)
     base = replace(scene, planes=walls)
     candidates = all_sequences(list(range(len(walls))), ORDER)
-    distance = _distances(base, candidates, sources)
+    distance = _penalised_distances(base, candidates, sources)
     planes, ids, assigned = [*walls], [0], set()
     sequences: list[Reflections] = [()]
     for i in range(1, len(sources)):
@@ -190,15 +190,15 @@ def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     return explained.select_sources(list(range(len(ids))))
 
 
-def prune_sources(rows: Rows, scene: Scene, least: float) -> Scene:
-    """Drop sources that gain fewer than `least` nats, twice with a plane of their own, or `out_of_time`."""
+def prune_sources(rows: Rows, scene: Scene, min_gain: float) -> Scene:
+    """Drop sources that gain under `min_gain` nats, twice with a plane of their own, or `out_of_time`."""
     posterior, kept = Posterior(rows, scene), list(range(len(scene.sequences)))
     for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):
         if out_of_time():
             break
         sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in scene.sequences[i])
         lost = posterior.nll_without_source(kept.index(i)) - posterior.nll
-        if lost < (2 * least if sole_user else least):
+        if lost < (2 * min_gain if sole_user else min_gain):
             kept.remove(i)
             posterior = Posterior(rows, scene.select_sources(kept))
     return scene.select_sources(kept)

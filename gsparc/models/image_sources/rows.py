@@ -42,7 +42,7 @@ class Rows:
     def __len__(self) -> int:
         return len(self.position)
 
-    def take(self, index: Tensor) -> Rows:
+    def select_rows(self, index: Tensor) -> Rows:
         """Return the rows with these numbers."""
         element = None if self.element is None else self.element[index]
         measured = (self.target[index], self.receiver[index])
@@ -152,16 +152,16 @@ def measured_places(data: Measurements, index: np.ndarray) -> Tensor:
     return channel_places(data.site, data.target.shape[1], position, rotation)
 
 
-def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
+def ranges_at(places: Tensor, sources: Tensor, rotations: Tensor) -> Tensor:
     """Return ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
 
     Args:
         places: see `Rows.places`.
         sources: (K, 3) float64 [m].
-        turned: (K, 3, 3), see `mirror_planes.orientations`.
+        rotations: (K, 3, 3), see `mirror_planes.orientations`.
     """
     position = moving_end(places)
     if places.shape[1] > position.shape[1]:
         # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
-        sources = sources + torch.einsum("kij,mj->mki", turned, places[:, position.shape[1] :])
+        sources = sources + torch.einsum("kij,mj->mki", rotations, places[:, position.shape[1] :])
     return ranges(position, sources)

@@ -46,10 +46,10 @@ class KernelVisibility:
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
-        squared = _squared(unit_vectors(moving_end(places), source)) / self.angle**2
-        if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
+        squared = _squared_distances(unit_vectors(moving_end(places), source)) / self.angle**2
+        if not _needs_float64(places, float(torch.as_tensor(self.length).detach())):
             places = places.float()
-        squared = squared + _squared(places).float() / self.length**2
+        squared = squared + _squared_distances(places).float() / self.length**2
         return self.constant + (1 - self.constant) * matern32_of_squares(squared)
 
     @staticmethod
@@ -57,10 +57,10 @@ class KernelVisibility:
         """Make it from the logit of `constant` and the logarithms of both lengths; differentiable."""
         return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
 
-    def parameters(self, least: float, *shares: float) -> Tensor:
-        """Return what `from_parameters` reads, then logits of more `shares`; all are at least `least`."""
+    def to_parameters(self, min_share: float, *shares: float) -> Tensor:
+        """Return what `from_parameters` reads, then logits of more `shares`; all are at least `min_share`."""
         # A logit has no value at 0 and 1, and hardly a slope near them.
-        clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
+        clipped = [min(max(float(share), min_share), 0.995) for share in (self.constant, *shares)]
         first, *rest = (math.log(share / (1 - share)) for share in clipped)
         return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
 
@@ -215,7 +215,7 @@ def unit_vectors(places: Tensor, sources: Tensor, dtype: torch.dtype = torch.flo
     return normalize(places - sources[..., None, :], dim=-1).to(dtype)
 
 
-def _is_wide(places: Tensor, length: float) -> bool:
+def _needs_float64(places: Tensor, length: float) -> bool:
     """Whether squared distances need float64: of 5 km those in float32 are off by a square metre.
 
     Elsewhere float64 would only double the time of a search.
@@ -224,7 +224,7 @@ def _is_wide(places: Tensor, length: float) -> bool:
     return torch.finfo(torch.float32).eps * reach**2 > ROUNDED * length**2
 
 
-def _squared(a: Tensor) -> Tensor:
+def _squared_distances(a: Tensor) -> Tensor:
     length = a.square().sum(-1)
     # The sum cancels for near places, and rounds below 0.
     return (length[:, None] + length[None] - 2 * a @ a.T).clamp_min(0)

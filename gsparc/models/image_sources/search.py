@@ -14,9 +14,13 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
-from gsparc.field.initial import Snapshot
+from gsparc.field.initial import InitSettings, Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
-from gsparc.models.image_sources.backprojection import find_sources_in_box, likelihood_gain, select_separated
+from gsparc.models.image_sources.backprojection import (
+    find_sources_in_box,
+    gains_and_amplitudes,
+    select_separated,
+)
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import (
     POLISHING_STEPS,
@@ -62,10 +66,10 @@ class SearchSettings(Checked):
     """
 
     searches: int = setting(6, whole(1))
-    search_rows: int = setting(700, whole(LEAST_ROWS))
-    rows: int = setting(3000, whole(LEAST_ROWS))
-    margin: float = setting(8.0, POSITIVE)
-    max_sources: int = setting(60, whole(1))
+    search_rows: int = setting(InitSettings.search_rows, whole(LEAST_ROWS))
+    rows: int = setting(InitSettings.rows, whole(LEAST_ROWS))
+    margin: float = setting(InitSettings.margin, POSITIVE)
+    max_sources: int = setting(InitSettings.max_sources, whole(1))
     order: int = setting(orders.ORDER, whole(0))
     offsets: Snapshot = setting("none", choice(*get_args(Snapshot)))
     clutter: bool = setting(True, switch())
@@ -87,9 +91,9 @@ class Search:
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
-        last_round: Callable[[], bool], found: Found | None = None,
+        is_last_round: Callable[[], bool], found: Found | None = None,
     ) -> None:  # fmt: skip
-        self.rows, self.settings, self.last_round = rows, settings, last_round
+        self.rows, self.settings, self.last_round = rows, settings, is_last_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         measured = torch.cat([rows.position, transmitter[None]])
@@ -107,19 +111,19 @@ class Search:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
         self._refine(ROUND_STEPS)
-        self._find_walls()  # among sources that it starts from
+        self._try_paired_walls()  # among sources that it starts from
         for number in count():
             added = self._add_sequences()
             free = not added
             if free:
-                added = self._add_free()
+                added = self._add_free_sources()
             if not added or self.last_round():
                 break
             self._refine(ROUND_STEPS)
             if free or number % 2:
                 self.scene = orders.drop_planes(self.rows, self.scene, 2 * self.wavelength)
             if number > 1 and number % REARRANGED_EVERY == 1:
-                self._find_walls()
+                self._try_paired_walls()
             if number % 2:
                 self.scene = orders.prune_sources(self.rows, self.scene, PRUNE)
             if number % REARRANGED_EVERY == 2:
@@ -134,12 +138,12 @@ class Search:
             stale, best = (0, nll) if nll < best - PROGRESS else (stale + 1, best)
             if stale >= PATIENCE:
                 break
-        return self._finish()
+        return self._finish_scene()
 
-    def _finish(self) -> Scene:
+    def _finish_scene(self) -> Scene:
         self._refine(POLISHING_STEPS)
-        self._find_walls()
-        self._reassign(orders.find_orthogonal_walls(self.scene))
+        self._try_paired_walls()
+        self._try_walls(orders.find_orthogonal_walls(self.scene))
         self.scene = orders.drop_planes(self.rows, self.scene, 3 * self.wavelength)
         self._add_sequences()
         self._refine(ROUND_STEPS)
@@ -153,23 +157,23 @@ class Search:
 
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
-            few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
+            few = self.rows.select_rows(torch.randperm(len(self.rows), generator=self.generator)[:400])
             self.scene = learn_visibility(few, self.scene, KernelVisibility(), steps)
 
-    def _add_sequences(self, most: int | None = None) -> int:
+    def _add_sequences(self, limit: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
-        scene, most = self.scene, most or SEQUENCES_PER_ROUND
+        scene, limit = self.scene, limit or SEQUENCES_PER_ROUND
         more = scene.replace_sequences(scene.longer_sequences(self.settings.order))
         if not more.sequences:
             return 0
-        scores, amplitude = likelihood_gain(Posterior(self.rows, scene), more.images(self.rows))
+        scores, amplitude = gains_and_amplitudes(Posterior(self.rows, scene), more.images(self.rows))
         apart = 0.5 * self.wavelength
-        chosen = select_separated(more.sources, scores, apart, most, SEQUENCE_SCORE, scene.sources)
+        chosen = select_separated(more.sources, scores, apart, limit, SEQUENCE_SCORE, scene.sources)
         if chosen:
             self.scene = scene.add_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
-    def _add_free(self) -> int:
+    def _add_free_sources(self) -> int:
         """Add the best sources anywhere in the box, each with a plane of its own; returns how many.
 
         Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
@@ -179,12 +183,12 @@ class Search:
         for number, parent in enumerate(parents):
             if number and out_of_time():
                 break
-            spread = partial(self._spread, parent)
+            spread = partial(self._antenna_images, parent)
             apart = 0.5 * self.wavelength
             found = find_sources_in_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
             found = [source for source in found if source[1] >= FREE_SCORE]
             for position, _, amplitude in found:
-                sequence, plane = self._parent(position, posterior)
+                sequence, plane = self._best_parent_and_plane(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
                 self.scene = replace(self.scene, planes=planes).add_sequences(
                     [(*sequence, len(planes) - 1)], amplitude[None]
@@ -193,33 +197,33 @@ class Search:
                 return len(found)
         return 0
 
-    def _able(self, scene: Scene) -> list[int]:
+    def _reflectable(self, scene: Scene) -> list[int]:
         """Sources that may be reflected once more."""
         return [i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order]
 
     def _strong_parents(self) -> list[Reflections]:
         """The static end, then the sequences of the loudest sources that may be reflected once more."""
         loudness = self.scene.log_amplitude
-        louder = sorted((i for i in self._able(self.scene) if i), key=lambda i: -float(loudness[i]))
+        louder = sorted((i for i in self._reflectable(self.scene) if i), key=lambda i: -float(loudness[i]))
         return [self.scene.sequences[i] for i in (0, *louder[: PARENTS - 1])]
 
-    def _spread(self, parent: Reflections | None, points: Tensor) -> Tensor:
+    def _antenna_images(self, parent: Reflections | None, points: Tensor) -> Tensor:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
         scene = self.scene.replace_sequences((parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
-    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
+    def _best_parent_and_plane(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
         """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
-        scene, able = posterior.scene, self._able(posterior.scene)
+        scene, able = posterior.scene, self._reflectable(posterior.scene)
         planes = bisector(scene.sources[able], position)
         mirrored = reflect(scene.sources[None], planes[:, None])  # (parents, K, 3)
         flat = mirrored.flatten(0, 1)
         candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
         sources = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
-        scores = likelihood_gain(posterior, candidates)[0].reshape(mirrored.shape[:2])
+        scores = gains_and_amplitudes(posterior, candidates)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas
@@ -227,13 +231,13 @@ class Search:
         best = int(gain.argmax())
         return scene.sequences[able[best]], planes[best]
 
-    def _find_walls(self) -> None:
+    def _try_paired_walls(self) -> None:
         """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
         if len(self.scene.sequences) < 6:
             return
-        self._reassign(orders.find_walls(self.scene.sources))
+        self._try_walls(orders.find_walls(self.scene.sources))
 
-    def _reassign(self, walls: Tensor | None) -> None:
+    def _try_walls(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
         if walls is None or out_of_time():
             return

@@ -16,7 +16,7 @@ from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings
+from gsparc.models.moving_array.triangulate import BearingSearchSettings
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.training.context import FitContext
@@ -25,27 +25,27 @@ from gsparc.training.context import FitContext
 Candidate = Callable[[InitSettings, bool, FitContext], ClosedForm]
 
 
-def sources(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
+def make_sources(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return image sources of several searches.
 
     Searches start where measured directions meet, where these were solved before.
     """
-    method = ImageSourceGP(**_searched(init, clutter, context))
+    method = ImageSourceGP(**_search_arguments(init, clutter, context))
     if "rays" in context.beside:
-        method.start = context.beside["rays"].sources()
+        method.start = context.beside["rays"].points_and_amplitudes()
     return method
 
 
-def scene(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
+def make_scene(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return images of the static end in the walls of `init.file`.
 
     Raises:
         DataError: no such file, or walls that cannot be.
     """
-    return KnownWallsGP(read_walls(init.file), **_searched(init, clutter, context))
+    return KnownWallsGP(read_walls(init.file), **_search_arguments(init, clutter, context))
 
 
-def powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
+def make_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Make coherent waves, or losses in walls of a file (`init=scene`), and a process of the rest.
 
     Raises:
@@ -55,17 +55,17 @@ def powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm
     return PowerField(init.name != "diffuse", context.seed, walls, context.terms)
 
 
-def joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
+def make_joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return powers of several stations in one process; without `clutter` they share their law alone."""
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
-def bearings(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
+def make_bearings(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
     """Return sources where bearings cross."""
-    return MovingArrayField(replace(SearchSettings(), sources=init.max_sources), seed=context.seed)
+    return MovingArrayField(replace(BearingSearchSettings(), sources=init.max_sources), seed=context.seed)
 
 
-def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
+def _search_arguments(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
     """What `ImageSourceGP` takes, of the settings of an initialiser."""
     names = ("searches", "search_rows", "rows", "margin", "max_sources", "order")
     own = {name: getattr(init, name) for name in names}
@@ -77,13 +77,13 @@ def _searched(init: InitSettings, clutter: bool, context: FitContext) -> dict[st
 
 
 CANDIDATES: dict[str, Candidate] = {
-    "sources": sources,
-    "scene": scene,
+    "sources": make_sources,
+    "scene": make_scene,
     "rays": lambda init, clutter, context: DirectionalGP(init.rows, context.seed),
     "diffuse": lambda *unused: ChannelField(),
-    "powers": powers,
-    "joint_powers": joint_powers,
-    "bearings": bearings,
+    "powers": make_powers,
+    "joint_powers": make_joint_powers,
+    "bearings": make_bearings,
     "process": lambda *unused: GaussianProcess(),
     "aligned": lambda *unused: ComplexGP(),
 }

@@ -81,7 +81,7 @@ def choose_stations(
             learned = np.sort(np.random.default_rng(context.seed).permutation(learned)[:most])
         # Trial fits leave no files, and go on from none.
         own = replace(context, run_dir=Path(), resume=None, budget_s=budget.left_s)
-        parts = list(_by_station(data, learned, queries, own))
+        parts = list(_predict_by_station(data, learned, queries, own))
         if not parts:
             continue
         joint = JointPowerField(shared=False, seed=context.seed)
@@ -89,7 +89,7 @@ def choose_stations(
         rows = np.concatenate([part for part, _ in parts])
         separate = torch.cat([powers for _, powers in parts])
         target = decibels(data.batch(rows).target.flatten().double())
-        errors.append([(_levels(joint, data, rows) - target).square(), (separate - target).square()])
+        errors.append([(_decibels(joint, data, rows) - target).square(), (separate - target).square()])
         if budget.is_spent():
             break
     if not errors:
@@ -100,7 +100,7 @@ def choose_stations(
     return ("together" if together <= each else "each"), f"{why} ({len(errors)} folds)"
 
 
-def _by_station(
+def _predict_by_station(
     data: Measurements, learned: np.ndarray, queries: np.ndarray, context: FitContext
 ) -> Iterator[tuple[np.ndarray, Tensor]]:
     """Rows (m,) asked of each station with rows to learn from, and powers (m,) [dB] by its own process."""
@@ -112,9 +112,9 @@ def _by_station(
             part = data.subset(rows, station_site(data.site, number))
             single = PowerField(waves=False, seed=context.seed)
             single.fit(part, Fold(known, known[:0], known[:0]), context)
-            yield rows[left], _levels(single, part, left)
+            yield rows[left], _decibels(single, part, left)
 
 
 @torch.no_grad()
-def _levels(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
+def _decibels(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
     return decibels(method.predict(data.batch(rows)).mean.flatten().double())

@@ -60,18 +60,18 @@ def fit_candidates(
     """
     several = cut is not None
     rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
-    groups = () if cut is None else _groups(cut, fold.train)
+    groups = () if cut is None else _training_groups(cut, fold.train)
     # Searches come last: they race against the best before them, and end where they fall behind.
     fields: dict[str, ClosedForm] = {}
     reports: dict[str, FitReport] = {}
     read: dict[str, set[str]] = {}
     race: Race | None = None
 
-    def note(what: str, error: float) -> None:
+    def log_error(what: str, error: float) -> None:
         context.log_curve(budget.by_clock.wall, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES and (why := _needless(race, bool(fields) and budget.is_spent())):
+        if name in SEARCHES and (why := _why_not_searched(race, bool(fields) and budget.is_spent())):
             log.info("init=%s is left out: %s", name, why)
             continue
         within, began = replace(context, budget_s=budget.left_s), budget.by_clock.wall
@@ -85,12 +85,15 @@ def fit_candidates(
                 field = parts[name](settings, clutter, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             fields[name] = field
-            if name not in OPEN_ENDED:
-                field.held = _held(field, data, rows, groups)
+            # Every group costs a fit: when the seconds are over, validation rows alone weigh solutions.
+            if name not in OPEN_ENDED and not budget.is_spent():
+                field.held = _predict_groups(field, data, rows, groups)
             if field.held is not None:
                 target = in_error_unit(data.batch(field.held.rows).target, data.site)
-                one = Race.from_mean(field.held.rows, in_error_unit(field.held.mean, data.site), target, note)
-                note(name, mean_square(one.missed))
+                one = Race.from_mean(
+                    field.held.rows, in_error_unit(field.held.mean, data.site), target, log_error
+                )
+                log_error(name, mean_square(one.missed))
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:
             if isinstance(error, FellBehind):  # a `ValueError`, too
@@ -105,9 +108,9 @@ def fit_candidates(
     return fields, reports, read
 
 
-def _needless(race: Race | None, over: bool) -> str | None:
+def _why_not_searched(race: Race | None, is_spent: bool) -> str | None:
     """Why no search is begun: the time is over, or another solution as near as searches come; else None."""
-    if over:
+    if is_spent:
         return "the seconds were over"
     if race is None or race.error > CONVERGED_ERROR:
         return None
@@ -159,13 +162,13 @@ def weigh_candidates(
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
 
 
-def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
+def _training_groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
     """Training rows (n,) of each group."""
     result = [np.intersect1d(one.test, train) for one in cut.folds]
     return tuple(group for group in result if 0 < len(group) < len(train))
 
 
-def _held(
+def _predict_groups(
     field: ClosedForm, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
 ) -> LeftOutRows | None:
     """Rows of every group, predicted from the others with the parameters of all; None without groups."""
@@ -223,7 +226,7 @@ def weigh_process(
         else:
             weight = solution_weights.stacking_weights([own, plain], target, np.arange(len(val)))[1]
     if left_out is not None:
-        rows.append(_left_out(left_out, distance))
+        rows.append(_held_out_pair(left_out, distance))
         if explained is None:
             own, target = (torch.from_numpy(part) for part in (rows[-1].own, rows[-1].target))
             explained = solution_weights.explained_variance(own, target, True)
@@ -236,8 +239,8 @@ def weigh_process(
     return ((process, weight) if weight > 0 else None), explained
 
 
-def _left_out(left_out: LeftOut, distance: float | None) -> HeldOutPair:
+def _held_out_pair(left_out: LeftOut, distance: float | None) -> HeldOutPair:
     """Training rows as far from what is left as held-out rows are, as field and process predict them."""
     gap = left_out.nearest_gap(distance)
-    own, target = left_out.pairs_at_gap(gap, left_out.predicted)
-    return HeldOutPair(own, left_out.pairs_at_gap(gap, left_out.predict_by_process())[0], target)
+    own, target = left_out.predictions_and_targets(gap, left_out.predicted)
+    return HeldOutPair(own, left_out.predictions_and_targets(gap, left_out.predict_by_process())[0], target)

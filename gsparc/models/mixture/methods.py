@@ -11,14 +11,14 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.powers.own_terms import as_terms
+from gsparc.models.powers.own_terms import to_terms
 from gsparc.models.terms import array_obstacle, phase_obstacle
 from gsparc.training.context import FitContext, FitReport
 
 PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
 
 
-def _named(*names: str) -> dict[str, Candidate]:
+def _candidates(*names: str) -> dict[str, Candidate]:
     return {name: CANDIDATES[name] for name in names}
 
 
@@ -32,9 +32,9 @@ class ImageSources(Mixture):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
         # Offsets are known to sources alone.
-        return _named(*placed, *["diffuse"] * (self.plain and self.init.snapshot == "none"))
+        return _candidates(*placed, *["diffuse"] * (self.adds_process and self.init.snapshot == "none"))
 
-    def obstacle(self, data: Measurements) -> str | None:
+    def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
         return phase_obstacle(data)
 
@@ -46,9 +46,9 @@ class Channels(Mixture):
 
     def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; no phase tells of paths where rows have phases of their own."""
-        return _named("aligned" if data.site.phase_reference == "neighbours" else "diffuse")
+        return _candidates("aligned" if data.site.phase_reference == "neighbours" else "diffuse")
 
-    def obstacle(self, data: Measurements) -> str | None:
+    def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
         return None if data.site.kind == "csi" else f"the target is {data.site.kind}, not channels"
 
@@ -66,9 +66,9 @@ class Powers(Mixture):
     uses_censored = True
     stored_names: ClassVar[dict[str, str]] = {**Mixture.stored_names, "terms": ""}
 
-    def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named: Any) -> None:
-        super().__init__(*settings, **named)
-        self.own_terms = as_terms(terms)
+    def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named_settings: Any) -> None:
+        super().__init__(*settings, **named_settings)
+        self.own_terms = to_terms(terms)
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
@@ -80,9 +80,9 @@ class Powers(Mixture):
         if self.init.name == "scene":
             return {"scene": CANDIDATES["powers"]}
         several = data.site.stations is not None and len(data.site.stations) > 1
-        return _named("joint_powers" if several else "powers")
+        return _candidates("joint_powers" if several else "powers")
 
-    def obstacle(self, data: Measurements) -> str | None:
+    def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
         if self.own_terms and data.site.stations is not None and len(data.site.stations) > 1:
             return "model.terms are of one station's model; say stations=each"
@@ -96,8 +96,8 @@ class Bearings(Mixture):
 
     def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`."""
-        return _named("bearings", *["process"] * (self.plain and len(data) <= PROCESS_ROWS))
+        return _candidates("bearings", *["process"] * (self.adds_process and len(data) <= PROCESS_ROWS))
 
-    def obstacle(self, data: Measurements) -> str | None:
+    def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
         return array_obstacle(data.site, "tx", "the receiver stands still")

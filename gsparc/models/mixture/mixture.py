@@ -26,12 +26,12 @@ from gsparc.field.initial import InitSettings
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
-from gsparc.models.method import HasPaths, HasProcess, Method, Prediction
+from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, QueryPaths
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.weights import explained_variance, in_error_unit
-from gsparc.models.refined_places import errors_of, move_rows, refine_places
+from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
@@ -78,11 +78,11 @@ class Mixture(LearnsTogether, ClosedForm):
         """Return candidates by name, weighed where they are several."""
 
     @abstractmethod
-    def obstacle(self, data: Measurements) -> str | None:
+    def why_not(self, data: Measurements) -> str | None:
         """Return why this cannot be solved for such measurements; None where it can."""
 
     @property
-    def plain(self) -> bool:
+    def adds_process(self) -> bool:
         """Whether a plain process may stand in, or beside."""
         return self.switches.residual is not False
 
@@ -96,7 +96,7 @@ class Mixture(LearnsTogether, ClosedForm):
         """
         self.site, self.runs = data.site, RunFactors.identity()
         with heeded.set_apart():
-            if (why := self.obstacle(data)) is not None:
+            if (why := self.why_not(data)) is not None:
                 raise ValueError(f"{self.name}: {why}")
             parts = self.list_candidates(data)
             named = self.init.name in ("auto", "diffuse", *parts)
@@ -110,11 +110,11 @@ class Mixture(LearnsTogether, ClosedForm):
         site, phases = data.site, data.site.phase_reference != "neighbours"
         heeds = site.kind != "spectrum" and site.static_end is not None and phases
         known = np.concatenate([fold.train, fold.val])
-        if (std := errors_of(data, known, self.position_std, heeds)) is not None:
-            return self._fit_refined(parts, init, data, fold, context, std)
+        if (std := position_errors(data, known, self.position_std, heeds)) is not None:
+            return self._fit_twice(parts, init, data, fold, context, std)
         return self._solve(parts, init, data, fold, context)
 
-    def _fit_refined(
+    def _fit_twice(
         self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
         context: FitContext, std: np.ndarray,
     ) -> FitReport:  # fmt: skip
@@ -123,7 +123,7 @@ class Mixture(LearnsTogether, ClosedForm):
         # Files of the folder are of the second pass, which an interrupted run goes on with.
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
-        rows, by, note = refine_places(self, self.runs.align_channels(data), std)
+        rows, by, note = refine_places(self, self.runs.remove_factors(data), std)
         if by.any() and budget.is_spent():
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
@@ -153,8 +153,8 @@ class Mixture(LearnsTogether, ClosedForm):
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
         log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
-        self.runs = _runs(data, known, context)
-        data = self.runs.align_channels(data)
+        self.runs = _estimate_run_factors(data, known, context)
+        data = self.runs.remove_factors(data)
         stages = {"factors of runs": budget.by_clock.wall} if len(self.runs) > 1 else {}
         cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
         found, reports, read = fit_candidates.fit_candidates(
@@ -166,10 +166,10 @@ class Mixture(LearnsTogether, ClosedForm):
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
         self.site, self.init_s = data.site, budget.by_clock.wall
         log.info(
-            "%s of %d Gaussians from init=%s, terms %s", type(self).__name__, self.count,
+            "%s of %d Gaussians from init=%s, terms %s", type(self).__name__, self.count_gaussians,
             self.started, ", ".join(self.terms) or "none",
         )  # fmt: skip
-        self.explained = self._explained(data, fold, several)
+        self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
             self.condition(data, known)
         seconds = budget.by_clock.wall
@@ -184,11 +184,11 @@ class Mixture(LearnsTogether, ClosedForm):
         limited = worst_clock(budget.limited_by, *(report.limited_by for report in reports.values()))
         return FitReport(seconds, tuple(notes), limited).with_cost(Cost(stages, unused))
 
-    def _explained(self, data: Measurements, fold: Fold, apart: bool) -> float | None:
+    def _explained_share(self, data: Measurements, fold: Fold, is_conditioned: bool) -> float | None:
         """What Gaussians explain of validation rows; conditions on training rows, unless apart already."""
-        if not (len(fold.val) and self.count):
+        if not (len(fold.val) and self.count_gaussians):
             return None
-        if not apart:
+        if not is_conditioned:
             self.condition(data, fold.train)
         batch = data.batch(fold.val)
         result = self.predict(batch).explained
@@ -201,9 +201,9 @@ class Mixture(LearnsTogether, ClosedForm):
         for member in self.members:
             member.condition(data, rows)
 
-    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
-        if self.single is None or not self.single.forgets:
+        if self.member is None or not self.member.forgets:
             return None
         # Deep, as members are conditioned in place and those of this method must stay as they are.
         result = copy.deepcopy(self)
@@ -216,10 +216,10 @@ class Mixture(LearnsTogether, ClosedForm):
         """See `Method.predict`; what members disagree about is added to their variances."""
         if not self.members:
             raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
-        told = Prediction.joined([self._mean(part) for part in query.split(QUERY_CHUNK)])
-        return self.runs.restore_run(told, query.run)
+        told = Prediction.joined([self._mix_predictions(part) for part in query.split(QUERY_CHUNK)])
+        return self.runs.apply_factors(told, query.run)
 
-    def _mean(self, query: Query) -> Prediction:
+    def _mix_predictions(self, query: Query) -> Prediction:
         """In the phase and level of the largest run."""
         result = [member.predict(query) for member in self.members]
         if len(result) == 1:
@@ -244,9 +244,9 @@ class Mixture(LearnsTogether, ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return self.single.process() if isinstance(self.single, HasProcess) else None
+        return self.member.process() if isinstance(self.member, HasProcess) else None
 
-    def paths(self, query: Query) -> tuple[Tensor, Tensor, Tensor, float]:
+    def paths(self, query: Query) -> QueryPaths:
         """See `HasPaths`; of solutions that are made of paths each source once, by their weights in the mean.
 
         What other solutions and the residual add to channels is in no path.
@@ -257,19 +257,19 @@ class Mixture(LearnsTogether, ClosedForm):
         gains, delays, units, carriers = zip(*(method.paths(query) for _, method in made), strict=True)
         gain = torch.cat([weight * own for (weight, _), own in zip(made, gains, strict=True)], dim=2)
         delay, unit, carrier = torch.cat(delays, dim=2), torch.cat(units, dim=1), carriers[0]
-        return *merge_equal_paths(gain, delay, unit, carrier), carrier
+        return merge_equal_paths(QueryPaths(gain, delay, unit, carrier))
 
     # -- what it is made of --------------------------------------------------------------------------
 
     @property
-    def single(self) -> ClosedForm | None:
+    def member(self) -> ClosedForm | None:
         """Return the member, where it is one."""
         return self.members[0] if len(self.members) == 1 else None
 
     @property
     def reducible(self) -> Method | None:
         """See `Method.reducible`; what answers faster knows nothing of runs' factors."""
-        return self.single if len(self.runs) == 1 else None
+        return self.member if len(self.runs) == 1 else None
 
     def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""
@@ -279,7 +279,7 @@ class Mixture(LearnsTogether, ClosedForm):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return self.name if self.single is None else self.single.label.replace(self.single.name, self.name, 1)
+        return self.name if self.member is None else self.member.label.replace(self.member.name, self.name, 1)
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -292,14 +292,14 @@ class Mixture(LearnsTogether, ClosedForm):
         return "+".join(self.terms) or "residual"
 
     @property
-    def made(self) -> str:
+    def description(self) -> str:
         """See `Method`."""
         terms = ", ".join(self.terms) or "a process alone"
         return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
 
     def count_components(self) -> int:
         """Return the number of Gaussians of all members."""
-        return sum(member.count for member in self.members)
+        return sum(member.count_gaussians for member in self.members)
 
     def objects(self) -> SiteObjects:
         """Return those of the heaviest member that found any."""
@@ -329,7 +329,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.weights, self.runs = tuple(state["weights"]), RunFactors.read(state["runs"])
 
 
-def _runs(data: Measurements, known: np.ndarray, context: FitContext) -> RunFactors:
+def _estimate_run_factors(data: Measurements, known: np.ndarray, context: FitContext) -> RunFactors:
     """Factors of several runs of channels, by the waves that explain rows (n,); else none."""
     if not RunFactors.has_several_runs(data, known):
         return RunFactors.identity()

@@ -29,7 +29,7 @@ LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
 def stacking_weights(
-    predicted: list[Tensor], target: Tensor, unit: np.ndarray, sure: float = 1.0
+    predicted: list[Tensor], target: Tensor, unit: np.ndarray, deviations: float = 1.0
 ) -> tuple[float, ...]:
     """Return weights in [0, 1] of sum one: one alone, unless a mixture is surely better.
 
@@ -37,10 +37,10 @@ def stacking_weights(
         predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
         target: (n, ...).
         unit: (n,), rows of one unit are not independent.
-        sure: see `choose_weights`.
+        deviations: see `choose_weights`.
     """
     missed = torch.stack([to_real_entries((one - target).detach()) for one in predicted], 1)  # (n, M, P)
-    chosen = choose_weights((missed @ missed.mT).numpy(), unit, sure)
+    chosen = choose_weights((missed @ missed.mT).numpy(), unit, deviations)
     return tuple(float(weight) for weight in chosen)
 
 
@@ -87,9 +87,9 @@ def relative_error(predicted: Tensor, target: Tensor) -> float:
     return float(missed / target.abs().square().sum().clamp_min(TINY_POWER))
 
 
-def explained_variance(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
+def explained_variance(predicted: Tensor, target: Tensor, remove_mean: bool) -> float:
     """Return the share of variance that a prediction explains, of complex targets about 0; at most 1."""
-    middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
+    middle = target.mean(0, keepdim=True) if remove_mean else torch.zeros_like(target[:1])
     whole = (target - middle).abs().square().sum().clamp_min(TINY_POWER)
     return 1 - float((predicted - target).abs().square().sum() / whole)
 
@@ -99,11 +99,11 @@ def in_error_unit(values: Tensor, site: Site) -> Tensor:
     return decibels(values) if site.kind == "rssi" else values
 
 
-def mix_means(own: Tensor, second: Tensor, weight: float, site: Site) -> Tensor:
+def mix_means(first: Tensor, second: Tensor, weight: float, site: Site) -> Tensor:
     """Return the mean (n, ...) of two predictions in the unit of errors, the other's of this weight."""
     if site.kind != "rssi":
-        return own.lerp(second, weight)
-    return own.clamp_min(TINY_POWER) ** (1 - weight) * second.clamp_min(TINY_POWER) ** weight
+        return first.lerp(second, weight)
+    return first.clamp_min(TINY_POWER) ** (1 - weight) * second.clamp_min(TINY_POWER) ** weight
 
 
 def to_real_entries(values: Tensor) -> Tensor:
@@ -139,15 +139,15 @@ def mean_and_error(difference: np.ndarray, unit: np.ndarray) -> tuple[float, flo
     return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
-def choose_weights(gram: np.ndarray, unit: np.ndarray, sure: float = 1.0) -> np.ndarray:
-    """Return weights (K,) of predictions: one alone, unless a mixture is better by over `sure` errors.
+def choose_weights(gram: np.ndarray, unit: np.ndarray, deviations: float = 1.0) -> np.ndarray:
+    """Return weights (K,) of predictions: one alone, unless a mixture is better by over `deviations` errors.
 
     The mixture is judged on units whose rows its weights were not learned from.
 
     Args:
         gram: (n, K, K) products of the errors of n rows.
         unit: (n,) of the rows, see `mean_and_error`.
-        sure: standard errors of the gain.
+        deviations: standard errors of the gain.
     """
     errors = np.einsum("nkk->nk", gram)
     winner = int(errors.mean(0).argmin())
@@ -158,9 +158,9 @@ def choose_weights(gram: np.ndarray, unit: np.ndarray, sure: float = 1.0) -> np.
     mixed = np.empty(len(gram))
     for number in range(int(part.max()) + 1):
         here = part == number
-        mixed[here] = mixture_errors(_pruned(gram[~here].mean(0)), gram[here])
+        mixed[here] = mixture_errors(_weights_of_large(gram[~here].mean(0)), gram[here])
     gain, error = mean_and_error(errors[:, winner] - mixed, unit)
-    return _pruned(gram.mean(0)) if gain > sure * error else single
+    return _weights_of_large(gram.mean(0)) if gain > deviations * error else single
 
 
 def mixture_errors(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
@@ -168,7 +168,7 @@ def mixture_errors(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
     return np.einsum("k,nkl,l->n", weights, gram, weights)
 
 
-def _pruned(gram: np.ndarray) -> np.ndarray:
+def _weights_of_large(gram: np.ndarray) -> np.ndarray:
     """The best weights (K,) without those that matter little."""
     large = best_weights(gram) >= UNUSED
     result = np.zeros(len(gram))

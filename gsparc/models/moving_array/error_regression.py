@@ -62,7 +62,7 @@ class ImageErrors(Stored):
     reach: float
     prior: float
 
-    def expected(self, far: Tensor, features: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+    def unknown_and_variance(self, far: Tensor, features: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
         """Return what is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
 
         An image is known to its relative error with weight c and not at all with weight 1 - c, the
@@ -73,12 +73,12 @@ class ImageErrors(Stored):
             features: (m, 3), see `image_features`.
             power: (m,) mean square of the predicted images.
         """
-        error, nearest = self.relative_error(far, features)
+        error, nearest = self.error_and_nearest(far, features)
         known = matern32((nearest - self.farthest).clamp_min(0), self.reach)
         variance = known * (error * power).clamp_max(self.prior) + (1 - known) * self.prior
         return 1 - known / (1 + error), variance
 
-    def relative_error(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def error_and_nearest(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m]; see `expected`.
 
         Beyond the largest distance between training places it grows with the distance squared.
@@ -88,7 +88,7 @@ class ImageErrors(Stored):
         distance = far.gather(1, near)
         columns = _columns(self.kernel, distance, self.precision[row], self.errors[near], features)
         beyond = (nearest / self.farthest).clamp_min(1.0).square()
-        return self.regression.expected(columns) * beyond, nearest
+        return self.regression.expected_error(columns) * beyond, nearest
 
 
 def fit_errors(
@@ -105,14 +105,14 @@ def fit_errors(
     near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
     regression = RelativeErrorRegression.from_rows(columns, relative_error)
-    precision, farthest = _precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M)
+    precision, farthest = (_precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M))
     return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 
 
 def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:
     """Columns (m, 5) of the regression from k neighbours: (m, k) distances [m], (m, k, k), (m, k) errors."""
-    variance = _variance(kernel, distance, precision).log().to(distance.dtype)
-    return torch.cat([torch.stack([_average(distance, errors), variance], 1), features], 1)
+    variance = _posterior_variance(kernel, distance, precision).log().to(distance.dtype)
+    return torch.cat([torch.stack([_average_neighbours(distance, errors), variance], 1), features], 1)
 
 
 def _precision(kernel: Kernel, places: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ def _precision(kernel: Kernel, places: Tensor) -> Tensor:
     return Factor.from_gram(kernel.correlations(places, places) + noise, "raise").inverse
 
 
-def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
+def _posterior_variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
     """Posterior variance (m,) float64 over the amplitude at a `distance` (m, k) [m] from k neighbours.
 
     The nearest rows screen off the others (Stein 2002), whose Cholesky factor would be most of a query.
@@ -131,7 +131,7 @@ def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
     return (prior - (cross @ precision @ cross.mT)[:, 0, 0]).clamp(max(kernel.noise, LEAST_NOISE), prior)
 
 
-def _average(distance: Tensor, values: Tensor) -> Tensor:
+def _average_neighbours(distance: Tensor, values: Tensor) -> Tensor:
     """Mean (m,) of neighbours' values (m, k) with exponential weights of the distances (m, k)."""
     near = min(NEAR, distance.shape[1])
     reach = distance.kthvalue(near, dim=1, keepdim=True).values.clamp_min(LEAST_M)

@@ -21,11 +21,11 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction, to_double
 from gsparc.models.moving_array.error_regression import fit_errors, image_features
 from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
-from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, reduced
-from gsparc.models.moving_array.residual import fit_residual, left_out_error
+from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, reduce_moving_array
+from gsparc.models.moving_array.residual import error_and_likeliest_kernel, fit_residual
 from gsparc.models.moving_array.triangulate import (
     MAX_UNEXPLAINED,
-    SearchSettings,
+    BearingSearchSettings,
     find_sources,
     nonnegative_powers,
     pixel_exponent,
@@ -83,7 +83,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     found: PowerTrend  # sources and their powers
 
     def __init__(
-        self, search: SearchSettings = SearchSettings(), trend: TrendSettings = TrendSettings(),
+        self, search: BearingSearchSettings = BearingSearchSettings(), trend: TrendSettings = TrendSettings(),
         rest_rows: int = 1500, components: int = 512, seed: int = 0, name: str = "moving_array",
     ) -> None:  # fmt: skip
         super().__init__()
@@ -116,24 +116,24 @@ class MovingArrayField(Differentiable, ClosedForm):
         return ("moving_array", "residual") if len(self.residual.axes) else ("moving_array",)
 
     def reduction_settings(self) -> tuple[str, ...]:
-        """See `Method.reduced`."""
+        """See `Method.reduce`."""
         return ("keep", "stride", "confidence")
 
-    reduced = reduced
+    reduce = reduce_moving_array
 
     # -- learning ----------------------------------------------------------------------------------
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Before any lags are taken: they are linear in power, not in amplitude.
-        self.exponent = self._exponent(targets)
+        self.exponent = self._find_pixel_exponent(targets)
         self.basis = fit_separable(self._blocks(targets), UNRESOLVED)
-        spectra = self._spectra(positions, targets)
-        sources = self._find(spectra)
-        power = self._powers(spectra, sources)
-        modelled = self._smooth(spectra, sources, power, self._choose_kernel(spectra, sources, power))
-        rows = _spread(len(positions), self.rest_rows)
-        left, kernel = left_out_error(positions[rows], spectra.values[rows] - modelled[rows])
-        self._complete(spectra, modelled, kernel, targets)
+        spectra = self._make_spectra(positions, targets)
+        sources = self._find_sources(spectra)
+        power = self._fit_powers(spectra, sources)
+        modelled = self._fit_trend(spectra, sources, power, self._choose_kernel(spectra, sources, power))
+        rows = _spread_rows(len(positions), self.rest_rows)
+        left, kernel = error_and_likeliest_kernel(positions[rows], spectra.values[rows] - modelled[rows])
+        self._fit_residual(spectra, modelled, kernel, targets)
         error, count = left / targets[0].size, self.count_components()
         note = f"{self.name}: {count} sources, leave-one-out error {error:.4g}"
         fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
@@ -146,17 +146,17 @@ class MovingArrayField(Differentiable, ClosedForm):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
-        spectra, one = self._spectra(data.moving[rows], targets), self.found
-        modelled = self._smooth(spectra, one.sources, self._powers(spectra, one.sources), one.kernel)
-        self._complete(spectra, modelled, self.residual.kernel, targets)
+        spectra, one = self._make_spectra(data.moving[rows], targets), self.found
+        modelled = self._fit_trend(spectra, one.sources, self._fit_powers(spectra, one.sources), one.kernel)
+        self._fit_residual(spectra, modelled, self.residual.kernel, targets)
 
-    def _exponent(self, targets: np.ndarray) -> int:
+    def _find_pixel_exponent(self, targets: np.ndarray) -> int:
         """Whether pixels are amplitude (2) or power (1).
 
         Raises:
             ValueError: neither is a spectrum of the declared array.
         """
-        exponent, left = pixel_exponent(self.lags(), self._images(targets[_spread(len(targets), 16)]))
+        exponent, left = pixel_exponent(self.lags(), self._to_images(targets[_spread_rows(len(targets), 16)]))
         if left > MAX_UNEXPLAINED:
             raise ValueError(
                 f"{self.name}: the declared array cannot have measured these spectra "
@@ -164,37 +164,40 @@ class MovingArrayField(Differentiable, ClosedForm):
             )
         return exponent
 
-    def _spectra(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
+    def _make_spectra(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
         both = [(self.lags().to_lags(b**self.exponent), self.basis.project(b)) for b in self._blocks(targets)]
         lags, values = (torch.cat(part) for part in zip(*both, strict=True))
         return Spectra(places, lags, values)
 
-    def _find(self, spectra: Spectra) -> Tensor:
+    def _find_sources(self, spectra: Spectra) -> Tensor:
         """Sources (K, 3) [m]."""
         assert self.site is not None and self.site.grid is not None
-        few, still = spectra.subset(_spread(len(spectra.places), self.search.rows)), self.site.static_position
+        few, still = (
+            spectra.subset(_spread_rows(len(spectra.places), self.search.rows)),
+            self.site.static_position,
+        )
         first = None if still is None else torch.from_numpy(np.asarray(still)).float()
         return find_sources(
             few.lags, few.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
             self.seed, self._budget.is_spent,
         )  # fmt: skip
 
-    def _powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:
+    def _fit_powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:
         """Powers (n, K) float64 that explain each row best."""
-        array = self.array()
+        array = self.receiving_array()
         return torch.cat([
             nonnegative_powers(part, array.atoms(sources, places), self.search.ridge)
             for part, places in zip(spectra.lags.split(BLOCK), spectra.receivers.split(BLOCK), strict=True)
         ]).double().numpy()  # fmt: skip
 
-    def _smooth(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
+    def _fit_trend(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
         """Fit the trend of powers (n, K); its left-out images (n, R)."""
         self.found, left = fit_trend(sources, kernel, spectra.places, power)
-        return self._modelled(spectra, sources, torch.from_numpy(left).float())
+        return self._render_coefficients(spectra, sources, torch.from_numpy(left).float())
 
-    def _modelled(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
+    def _render_coefficients(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
         """Images (n, R) of sources of powers (n, K)."""
-        array = self.array()
+        array = self.receiving_array()
         return torch.cat([
             self.basis.project(array.render(sources, places, part))
             for places, part in zip(spectra.receivers.split(BLOCK), power.split(BLOCK), strict=True)
@@ -202,18 +205,18 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     def _choose_kernel(self, spectra: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
         """Kernel of a trend, by leave-one-out error."""
-        rows = _spread(len(spectra.places), self.trend.rows)
+        rows = _spread_rows(len(spectra.places), self.trend.rows)
         # Lengths are shares of the site's diagonal, of 1 m where all rows are at one place.
         some, diagonal = spectra.subset(rows), float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0
         errors = {}
         for length in self.trend.lengths:
             kernel = Kernel.from_length(length * diagonal, self.trend.noise)
             left = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
-            missed = some.values - self._modelled(some, sources, left)
-            errors[kernel] = left_out_error(some.places, missed)[0]
+            missed = some.values - self._render_coefficients(some, sources, left)
+            errors[kernel] = error_and_likeliest_kernel(some.places, missed)[0]
         return min(errors, key=lambda kernel: errors[kernel])
 
-    def _complete(self, spectra: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
+    def _fit_residual(self, spectra: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
         """The process on what left-out trends (n, R) miss, and the error model of the sum."""
         self.positions, missed = spectra.places, spectra.values - modelled
         self.residual, added = fit_residual(kernel, spectra.places, missed, self.components)
@@ -245,9 +248,9 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     # -- answering ---------------------------------------------------------------------------------
 
-    def _answered(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
+    def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """See `Differentiable`; `explained` are the sources' images alone."""
-        query, errors = self.query(), self.errors
+        query, errors = self.renderer(), self.errors
         if dtype == torch.float64:
             query, errors = query.in_float64, to_double(errors)
         answer = query(queries)
@@ -255,21 +258,21 @@ class MovingArrayField(Differentiable, ClosedForm):
         mean = answer.image.clamp_(0, 1)
         features = image_features(mean, answer.added / mean[0].numel())
         power = mean.flatten(1).square().mean(1)
-        unknown, variance = errors.expected(answer.far, features, power)
+        unknown, variance = errors.unknown_and_variance(answer.far, features, power)
         return Prediction(mean, variance, unknown, answer.explained.clamp(0, 1))
 
-    def query(self) -> ImageRenderer:
+    def renderer(self) -> ImageRenderer:
         """Return answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
-            self._query = ImageRenderer(self.array(), self.basis, self.found, self.residual, places)
+            self._query = ImageRenderer(self.receiving_array(), self.basis, self.found, self.residual, places)
         return self._query
 
     def count_components(self) -> int:
         """Return the number of sources."""
         return len(self.found.sources) if "found" in vars(self) else 0
 
-    def array(self, stride: int = 1) -> ReceivingArray:
+    def receiving_array(self, stride: int = 1) -> ReceivingArray:
         """Return the array, which looks at every `stride`-th pixel."""
         return ReceivingArray(self.lags(), self.rotation(), self.exponent, stride)
 
@@ -288,21 +291,21 @@ class MovingArrayField(Differentiable, ClosedForm):
     _lags: SpectrumLags | None = None
     _query: ImageRenderer | None = None
 
-    def _images(self, targets: np.ndarray) -> Tensor:
+    def _to_images(self, targets: np.ndarray) -> Tensor:
         return torch.from_numpy(to_real(targets, "spectrum")).reshape(targets.shape)
 
     def _blocks(self, targets: np.ndarray) -> Iterator[Tensor]:
-        return (self._images(targets[i : i + BLOCK]) for i in range(0, len(targets), BLOCK))
+        return (self._to_images(targets[i : i + BLOCK]) for i in range(0, len(targets), BLOCK))
 
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)
         self._lags = self._query = None
         self.basis = Separable(**state["basis"])
 
-    def _learned(self) -> dict[str, Any]:
-        return {**super()._learned(), "basis": vars(self.basis)}
+    def _stored_state(self) -> dict[str, Any]:
+        return {**super()._stored_state(), "basis": vars(self.basis)}
 
 
-def _spread(count: int, limit: int) -> np.ndarray:
+def _spread_rows(count: int, limit: int) -> np.ndarray:
     """At most `limit` of `count` rows, evenly."""
     return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int))

@@ -47,9 +47,9 @@ class PowerTrend(Stored):
     level: Tensor
     weights: Tensor
 
-    def powers(self, far: Tensor) -> Tensor:
-        """Return powers (m, K) of sources at places that are `far` (m, n) [m] from training receivers."""
-        return torch.addmm(self.level, self.kernel.correlation(far), self.weights)
+    def powers(self, distance: Tensor) -> Tensor:
+        """Return powers (m, K) of sources at places `distance` (m, n) [m] from training receivers."""
+        return torch.addmm(self.level, self.kernel.correlation(distance), self.weights)
 
 
 def solve_and_leave_out(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:

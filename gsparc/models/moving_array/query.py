@@ -106,7 +106,7 @@ class ImageRenderer:
         return to_double(self)
 
 
-def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
+def reduce_moving_array(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
     """Return the mean with the strongest components of the residual (`keep`).
 
     On fewer pixels (`stride`) and without its variance.
@@ -139,7 +139,7 @@ class ReducedMean(View):
         basis = inner.basis if stride == 1 else inner.basis.subsample_pixels(stride)
         residual = inner.residual.keep_axes(count)
         places = torch.from_numpy(inner.positions)
-        self._query = ImageRenderer(inner.array(stride), basis, inner.found, residual, places)
+        self._query = ImageRenderer(inner.receiving_array(stride), basis, inner.found, residual, places)
         self._count = count
 
     @torch.no_grad()

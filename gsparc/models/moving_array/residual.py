@@ -38,9 +38,9 @@ class Residual(Stored):
     axes: Tensor
     weights: Tensor
 
-    def coefficients(self, far: Tensor) -> Tensor:
-        """Return coefficients (m, R) of images at places `far` (m, n) [m] from the training receivers."""
-        return torch.addmm(self.mean, self.kernel.correlation(far) @ self.weights, self.axes)
+    def coefficients(self, distance: Tensor) -> Tensor:
+        """Return coefficients (m, R) of images at places `distance` (m, n) [m] from training receivers."""
+        return torch.addmm(self.mean, self.kernel.correlation(distance) @ self.weights, self.axes)
 
     def keep_axes(self, count: int) -> Residual:
         """Return the process with the `count` axes that most is predicted along."""
@@ -62,7 +62,7 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
         part.numpy() for part in solve_and_leave_out(kernel, places, torch.from_numpy(centred))
     )
     predicted = centred - missed
-    energy, axes = principal_axes(predicted, limit)
+    energy, axes = energies_and_axes(predicted, limit)
     left_out = (predicted**2).sum() - energy.sum() + energy[::-1].cumsum()[::-1] - energy
     basis = axes[: 1 + int((left_out > SPARED * (missed**2).sum()).sum())]
     turned = torch.from_numpy(weights @ basis.T).float().contiguous()
@@ -70,18 +70,18 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
     return residual, torch.addmm(mean, torch.from_numpy(predicted @ basis.T).float(), residual.axes)
 
 
-def left_out_error(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
+def error_and_likeliest_kernel(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
     """Return the left-out squared error of images (n, R) under the likeliest kernel, and that kernel."""
     mean = values.mean(0)
     centred = (values - mean).double().numpy()
-    scores = centred @ principal_axes(centred, KERNEL_COMPONENTS)[1].T
+    scores = centred @ energies_and_axes(centred, KERNEL_COMPONENTS)[1].T
     kernel = choose_left_out_kernel(places, scores, values.shape[1], 1)
     residual = solve_and_leave_out(kernel, places, torch.from_numpy(scores))[1]
     missed = float(residual.square().sum()) + (centred**2).sum() - (scores**2).sum()
     return float(missed) / len(values), kernel
 
 
-def principal_axes(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
+def energies_and_axes(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
     """Return at most `limit` principal axes (C, R) of values (n, R), energies (C,) along them, falling."""
     n, r = values.shape
     gram = values @ values.T if n <= r else values.T @ values

@@ -25,7 +25,7 @@ SEEN_AT_ONCE = 64  # receivers of a step of refinement
 
 
 @dataclass(frozen=True)
-class SearchSettings:
+class BearingSearchSettings:
     """Source search.
 
     Attributes:
@@ -87,7 +87,7 @@ def sum_lags(power: Tensor, atoms: Tensor) -> Tensor:
 
 def find_sources(
     lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: SpectrumLags,
-    grid: SphereGrid, settings: SearchSettings, seed: int, over: Callable[[], bool],
+    grid: SphereGrid, settings: BearingSearchSettings, seed: int, is_spent: Callable[[], bool],
 ) -> Tensor:  # fmt: skip
     """Return positions (K, 3) float32 [m] of sources.
 
@@ -100,7 +100,7 @@ def find_sources(
         grid: of the spectra; candidates are scored at their nearest pixel.
         settings: how.
         seed: of the candidates.
-        over: asked between steps, which end when it says so.
+        is_spent: asked between steps, which end when it says so.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
@@ -108,24 +108,24 @@ def find_sources(
     low, high = low - far, high + far
     known = receivers[:0] if first is None else first[None].float()
 
-    def residual_of(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
+    def residual_lags(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
         atoms = space.plane_wave_lags(bearings(sources, receivers, rotation))
         return lags - sum_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 
-    positions, residual = known, residual_of(lags, receivers, known) if len(known) else lags
+    positions, residual = known, residual_lags(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
         candidates = draw_in_box(low, high, settings.candidates, generator)
         # Amplitudes: with powers the nearest receiver would decide alone.
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
-        new = _best(candidates, amplitude, receivers, rotation, grid, settings)
+        new = _best_separated(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
             break
         positions = torch.cat([positions, new[: settings.sources - len(positions)]])
-        residual = residual_of(lags, receivers, positions)
+        residual = residual_lags(lags, receivers, positions)
         before, energy = energy, float(residual.square().sum())
-        if energy > (1 - settings.least_gain) * before or over():
+        if energy > (1 - settings.least_gain) * before or is_spent():
             break
     if settings.steps == 0 or len(positions) == len(known):
         return positions
@@ -133,13 +133,13 @@ def find_sources(
     free = positions[len(known) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
     for step in range(settings.steps):
-        if over():
+        if is_spent():
             break
         progress = step / settings.steps
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         # As many receivers a step on every site, so that its time is bounded.
         some = torch.randperm(len(receivers), generator=generator)[:SEEN_AT_ONCE]
-        residual = residual_of(lags[some], receivers[some], torch.cat([known, free]))
+        residual = residual_lags(lags[some], receivers[some], torch.cat([known, free]))
         # A share of the energy: levels of spectra must not matter beside Adam's epsilon.
         loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
@@ -148,14 +148,14 @@ def find_sources(
     return torch.cat([known, free.detach()])
 
 
-def _best(
+def _best_separated(
     candidates: Tensor, images: Tensor, receivers: Tensor, rotation: Tensor, grid: SphereGrid,
-    settings: SearchSettings,
+    settings: BearingSearchSettings,
 ) -> Tensor:  # fmt: skip
     """Candidates of the largest amplitude (n, P) in their direction over all receivers, no near doubles."""
     score = torch.zeros(len(candidates))
     for image, receiver in zip(images, receivers, strict=True):
-        pixel, inside = _pixels(bearings(candidates, receiver[None], rotation)[0], grid)
+        pixel, inside = _pixels_and_inside(bearings(candidates, receiver[None], rotation)[0], grid)
         score += torch.where(inside, image[pixel], 0.0)
     # Doubles are found by comparing pairs one by one.
     ranked = candidates[score.argsort(descending=True)[: len(candidates) // BEST_PART]]
@@ -170,7 +170,7 @@ def _best(
     return ranked[chosen]
 
 
-def _pixels(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
+def _pixels_and_inside(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
     """Nearest pixel (n,) of unit vectors (n, 3), and whether the grid has one there."""
     # Unit vectors rounded above 1 have no arcsine.
     elevation = torch.asin(directions[:, 2].clamp(-1, 1))

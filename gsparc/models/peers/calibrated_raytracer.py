@@ -70,9 +70,9 @@ class CalibratedRayTracer(Method):
         self._scene_json, self._silent_db, self._factor = "", 0.0, 1.0 + 0.0j
         self._tracer: RayTracer | None = None
         # A depth that no tracer takes is refused here, before anything is loaded.
-        self._traced_effects()
+        self._effects()
 
-    def problem(self, data: Measurements) -> str | None:
+    def why_not(self, data: Measurements) -> str | None:
         """Return why it cannot serve these measurements; None where it may."""
         site = data.site
         if site.kind not in self.kinds:
@@ -92,7 +92,7 @@ class CalibratedRayTracer(Method):
             ValueError: other data than `problem` allows, no known scene, or paths to fewer than 2 rows.
             SimulatorMissing: Sionna is not installed.
         """
-        fault = self.problem(data)
+        fault = self.why_not(data)
         if fault is not None:
             raise ValueError(fault)
         begin = TimeBudget()
@@ -104,14 +104,14 @@ class CalibratedRayTracer(Method):
         self._scene_json, self._tracer = json.dumps(asdict(scene)), None
         rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
         # Measurements are local, the tracer's scene is in world coordinates.
-        places, measured = data.moving[rows] + data.site.origin, _levels(data, rows)
-        tracer = self._ready()
+        places, measured = data.moving[rows] + data.site.origin, _measured_decibels(data, rows)
+        tracer = self._loaded_tracer()
         own = used_materials(tracer)
         start = own if self.start == "scene" else dict.fromkeys(own, GENERIC)
         # Before the replay, whose first powers are those under the start's materials.
         apply_materials(tracer, start)
         # Paths are traced once: materials change what they carry, not where they run.
-        replay = Replay(tracer, places, self._traced_effects())
+        replay = Replay(tracer, places, self._effects())
         traced = replay.received_powers()
         reached = traced > 0
         # Gain and scale of the residuals are learned at least: two unknowns.
@@ -123,9 +123,9 @@ class CalibratedRayTracer(Method):
         # Powers tell a gain in decibels; channels need its phase too.
         if data.site.kind == "csi":
             self._factor = self._best_factor(data, rows)
-        return FitReport(begin.spent, self._notes(len(rows) - int(reached.sum())))
+        return FitReport(begin.spent, self._describe_fit(len(rows) - int(reached.sum())))
 
-    def _notes(self, dark: int) -> tuple[str, ...]:
+    def _describe_fit(self, dark: int) -> tuple[str, ...]:
         assert self.learned is not None
         materials = ", ".join(
             f"{name} {one.permittivity:.3g} and {one.conductivity:.2g} S/m"
@@ -167,16 +167,16 @@ class CalibratedRayTracer(Method):
     def _trace(self, places: np.ndarray) -> Paths:
         """Paths to places (B, 3) [m], local."""
         assert self.site is not None
-        return self._ready().trace(places + self.site.origin, self._traced_effects())
+        return self._loaded_tracer().trace(places + self.site.origin, self._effects())
 
-    def _traced_effects(self) -> Effects:
+    def _effects(self) -> Effects:
         # Diffuse scattering has parameters of its own, which nothing here learns.
         return Effects(
             diffraction=self.diffraction, edge_diffraction=False, diffuse=False, polarisation=False,
             depth=self.depth,
         )  # fmt: skip
 
-    def _ready(self) -> RayTracer:
+    def _loaded_tracer(self) -> RayTracer:
         """The scene under what was learned, loaded when it is first asked."""
         if self._tracer is None:
             assert self.site is not None and self.site.static_position is not None
@@ -204,7 +204,7 @@ class CalibratedRayTracer(Method):
         self._silent_db, self._factor = float(state["silent_db"]), complex(*state["factor"])
 
 
-def _levels(data: Measurements, rows: np.ndarray) -> np.ndarray:
+def _measured_decibels(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Powers (n,) of `rows` in decibels of stored units; of channels the mean over tones."""
     if data.site.kind == "rssi":
         return to_real(data.target[rows], "rssi")[:, 0].astype(np.float64)

@@ -35,7 +35,7 @@ class Coder(Network):
         self.encoder = perceptron(2 * len(scene.site.uplink_hz), 2 * self.code, settings.hidden, 2, nn.GELU)
         self.decoder = perceptron(self.code, 2 * scene.shape[1], settings.hidden, 2, nn.GELU)
 
-    def predict_downlink(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def downlink_and_divergence(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the downlink (B, K) and the code's divergence from a standard normal (B,)."""
         middle, log_variance = self.encoder(torch.view_as_real(uplink).flatten(1)).chunk(2, dim=1)
         code = middle if noise is None else middle + noise * (log_variance / 2).exp()
@@ -44,7 +44,7 @@ class Coder(Network):
         out = self.decoder(code)
         return torch.view_as_complex(out.view(len(out), -1, 2)), divergence
 
-    def normalise_uplink(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
+    def unit_uplink_and_level(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
         """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
         # Both bands lose alike along the path: the uplink's level carries over to the downlink.
         scale = root_mean_power(uplink)[:, None, None]
@@ -53,7 +53,7 @@ class Coder(Network):
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the mean squared error () of unit channels, and the code's divergence by its weight."""
         assert batch.uplink is not None
-        own, scale = self.normalise_uplink(batch.uplink)
+        own, scale = self.unit_uplink_and_level(batch.uplink)
         # As many antennas of snapshots as there are snapshots, whatever the array: steps cost alike.
         pick = torch.randint(own.shape[0] * own.shape[1], (len(own),), generator=generator)
         # Snapshots have arbitrary phase: rotating both ends augments the data.
@@ -62,7 +62,7 @@ class Coder(Network):
             torch.polar(torch.ones_like(angle), angle),
             torch.randn(len(own), self.code, generator=generator),
         )
-        guess, divergence = self.predict_downlink(own.flatten(0, 1)[pick] * turn, noise)
+        guess, divergence = self.downlink_and_divergence(own.flatten(0, 1)[pick] * turn, noise)
         missed = guess - (batch.target / scale).flatten(0, 1)[pick] * turn
         return missed.abs().square().mean() + self.weight * divergence.mean()
 
@@ -89,7 +89,7 @@ class Fire(UplinkMethod, TrainedPeer):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `TrainedPeer.fit`; on all antennas."""
-        self._need_uplink(data)
+        self._require_uplink(data)
         return super().fit(data, fold, context)
 
     @torch.no_grad()
@@ -97,5 +97,7 @@ class Fire(UplinkMethod, TrainedPeer):
         """See `Method.predict`; of the uplink alone."""
         network, uplink = self.fitted(), self.query_uplinks(query)
         assert isinstance(network, Coder)
-        own, scale = network.normalise_uplink(uplink)
-        return Prediction(network.predict_downlink(own.flatten(0, 1))[0].view(*own.shape[:2], -1) * scale)
+        own, scale = network.unit_uplink_and_level(uplink)
+        return Prediction(
+            network.downlink_and_divergence(own.flatten(0, 1))[0].view(*own.shape[:2], -1) * scale
+        )

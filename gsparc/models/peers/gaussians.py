@@ -33,8 +33,8 @@ class GaussianPeer(TrainedPeer):
         """See `HasGaussians`."""
         network = self.fitted()
         assert isinstance(network, GaussianNetwork)
-        emitted = [network.emitted(one.tx, one.rx) for one in query.split(1)]
-        return network.cloud(torch.stack(emitted).square().mean(0).sqrt())
+        emitted = [network.emit(one.tx, one.rx) for one in query.split(1)]
+        return network.to_cloud(torch.stack(emitted).square().mean(0).sqrt())
 
 
 @dataclass(eq=False, kw_only=True)
@@ -58,11 +58,11 @@ class GaussianNetwork(Network):
 
     field: GaussianField
 
-    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+    def emit(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return what each Gaussian emits (N,) for one position (1, 3)."""
         raise NotImplementedError
 
-    def cloud(self, strengths: Tensor) -> GaussianCloud:
+    def to_cloud(self, strengths: Tensor) -> GaussianCloud:
         """Return the Gaussians, with what each emits (N,)."""
         return self.field.to_cloud(strengths, "emission of a Gaussian")
 

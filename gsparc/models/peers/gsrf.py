@@ -33,7 +33,7 @@ from gsparc.models.peers.gaussians import (
     initial_gaussians,
     rendering_options,
 )
-from gsparc.models.peers.trained import Scene, magnitude
+from gsparc.models.peers.trained import Scene, smooth_root
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
 
 
@@ -59,7 +59,7 @@ class ComplexGaussians(GaussianNetwork):
             self.response = nn.Parameter(response)
         self._frozen: FrozenPlan | None = None
 
-    def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
+    def radiance_towards(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return radiance (B, N, 2) of each Gaussian towards the moving end."""
         towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
         # [m]: 1 / distance grows without end at the moving end itself.
@@ -75,16 +75,16 @@ class ComplexGaussians(GaussianNetwork):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return spectra (B, H, W) or channels (B, A, K)."""
-        sent, geometry = self.radiance(tx, rx), self.field.geometry()
+        sent, geometry = self.radiance_towards(tx, rx), self.field.geometry()
         if self.response is not None:
             seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
             return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
-        return magnitude(rasterize(*geometry, sent, rx, self.grid, **self.options).image.square().sum(1))
+        return smooth_root(rasterize(*geometry, sent, rx, self.grid, **self.options).image.square().sum(1))
 
-    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+    def emit(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""
-        sent = self.radiance(tx, rx)[0].norm(dim=1)
+        sent = self.radiance_towards(tx, rx)[0].norm(dim=1)
         return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -112,7 +112,7 @@ class ComplexGaussians(GaussianNetwork):
             geometry = self.field.geometry()
             plan = make_plan(*geometry, rx, self.grid, **self.options)
             self._frozen = freeze(plan, *geometry, version=0)
-        return magnitude(self._frozen.render(self.radiance(tx, rx), 0).square().sum(1))
+        return smooth_root(self._frozen.render(self.radiance_towards(tx, rx), 0).square().sum(1))
 
 
 @dataclass(eq=False, kw_only=True)

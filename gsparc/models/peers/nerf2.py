@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, magnitude, perceptron
+from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron, smooth_root
 from gsparc.ops import Pose
 
 REFERENCE = 0.025  # [m] at which a signal has unit gain: 1/d without its constant
@@ -69,13 +69,13 @@ class MarchedField(Network):
         thick, turn = step * size[0], step * phase[0]
         gain = (thick - thick.cumsum(1)).exp() * size[1] * REFERENCE / (depth + step)
         wave = torch.polar(gain, turn.cumsum(1) - turn + phase[1])
-        return magnitude(wave.sum(1).abs().square())
+        return smooth_root(wave.sum(1).abs().square())
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Mean squared error () of rays drawn at random."""
         sample = torch.randint(len(batch), (self.rays,), generator=generator)
         pixel = torch.randint(len(self.directions), (self.rays,), generator=generator)
-        origin, heading = self._rays(batch.rx, sample, pixel)
+        origin, heading = self._origins_and_directions(batch.rx, sample, pixel)
         seen = self.march(origin, heading, self.scene.site.moving(batch.tx, batch.rx)[sample])
         error = (seen - batch.target.flatten(1)[sample, pixel]).square()
         if batch.mask is not None:
@@ -88,10 +88,10 @@ class MarchedField(Network):
         parts = []
         for sample, some in product(range(len(tx)), pixels.split(max(POINTS // self.samples, 1))):
             which = torch.full_like(some, sample)
-            parts.append(self.march(*self._rays(rx, which, some), moving[which]))
+            parts.append(self.march(*self._origins_and_directions(rx, which, some), moving[which]))
         return torch.cat(parts).view(len(tx), *self.scene.shape)
 
-    def _rays(self, rx: Pose, sample: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    def _origins_and_directions(self, rx: Pose, sample: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and world directions (R, 3) of the pixels of samples."""
         local = self.directions[pixel]
         if not rx.batched:

@@ -57,7 +57,7 @@ class DirectedRays(Network):
         inputs = self.place.width + self.heading.width
         self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
-    def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
+    def transmitters_and_likely(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
         """Return virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and which are (B, P).
 
         At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
@@ -95,12 +95,12 @@ class DirectedRays(Network):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return channels (B, 1, 1) at searched directions."""
         places = torch.atleast_2d(rx.position)
-        return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
+        return self.march(places, *self.transmitters_and_likely(places, False), None).view(-1, 1, 1)
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Mean squared error along measured directions."""
         places = torch.atleast_2d(batch.rx.position)
-        seen = self.march(places, *self.search(places, True), generator).view(-1, 1, 1)
+        seen = self.march(places, *self.transmitters_and_likely(places, True), generator).view(-1, 1, 1)
         return (seen - batch.target).abs().square().mean()
 
 
@@ -166,11 +166,11 @@ def locate_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.
         distance = np.ma.median(known, axis=1).filled(np.nan)
         points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
     flat = np.concatenate([places[:0], *points])
-    centres = _merged(flat[np.isfinite(flat[:, 0])])
-    return centres, [_passed(place, own, centres) for place, own in zip(places, rays, strict=True)]
+    centres = _cluster_centres(flat[np.isfinite(flat[:, 0])])
+    return centres, [_nearest_centres(place, own, centres) for place, own in zip(places, rays, strict=True)]
 
 
-def _passed(place: np.ndarray, rays: np.ndarray, centres: np.ndarray) -> np.ndarray:
+def _nearest_centres(place: np.ndarray, rays: np.ndarray, centres: np.ndarray) -> np.ndarray:
     """Row (paths,) of the centre that each ray comes nearest to, within the width of a cluster; -1: none."""
     if not len(centres):
         return np.full(len(rays), -1)
@@ -180,7 +180,7 @@ def _passed(place: np.ndarray, rays: np.ndarray, centres: np.ndarray) -> np.ndar
     return np.where(miss.min(1) < 2 * MERGE, miss.argmin(1), -1)
 
 
-def _merged(points: np.ndarray) -> np.ndarray:
+def _cluster_centres(points: np.ndarray) -> np.ndarray:
     """Centres (V, 3) of greedy clusters of radius MERGE, the densest first, of at least LEAST points.
 
     Where none has as many, of the largest.

@@ -96,7 +96,7 @@ def perceptron(
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
 
 
-def magnitude(power: Tensor) -> Tensor:
+def smooth_root(power: Tensor) -> Tensor:
     """Return roots, with a slope that is finite at zero."""
     return (power + LEAST_POWER).sqrt()
 
@@ -138,16 +138,16 @@ class TrainedPeer(Method):
                 f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
 
-    def _own_steps(self, kind: Kind) -> int:
+    def _steps_in_budget(self, kind: Kind) -> int:
         """As many as the seconds hold on the idle processor that `step_s` was measured on."""
         assert self.budget_s is not None
         own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
         return max(round(own), 1)
 
-    def time_limit(self, site: Site, budget_s: float | None) -> str:
+    def describe_time_limit(self, site: Site, budget_s: float | None) -> str:
         """See `MethodFactory.time_limit`; steps stand for the seconds."""
         told = self.max_steps is None and site.kind in self.step_s
-        steps = f"{self._own_steps(site.kind)} steps, " if told else ""
+        steps = f"{self._steps_in_budget(site.kind)} steps, " if told else ""
         return f"{steps}about {self.budget_s:g} s of an idle processor"
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
@@ -174,11 +174,11 @@ class TrainedPeer(Method):
         budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
-        self.network = self.makes(_scene(data, rows), self)
+        self.network = self.makes(_make_scene(data, rows), self)
         if context.resume is not None:
             origin.require_same(read_interrupted(context.resume))
-        module = self.module(self._own_steps(kind) if asked is None else asked, context.run_dir)
-        files = GsparcCheckpointIO(self, context.config_yaml, origin.marks())
+        module = self.module(self._steps_in_budget(kind) if asked is None else asked, context.run_dir)
+        files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
         all_rows = Fold(rows, rows[:0], fold.test)
         trainer, batches = make_trainer(module, data, all_rows, context, files, budget)
         with interruptible(trainer, batches):
@@ -194,9 +194,9 @@ class TrainedPeer(Method):
         """Return what Lightning trains, with a schedule of `steps`."""
         network, warmup = self.fitted(), max(round(WARMUP * steps), 1)
         rates = OptimizerSettings(decay=FINAL_RATE, warmup=warmup)
-        return NetworkModule(network, network.scene.site, rates, steps, run_dir, self._rate_of)
+        return NetworkModule(network, network.scene.site, rates, steps, run_dir, self._rate_group)
 
-    def _rate_of(self, name: str) -> tuple[str, float]:
+    def _rate_group(self, name: str) -> tuple[str, float]:
         kind = max((known for known in self.rates if name.startswith(known)), key=len, default="other")
         return kind, self.rates.get(kind, self.rate)
 
@@ -236,7 +236,7 @@ class TrainedPeer(Method):
         self.network.eval()
 
 
-def _scene(data: Measurements, rows: np.ndarray) -> Scene:
+def _make_scene(data: Measurements, rows: np.ndarray) -> Scene:
     moving = data.moving[rows]
     box = torch.from_numpy(np.stack([moving.min(0), moving.max(0)])).float()
     return Scene(data.site, tuple(data.target.shape[1:]), box)

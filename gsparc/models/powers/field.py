@@ -9,7 +9,7 @@ process.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,12 +22,18 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import SceneWalls
 from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.known.images import walls_of_file
+from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, fit_fringes, nearest_distances, resolves_wavelength
-from gsparc.models.powers.own_terms import UserTerm, about_terms, describe_weights, less_means
-from gsparc.models.powers.settings import LAW_NEEDS, candidate_priors, choose_candidate, mix_candidates
-from gsparc.models.target_rows import entry_variance, from_real, power_rows
+from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, describe_weights, subtract_means
+from gsparc.models.powers.settings import (
+    LAW_NEEDS,
+    MeanLaw,
+    candidate_priors,
+    choose_candidate,
+    mix_candidates,
+)
+from gsparc.models.target_rows import power_rows, to_entry_variance, to_targets
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximation_label
@@ -39,6 +45,22 @@ from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
+
+
+class DecibelMoments(NamedTuple):
+    """What is said of b places.
+
+    Attributes:
+        mean: (b,) [dB].
+        variance: (b,) [dB^2].
+        unknown: (b,), share of the prior variance.
+        explained: (b,) [dB], the part of the mean that coherent waves explain, or all of it.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    unknown: Tensor
+    explained: Tensor
 
 
 class PowerField(ClosedForm):
@@ -77,26 +99,26 @@ class PowerField(ClosedForm):
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
         self.site, self.fringes = data.site, None
-        notes = self._choose(data, rows, budget)
+        notes = self._choose_priors(data, rows, budget)
         self.condition(data, rows)
         own = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
             notes = (*describe_weights(self.powers.posterior, own), *notes)
         return FitReport(budget.by_clock.wall, notes, budget.limited_by)
 
-    def _choose(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
+    def _choose_priors(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, budget.effort.chosen_on
         # Checked once: a query has no time for it, nor has `torch.func`.
         own = tuple(UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places)) for t in self.own_terms)
         if self.walls is not None:
-            walls = walls_of_file(self.walls, site.origin, site.static_position)
+            walls = walls_in_frame(self.walls, site.origin, site.static_position)
             # A law goes through so few rows exactly, and leaves next to no variance.
             told = int((~seen.silent).sum()) >= LAW_NEEDS
-            rest = less_means(seen, own)
+            rest = subtract_means(seen, own)
             law, notes = fit_site_law(rest, site) if told else (None, ())
-            trend = about_terms(rest, replace(trend_about_rows(rest, law), more=(walls,)), own)
-            best = choose_candidate(seen, [(trend, 0.0, ())], self.seed, chosen_on)
+            trend = add_terms_to_trend(rest, replace(trend_about_rows(rest, law), more=(walls,)), own)
+            best = choose_candidate(seen, [MeanLaw(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"
             note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
@@ -132,7 +154,7 @@ class PowerField(ClosedForm):
         return None if self.powers is None else self.powers.with_exact_posterior()
 
     def count_components(self) -> int:
-        """See `ClosedForm.count`; coherent waves count as Gaussians of no extent, far away."""
+        """See `ClosedForm.count_gaussians`; coherent waves count as Gaussians of no extent, far away."""
         return 0 if self.fringes is None else len(self.fringes.weights)
 
     @property
@@ -166,15 +188,13 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        process, places = self._conditioned(), query.places(self.site)
-        parts = [self._answer(process, part) for part in places.split(QUERIES)]
-        mean, spread, share, explained = (torch.cat(part) for part in zip(*parts, strict=True))
-        mean, spread, share, explained = (
-            part.to(query.tx.dtype) for part in (mean, spread, share, explained)
-        )
-        power = self._power(mean)
-        explained_power = self._power(explained) if self.count_components() else None
-        return Prediction(power, entry_variance(spread, power, "rssi"), share, explained_power)
+        process, places = self._require_process(), query.places(self.site)
+        parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
+        joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
+        mean, spread, share, explained = joined
+        power = self._to_powers(mean)
+        explained_power = self._to_powers(explained) if self.count_components() else None
+        return Prediction(power, to_entry_variance(spread, power, "rssi"), share, explained_power)
 
     def left_out(self) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
@@ -184,18 +204,18 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        process = self._conditioned()
+        process = self._require_process()
         decibels, spread = process.left_out(self.at)
         if self.fringes is not None:
             posterior = process.posterior
             loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
             places = process.places[loud]
-            decibels, factor = self.fringes.add_left_out_fringes(
+            decibels, factor = self.fringes.blend_blind_solutions(
                 decibels, torch.from_numpy(places), torch.from_numpy(nearest_distances(places)), self.known
             )
             spread = spread * factor
-        mean = self._power(decibels.float())
-        return LeftOutRows(self.known, mean, entry_variance(spread.float(), mean, "rssi"))
+        mean = self._to_powers(decibels.float())
+        return LeftOutRows(self.known, mean, to_entry_variance(spread.float(), mean, "rssi"))
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
@@ -216,24 +236,24 @@ class PowerField(ClosedForm):
         self.priors, self.powers, self.fringes = parts
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
 
-    def _answer(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
-        """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
+    def _decibel_moments(self, process: PowerProcess, places: Tensor) -> DecibelMoments:
         mean, spread, share = process.answer(places)
         if self.fringes is None:
-            return mean, spread, share, mean
-        mean, factor = self.fringes.add_fringes(mean, places, self._distance(places))
-        return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)
+            return DecibelMoments(mean, spread, share, mean)
+        mean, factor = self.fringes.blend_solutions(mean, places, self._nearest_distance(places))
+        explained = self.fringes.solution_powers(places).mean(1)
+        return DecibelMoments(mean, spread * factor, share, explained)
 
-    def _distance(self, places: Tensor) -> Tensor:
+    def _nearest_distance(self, places: Tensor) -> Tensor:
         """From the nearest known row (B,) [m]."""
         if self._tree is None:
-            self._tree = cKDTree(self._conditioned().places)
+            self._tree = cKDTree(self._require_process().places)
         return nearest_distance(self._tree, places)
 
-    def _conditioned(self) -> PowerProcess:
+    def _require_process(self) -> PowerProcess:
         if self.powers is None:
             raise ValueError("a field of powers: condition it first")
         return self.powers
 
-    def _power(self, decibels: Tensor) -> Tensor:
-        return from_real(decibels[:, None], "rssi", (1,))
+    def _to_powers(self, decibels: Tensor) -> Tensor:
+        return to_targets(decibels[:, None], "rssi", (1,))

@@ -90,16 +90,16 @@ class Fringes(Stored):
     blend: Blend
 
     @cached_property
-    def _mixed(self) -> Tensor:
+    def _mixture_weights(self) -> Tensor:
         return torch.from_numpy(self.basis.mixture @ self.weights)
 
     def solution_powers(self, places: Tensor) -> Tensor:
         """Return powers (n, S) [dB] at places (n, 3) float64 [m], with autograd."""
         phase = places @ torch.from_numpy(self.basis.waves).T
-        field = torch.complex(phase.cos(), phase.sin()) @ self._mixed
+        field = torch.complex(phase.cos(), phase.sin()) @ self._mixture_weights
         return self.level + to_decibels(field.real.square() + field.imag.square() + FLOOR)
 
-    def add_fringes(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+    def blend_solutions(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
 
         Args:
@@ -107,18 +107,18 @@ class Fringes(Stored):
             places: (n, 3) [m].
             distance: (n,) to the nearest row that it knows [m].
         """
-        return self._shared(decibels, self.solution_powers(places).mean(1), distance)
+        return self._means_and_factors(decibels, self.solution_powers(places).mean(1), distance)
 
-    def add_left_out_fringes(
+    def blend_blind_solutions(
         self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
     ) -> tuple[Tensor, Tensor]:
         """Return the same at rows (n,) by those solutions that never saw them or their surroundings."""
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
         fold = np.where(self.rows[at] == rows, self.fold[at], -1)
         mean = _held_out_mean(self.solution_powers(places).numpy(), fold, self.blind)
-        return self._shared(decibels, torch.from_numpy(mean), distance)
+        return self._means_and_factors(decibels, torch.from_numpy(mean), distance)
 
-    def _shared(self, decibels: Tensor, mean: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+    def _means_and_factors(self, decibels: Tensor, mean: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
         share, factor = self.blend.share_and_inflation(distance, self.wavelength)
         return decibels + share * (mean - decibels), factor
 
@@ -165,7 +165,9 @@ def fit_fringes(
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
-    error, distance = (one[kept] for one in _apart(every, [*parts, order[:probes]], plain, seed))
+    error, distance = (
+        one[kept] for one in _errors_and_distances(every, [*parts, order[:probes]], plain, seed)
+    )
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: ErrorGain | None = None
@@ -176,7 +178,7 @@ def fit_fringes(
             weights.append(fit_wave_weights(columns[seen], rows.decibels[seen] - level, rng))
         blind = np.arange(len(weights)) % FOLDS
         powers = level + field_db(columns @ np.stack(weights, 1))
-        blend, gain = _blend(rows, group, fold, powers, blind, error, distance)
+        blend, gain = _fit_blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
         if len(weights) >= TRIED and not gain.exceeds(0.0):
             break
@@ -189,17 +191,17 @@ def fit_fringes(
 
 def _held_out_mean(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
     """Means (n,) of powers (n, S) over the solutions blind to each row's fold; over all where that is -1."""
-    counts = _counted(fold, blind)
+    counts = _blind_solutions(fold, blind)
     return (powers * counts).sum(1) / counts.sum(1)
 
 
-def _counted(fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
+def _blind_solutions(fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
     return (fold[:, None] < 0) | (fold[:, None] == blind)
 
 
 def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
     """Squared error (n,) that the mean of blind solutions has beyond that of as many as there are."""
-    counts = _counted(fold, blind)
+    counts = _blind_solutions(fold, blind)
     number, every = counts.sum(1), len(blind)
     mean = (powers * counts).sum(1) / number
     spread = ((powers - mean[:, None]) ** 2 * counts).sum(1) / np.maximum(number - 1, 1)
@@ -207,7 +209,7 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     return spread * (1 / number - 1 / every)
 
 
-def _apart(
+def _errors_and_distances(
     rows: PowerRows, parts: list[np.ndarray], prior: Prior, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Errors (n,) of a process at rows of each part without that part, and distances (n,) to the rest [m].
@@ -229,7 +231,7 @@ def _apart(
     return error, distance
 
 
-def _blend(
+def _fit_blend(
     rows: PowerRows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
     error: np.ndarray, distance: np.ndarray,
 ) -> tuple[Blend, ErrorGain]:  # fmt: skip
@@ -241,7 +243,7 @@ def _blend(
     shares, left = [], []
     # Rows of a square left out err together and count as one; probes among rows err alone.
     for chosen, alike in ((probes, 1.0), (~probes, len(group) / len(np.unique(group)))):
-        share = _share(error[chosen], towards[chosen], excess[chosen], alike)
+        share = _best_share(error[chosen], towards[chosen], excess[chosen], alike)
         # Less what would go if all solutions answered, as they do at new places.
         both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
         shares.append(share)
@@ -253,15 +255,15 @@ def _blend(
     return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
 
 
-def _share(error: np.ndarray, towards: np.ndarray, excess: np.ndarray, alike: float) -> float:
+def _best_share(error: np.ndarray, difference: np.ndarray, excess: np.ndarray, rows_per_unit: float) -> float:
     """Share of the way from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
 
-    So many rows as are `alike` count as one.
+    So many rows as are `rows_per_unit` count as one.
     """
-    noise = alike * max(float((error**2).mean()), TINY)
-    square = max(float(towards @ towards - excess.sum()), 0.0)
+    noise = rows_per_unit * max(float((error**2).mean()), TINY)
+    square = max(float(difference @ difference - excess.sum()), 0.0)
     # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.
     certain = 1 / SPREAD**2
     return float(
-        np.clip((-(towards @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)
+        np.clip((-(difference @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)
     )

@@ -51,8 +51,8 @@ def split_groups(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
     return [part for part in parts if len(part)]
 
 
-def compare_errors(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> ErrorGain:
-    """Return what `one` gains, by squared errors (n,) [dB^2] of both at rows left out in groups (n,)."""
-    gain = other - one
+def compare_errors(first: np.ndarray, second: np.ndarray, group: np.ndarray) -> ErrorGain:
+    """Return what `first` gains, by squared errors (n,) [dB^2] of both at rows left out in groups (n,)."""
+    gain = second - first
     total = np.bincount(group, gain - gain.mean())
-    return ErrorGain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))
+    return ErrorGain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(second.mean()))

@@ -26,7 +26,7 @@ POOLED_FROM = 6  # stations, from which on a weight of all as the prior of each 
 LARGEST = 1e4  # of a column [deviations]: squares of larger ones hide the noise in a covariance
 
 
-def as_terms(terms: Any) -> tuple[Columns, ...]:
+def to_terms(terms: Any) -> tuple[Columns, ...]:
     """Return terms (`model.terms`) as a tuple, one alone as of one; `ValueError` for what is none."""
     result = tuple(terms) if isinstance(terms, Sequence) else (terms,)
     for one in result:
@@ -64,21 +64,21 @@ class UserTerm(Columns):
         return cls(term, places[0], places[1])
 
     @property
-    def prior(self) -> tuple[float, float]:
+    def weight_prior(self) -> tuple[float, float]:
         """Mean [dB] and deviation [units] of each weight, of a column's unit."""
         mean, deviation = self.term.prior_db or (0.0, self.unit)
         return mean, deviation / self.unit
 
     def columns(self, places: Tensor) -> Tensor:
         """See `Columns`; of places of the moving end (n, 3), or of both (n, 6), in local coordinates."""
-        return self.prior[1] * (self._asked(places) - self.middle)
+        return self.weight_prior[1] * (self._user_columns(places) - self.middle)
 
     def mean(self, places: Tensor) -> Tensor:
         """See `Columns`."""
-        mean, _ = self.prior
-        return mean * self._asked(places).sum(1) if mean else super().mean(places)
+        mean, _ = self.weight_prior
+        return mean * self._user_columns(places).sum(1) if mean else super().mean(places)
 
-    def _asked(self, places: Tensor) -> Tensor:
+    def _user_columns(self, places: Tensor) -> Tensor:
         both = places if has_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
         result = self.term.columns(both + torch.cat([self.origin, self.origin]))
         if not isinstance(result, Tensor):
@@ -98,7 +98,7 @@ class UserTerm(Columns):
             raise ValueError(
                 f"{name}.prior_db={prior}: say [mean, deviation] of a weight in dB, such as [0, 3]"
             )
-        result = self._asked(places)
+        result = self._user_columns(places)
         gave = f"{name}.columns gave {(*result.shape,)}"
         if result.ndim != 2 or len(result) != len(places):
             raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed")
@@ -111,21 +111,21 @@ class UserTerm(Columns):
         return replace(self, middle=result.mean(0))
 
 
-def less_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
+def subtract_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
     """Return rows less what terms have as their mean."""
     places = torch.from_numpy(rows.places)
     return replace(rows, decibels=rows.decibels - sum(one.mean(places).numpy() for one in terms))
 
 
-def about_terms(rest: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
+def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
     """Return a trend of rows less the terms' means, with the terms, in units of what it leaves of rows."""
-    heard = rest.heard_rows
+    heard = rows.heard_rows
     left = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
     unit = float(left.std()) or 1.0
-    return in_unit_of(replace(trend, more=(*trend.more, *terms)), unit)
+    return set_term_unit(replace(trend, more=(*trend.more, *terms)), unit)
 
 
-def in_unit_of(trend: Trend, deviation: float) -> Trend:
+def set_term_unit(trend: Trend, deviation: float) -> Trend:
     """Return a trend whose users' terms are relative to a process of this deviation [dB]."""
     own = (replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more)
     return replace(trend, more=tuple(own)) if trend.more else trend
@@ -151,7 +151,7 @@ class LearnedWeights(str):
         return result
 
 
-def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[LearnedWeights]:
+def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[LearnedWeights]:
     """Return a sentence on each term: its weights [dB of a column's unit] and their deviations."""
     at = posterior.rows
     columns = posterior.prior.columns(at)
@@ -159,19 +159,19 @@ def describe_weights(posterior: Exact, own: tuple[UserTerm, ...]) -> list[Learne
     # Of weights of unit variance, times the amplitude: 1 - C^T K^-1 C.
     left = (scale * (1 - posterior.factor.whiten(columns).square().sum(0)).clamp_min(0)).sqrt()
     numbers = torch.stack([weights, left, torch.zeros_like(left), torch.full_like(left, scale**0.5)]).numpy()
-    sizes = [one.columns(at[:1]).shape[1] for one in own]
+    sizes = [one.columns(at[:1]).shape[1] for one in terms]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
-    kinds = [type(one.term).__name__ for one in own]
+    kinds = [type(one.term).__name__ for one in terms]
     # Several of one kind are told apart by their order.
     order = [kinds[: k + 1].count(kind) for k, kind in enumerate(kinds)]
     names = [f"{kind} {n}" if kinds.count(kind) > 1 else kind for kind, n in zip(kinds, order, strict=True)]
     return [
-        LearnedWeights.from_numbers(name, one.prior[1] * part + [[one.prior[0]], [0]] * 2)
-        for name, one, part in zip(names, own, parts, strict=True)
+        LearnedWeights.from_numbers(name, one.weight_prior[1] * part + [[one.weight_prior[0]], [0]] * 2)
+        for name, one, part in zip(names, terms, parts, strict=True)
     ]
 
 
-def over_stations(notes: Sequence[str]) -> dict[str, str]:
+def combine_stations(notes: Sequence[str]) -> dict[str, str]:
     """Return, for what stations say of each term, one sentence: all of them together, and how they differ.
 
     Rows of stations are independent given the weight (random effects: R. DerSimonian, N. Laird, Controlled

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
-from gsparc.models.powers.own_terms import UserTerm, about_terms, in_unit_of, less_means
+from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
 from gsparc.processes.density import LOOKS, LogEvidence, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
@@ -54,7 +54,7 @@ LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
-def fit_power_process(
+def process_and_notes(
     rows: PowerRows, site: Site, mean: MeanName = "auto", seed: int = 0
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return a process of largest leave-one-out likelihood, and what must be said of it.
@@ -67,9 +67,17 @@ def fit_power_process(
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
     """
-    best = choose_candidate(rows, _trends(rows, site, mean), seed, CHOSEN_ON)
+    best = choose_candidate(rows, _candidate_laws(rows, site, mean), seed, CHOSEN_ON)
     process, more = condition_on_powers(rows, best.prior, seed)
     return process, (best.description, *best.notes, *more)
+
+
+class MeanLaw(NamedTuple):
+    """A prior mean, what it costs [nats], and what must be said of it."""
+
+    trend: Trend
+    cost: float
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,7 @@ class Candidate:
     @property
     def prior(self) -> Prior:
         """Both; deviations that terms have in decibels are relative to the kernel's."""
-        return Prior(self.kernel, in_unit_of(self.trend, math.sqrt(self.kernel.amplitude)))
+        return Prior(self.kernel, set_term_unit(self.trend, math.sqrt(self.kernel.amplitude)))
 
     @property
     def description(self) -> str:
@@ -96,24 +104,26 @@ class Candidate:
 
 
 def candidate_priors(
-    rows: PowerRows, site: Site, seed: int, chosen_on: int, terms: tuple[UserTerm, ...] = ()
+    rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
 ) -> list[Candidate]:
     """Return the likeliest settings of each mean law, the best first, then those of kriging.
 
     Of few or very many rows the best law alone. Each law has further `terms`.
     """
-    rest = less_means(rows, terms)
-    laws = _trends(rest, site, "auto")
-    trends = [(about_terms(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
+    rest = subtract_means(rows, terms)
+    laws = _candidate_laws(rest, site, "auto")
+    trends = [MeanLaw(add_terms_to_trend(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
-        return [choose_candidate(rows, trends, seed, chosen_on)]
+        return [choose_candidate(rows, trends, seed, max_rows)]
     found = sorted(
-        (choose_candidate(rows, [one], seed, chosen_on) for one in trends), key=lambda one: -one.score
+        (choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda one: -one.score
     )
-    return found if rows.silent.any() else [*found, _kriged(rows.draw_subset(chosen_on, seed), trends[0][0])]
+    if rows.silent.any():
+        return found
+    return [*found, _fit_kriging(rows.draw_subset(max_rows, seed), trends[0].trend)]
 
 
-def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
+def _fit_kriging(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
     fit = fit_variogram(rows.places, rows.distances_terms_values(trend)[2].numpy())
     sill = max(fit.sill, LEAST_SILL * fit.variance)
@@ -122,36 +132,36 @@ def _kriged(rows: PowerRows, trend: Trend) -> Candidate:
 
 
 def mix_candidates(
-    rows: PowerRows, found: list[Candidate], seed: int, chosen_on: int
+    rows: PowerRows, candidates: list[Candidate], seed: int, max_rows: int
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Return candidates with their shares in a mean, the largest first, and what must be said of them.
 
     Shares have the least squared error at rows left out one by one and at squares of floor left out, both
     relative to the best candidate's. A prior on equal shares would lose among rows (by 1 % on dense streets).
     """
-    if len(found) == 1:
-        return ((1.0, found[0].prior),), (found[0].description, *found[0].notes)
-    part = rows.draw_subset(chosen_on, seed)
-    posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in found]
+    if len(candidates) == 1:
+        return ((1.0, candidates[0].prior),), (candidates[0].description, *candidates[0].notes)
+    part = rows.draw_subset(max_rows, seed)
+    posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    gram = _relative([_among_rows(rows.measured_rows, one.prior, seed) for one in found])
+    gram = _relative_gram([_errors_among_rows(rows.measured_rows, one.prior, seed) for one in candidates])
     for sides in SPANS:
-        gram += _relative([_left_out(one, sides) for one in posteriors]) / len(SPANS)
+        gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
     share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
-    kept = [(float(share[k]), found[k]) for k in np.argsort(-share, kind="stable") if share[k]]
+    kept = [(float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
     notes = dict.fromkeys(note for _, one in kept for note in one.notes)
     return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
 
 
-def _relative(errors: list[np.ndarray]) -> np.ndarray:
+def _relative_gram(errors: list[np.ndarray]) -> np.ndarray:
     """Mean products (K, K) of errors (n,) of K candidates, relative to the square of the best."""
     gram = np.stack(errors) @ np.stack(errors).T
     return gram / max(gram.diagonal().min(), np.finfo(float).tiny)
 
 
-def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
+def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
     """Errors (n,) [dB] of rows that were heard, each predicted without those of its square of floor."""
     assert isinstance(posterior, Exact)
     group = rows_of_groups(number_squares(posterior.rows.numpy(), sides))
@@ -159,45 +169,45 @@ def _left_out(posterior: Posterior, sides: int) -> np.ndarray:
     return residual[posterior.extra == 0, 0].numpy()
 
 
-def _among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
+def _errors_among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
     """Errors (n,) [dB] at each place, predicted from the nearest others."""
     values = loud.means_at_places()
     return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
-def choose_candidate(
-    rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
-) -> Candidate:
+def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
-    best = _settings(rows, trends, seed, min(chosen_on, COMPARED_ON) if many else chosen_on)
+    best = _choose_on_part(rows, trends, seed, min(max_rows, COMPARED_ON) if many else max_rows)
     if not many:
         return best
     kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
-def _settings(
-    rows: PowerRows, trends: list[tuple[Trend, float, tuple[str, ...]]], seed: int, chosen_on: int
-) -> Candidate:
+def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows.heard_rows.draw_subset(chosen_on, seed)
+    loud = rows.heard_rows.draw_subset(max_rows, seed)
     few = loud.draw_subset(COMPARED_ON, seed)
-    weighed = rows.draw_subset(min(WEIGHED_ON, chosen_on), seed)
+    weighed = rows.draw_subset(min(WEIGHED_ON, max_rows), seed)
     both = weighed.silent.any() and not weighed.silent.all()
-    candidates = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
+    candidates = [_fit_one_length(few, *law) for law in trends]
     scores = [one.score for one in candidates]
     if both and not out_of_time():
-        weighed = _in_doubt(weighed, candidates[-1])
-        scores = [_weighed(weighed, one, 0).score for one in candidates]
+        weighed = _select_doubtful(weighed, candidates[-1])
+        scores = [_fit_by_evidence(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
-        best = max(best, _searched(few, best, _pairs(few, best.kernel), 2.0), key=lambda one: one.score)
+        best = max(
+            best,
+            _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0),
+            key=lambda one: one.score,
+        )
     if len(loud.places) > len(few.places) and not out_of_time():
         # A look at all rows costs several at few: what was found on these is near already.
-        best = _searched(loud, best, [best.kernel], looks=REFINED)
+        best = _search_kernel(loud, best, [best.kernel], limit=REFINED)
     if both and not out_of_time():  # one walk: each look factors several covariances
-        best = _weighed(weighed, best, EVIDENCE_LOOKS)
+        best = _fit_by_evidence(weighed, best, EVIDENCE_LOOKS)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):
         note = f"settings chosen on {count} of {len(rows.places)} rows"
@@ -205,23 +215,23 @@ def _settings(
     return best
 
 
-def _trends(rows: PowerRows, site: Site, mean: MeanName) -> list[tuple[Trend, float, tuple[str, ...]]]:
+def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw]:
     """Candidate means, their cost, and notes.
 
     The cost is the number of parameters that the covariance leaves out, less the prior odds of a
     law: near the rows both predict alike, and far from them powers fall.
     """
-    constant: tuple[Trend, float, tuple[str, ...]] = (trend_about_rows(rows, None), 0.0, ())
+    constant = MeanLaw(trend_about_rows(rows, None), 0.0, ())
     if mean == "constant" or (mean == "auto" and int((~rows.silent).sum()) < LAW_NEEDS):
         return [constant]
     law, notes = fit_site_law(rows, site)
     trend = trend_about_rows(rows, law)
     odds = LAW_ODDS if law.exponent >= LEAST_FALL else 0.0
-    by_distance = trend, 4 if notes else 1 - odds, notes  # its floor, and a place that was sought
+    by_distance = MeanLaw(trend, 4 if notes else 1 - odds, notes)  # its floor, and a place that was sought
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
-def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
+def _fit_one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
     distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
@@ -232,25 +242,28 @@ def _one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ..
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
-def _searched(
-    rows: PowerRows, one: Candidate, starts: list[Kernel], cost: float = 0.0, looks: int = LOOKS
+def _search_kernel(
+    rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = fit_kernel_by_left_out(starts, *rows.distances_terms_values(one.trend), looks=looks)
-    return replace(one, score=-value - one.cost - cost, kernel=kernel, cost=one.cost + cost)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.distances_terms_values(base.trend), looks=limit)
+    return replace(base, score=-value - base.cost - cost, kernel=kernel, cost=base.cost + cost)
 
 
-def _pairs(rows: PowerRows, one: Kernel) -> list[Kernel]:
+def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
     scale = float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
-    near = [Kernel.from_lengths((one.length * a, one.length * b), (0.5, 0.5), one.noise) for a, b in SPLITS]
-    return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), one.noise) for a, b in WIDE]
+    near = [
+        Kernel.from_lengths((kernel.length * a, kernel.length * b), (0.5, 0.5), kernel.noise)
+        for a, b in SPLITS
+    ]
+    return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), kernel.noise) for a, b in WIDE]
 
 
-def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
+def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.distances_terms_values(one.trend)
-    gram = one.kernel.amplitude * covariance_of(one.kernel, distance, terms)
+    distance, terms, values = rows.distances_terms_values(base.trend)
+    gram = base.kernel.amplitude * covariance_of(base.kernel, distance, terms)
     silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
@@ -259,23 +272,23 @@ def _in_doubt(rows: PowerRows, one: Candidate) -> PowerRows:
     return rows.subset(np.flatnonzero(used))
 
 
-def _weighed(rows: PowerRows, one: Candidate, looks: int) -> Candidate:
+def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.distances_terms_values(one.trend)
+    distance, terms, values = rows.distances_terms_values(base.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
-    bounds = one.kernel.bounds(distance)
+    bounds = base.kernel.bounds(distance)
     bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
 
     last: list[PseudoValues] = []
 
-    def objective(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * covariance_of(one.kernel.with_values(at[:-1]), distance, terms)
+    def negative_log_evidence(at: Tensor) -> Tensor:
+        gram = at[-1].exp() * covariance_of(base.kernel.with_values(at[:-1]), distance, terms)
         return LogEvidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
-    start = np.append(one.kernel.parameters().numpy(), math.log(one.kernel.amplitude))
-    best, value = start, float(objective(torch.from_numpy(start)))
-    if looks:
-        best, value = minimise(objective, [start], bounds, looks, EVIDENCE_SETTLED)
-    kernel = replace(one.kernel.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
-    return replace(one, score=-value * len(values) - one.cost, kernel=kernel)
+    start = np.append(base.kernel.parameters().numpy(), math.log(base.kernel.amplitude))
+    best, value = start, float(negative_log_evidence(torch.from_numpy(start)))
+    if limit:
+        best, value = minimise(negative_log_evidence, [start], bounds, limit, EVIDENCE_SETTLED)
+    kernel = replace(base.kernel.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
+    return replace(base, score=-value * len(values) - base.cost, kernel=kernel)

@@ -44,13 +44,13 @@ class PlaneWaveBasis(Stored):
     waves: np.ndarray
     mixture: np.ndarray
 
-    def plane(self, places: np.ndarray) -> np.ndarray:
+    def plane_waves(self, places: np.ndarray) -> np.ndarray:
         """Return the plane waves (n, M) at places (n, 3) [m]."""
         return np.exp(1j * (places @ self.waves.T))
 
     def columns(self, places: np.ndarray) -> np.ndarray:
         """Return (n, r) complex128 at places (n, 3) [m]."""
-        return self.plane(places) @ self.mixture
+        return self.plane_waves(places) @ self.mixture
 
 
 def make_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
@@ -59,7 +59,7 @@ def make_basis(places: np.ndarray, wavelength: float) -> PlaneWaveBasis:
     A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
     """
     waves = 2 * math.pi / wavelength * fibonacci_sphere(WAVES).numpy()
-    plane = PlaneWaveBasis(waves, np.eye(WAVES)).plane(places)
+    plane = PlaneWaveBasis(waves, np.eye(WAVES)).plane_waves(places)
     # One triangle of a Hermitian product: half the multiplications of all of it.
     values, vectors = eigh(blas.zherk(1 / len(places), plane, trans=2), lower=False)
     large = values > KEPT * values[-1]
@@ -82,10 +82,10 @@ def fit_wave_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.G
     scale, damping = SCALE_DB, 1e-2
     for hidden in HIDDEN:
         now = _Misfit.from_waves(columns, decibels, weights, hidden, scale)
-        scale = now.scale()
+        scale = now.error_scale()
         now = _Misfit.from_waves(columns, decibels, weights, hidden, scale)
         for _ in range(STEPS if hidden else 2 * STEPS):
-            result = _step(columns, single, decibels, now, hidden, scale, damping)
+            result = _step_and_damping(columns, single, decibels, now, hidden, scale, damping)
             if result is None:
                 break
             better, damping = result
@@ -116,7 +116,7 @@ class _Misfit:
         value = 0.5 * (DEGREES + 1) * float(np.log1p(error**2 / (DEGREES * scale**2)).sum())
         return cls(weights, field, power, error, value + ALIKE * float((np.abs(weights) ** 2).sum()))
 
-    def scale(self) -> float:
+    def error_scale(self) -> float:
         """Of the errors [dB], by a few steps of expectation maximisation."""
         result = SCALE_DB
         for _ in range(5):
@@ -125,7 +125,7 @@ class _Misfit:
         return result
 
 
-def _step(
+def _step_and_damping(
     columns: np.ndarray, single: np.ndarray, decibels: np.ndarray, now: _Misfit, hidden: float,
     scale: float, damping: float,
 ) -> tuple[_Misfit, float] | None:  # fmt: skip

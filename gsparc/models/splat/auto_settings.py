@@ -48,7 +48,7 @@ def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[C
     emission, spectra, static = settings.emission, site.kind == "spectrum", site.static_end == "rx"
     notes: list[str] = []
 
-    def decide(name: str, setting: str, choice: str, reason: str) -> str:
+    def choose(name: str, setting: str, choice: str, reason: str) -> str:
         if setting != AUTO:
             return setting
         notes.append(f"{name}=auto -> {choice}: {reason}")
@@ -58,11 +58,11 @@ def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[C
     why = (still if static else "the receiver moves") if spectra else f"the target is {site.kind}"
     through_array = settings.response.array
     choice = "fourier" if emission.hidden else "kernel"
-    encoding = decide("encoding.kind", emission.encoding.kind, choice, f"hidden={emission.hidden}")
+    encoding = choose("encoding.kind", emission.encoding.kind, choice, f"hidden={emission.hidden}")
     possible = spectra and static and not emission.hidden and encoding == "kernel"
     fitted = "vectors" if through_array else "images"
     choice = fitted if possible else "sphere" if spectra and static else "uniform"
-    start = decide("init", init, choice, f"{why}, hidden={emission.hidden}, encoding.kind={encoding}")
+    start = choose("init", init, choice, f"{why}, hidden={emission.hidden}, encoding.kind={encoding}")
     if start in ("images", "vectors") and not (possible and start == fitted):
         needed = "spectra, a static receiver, model.emission.hidden=0 and encoding.kind=kernel"
         array = "with" if start == "vectors" else "without"
@@ -75,7 +75,7 @@ def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[C
         fitting["spectrum"], reason = "linear", "fields at an array are signed"
     if emission.log_distance and site.kind != "csi":
         fitting[site.kind], reason = "sigmoid", "log_distance=true"
-    activation = decide("activation", emission.activation, fitting[site.kind], reason)
+    activation = choose("activation", emission.activation, fitting[site.kind], reason)
     bias = emission.init_bias
     if bias == AUTO:
         # 500 softplus units of 0.7 each would start at 300 times the mean power.

@@ -24,7 +24,7 @@ from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
 from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
 from gsparc.models.mixture.weights import LEAST_HELD
-from gsparc.models.splat.left_out_images import LeftOut, predict_left_out
+from gsparc.models.splat.left_out_images import LeftOut, means_and_variances
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
@@ -43,7 +43,7 @@ LEAST_NOISE = 1e-6  # of the kernel's variance
 
 def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
     """Return smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
-    chosen, kernel = _kernel(data, rows, anchors, seed)
+    chosen, kernel = _fit_kernel(data, rows, anchors, seed)
     return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
 
 
@@ -62,7 +62,7 @@ class Process:
 
 def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
     """Learn a process of training rows (n,), at up to `anchors` places."""
-    _, kernel = _kernel(data, rows, anchors, seed)
+    _, kernel = _fit_kernel(data, rows, anchors, seed)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
     features = whitened_features(places, kernel.length, noise, "matern32", anchors)
@@ -70,10 +70,10 @@ def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int)
     return Process(prior, features)
 
 
-def _kernel(data: Measurements, rows: np.ndarray, most: int, seed: int) -> tuple[np.ndarray, Kernel]:
+def _fit_kernel(data: Measurements, rows: np.ndarray, limit: int, seed: int) -> tuple[np.ndarray, Kernel]:
     """At most so many of rows (n,), drawn by seed, and the kernel of largest likelihood for them."""
     draw = np.random.default_rng(seed)
-    chosen = rows if len(rows) <= most else np.sort(draw.choice(rows, most, replace=False))
+    chosen = rows if len(rows) <= limit else np.sort(draw.choice(rows, limit, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
     parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
     return chosen, choose_left_out_kernel(data.moving[looked_at], parts.scores, len(parts.mean), 1)
@@ -100,7 +100,7 @@ class ImageEmissions:
         attenuation = None if self.attenuation is None else self.attenuation[rows]
         return ImageEmissions(self.weights, self.images[rows], self.outputs[rows], attenuation)
 
-    def rendered(self, outputs: Tensor) -> Tensor:
+    def render(self, outputs: Tensor) -> Tensor:
         """Return images (n, P) of other outputs (n, N) at the same places."""
         emission = outputs.float()
         return (emission if self.attenuation is None else emission * self.attenuation) @ self.weights.mT
@@ -132,7 +132,7 @@ def solve_emissions(
         raise ValueError("init=images solves a linear read-out: leave init=auto, or model.emission.hidden=0")
     version = int(model.gaussians.version)
     weights = model.freeze(receiver).render(torch.eye(len(model.gaussians)), version).flatten(1).mT
-    parts = [_seen(model, data, part, weights) for part in np.array_split(rows, -(-len(rows) // CHUNK))]
+    parts = [_emissions(model, data, part, weights) for part in np.array_split(rows, -(-len(rows) // CHUNK))]
     outputs = torch.cat([part.outputs for part in parts])
     mean = outputs.mean(0)
     readout = process.features.weigh @ (outputs - mean)
@@ -144,11 +144,11 @@ def solve_emissions(
     features = whitened_features(places, process.prior.length, process.prior.noise, "matern32", len(own))
     inverse = features.weigh.mT @ features.weigh
     if model.error is not None:
-        model.error.set_error_law(*_errors(first, inverse, process.prior.noise, mean))
-    return _left_out(first, inverse, data.moving[own], mean)
+        model.error.set_error_law(*_error_law(first, inverse, process.prior.noise, mean))
+    return _leave_out(first, inverse, data.moving[own], mean)
 
 
-def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> ImageEmissions:
+def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> ImageEmissions:
     """Emissions (least squares) that show the images of rows (n,)."""
     gram = weights.mT @ weights
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
@@ -162,19 +162,19 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     return ImageEmissions(weights, images, outputs.double(), attenuation)
 
 
-def _errors(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
+def _error_law(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
     """Level and power of the `ErrorModel`: errors of rows left out one by one, and of the mean alone.
 
     Rasmussen and Williams (2006), eq. 5.12.
     """
     residual, variance = left_out_residuals(inverse, inverse @ (seen.outputs - mean))
     unknown = (variance - noise).clamp(0, 1)
-    images = [seen.rendered(seen.outputs - residual), seen.rendered(mean.expand_as(seen.outputs))]
+    images = [seen.render(seen.outputs - residual), seen.render(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])
     return fit_level_and_power(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
 
 
-def _left_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
+def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
     """Rows at places (n, 3) [m] predicted without their neighbours, at gaps of some spacings."""
     count = len(places)
     if count < LEAST_HELD:
@@ -186,16 +186,16 @@ def _left_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: T
     spacing = np.median(np.where(np.eye(count, dtype=bool), np.inf, distance).min(1))
     gaps = np.array(GAPS) * spacing
     about = (seen.outputs - mean).numpy()
-    means, _ = predict_left_out(inverse.numpy(), about, distance, centres, gaps)
+    means, _ = means_and_variances(inverse.numpy(), about, distance, centres, gaps)
     some = ImageEmissions(
         seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation
     ).subset(centres)
-    predicted = [some.rendered(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
+    predicted = [some.render(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
     images = seen.images[:, pixels].double().numpy()
     return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())
 
 
-def initialise(task: InitTask) -> Start:
+def start_in_closed_form(task: InitTask) -> Start:
     """Return the start of a task.
 
     Raises:

@@ -51,7 +51,7 @@ class ImageProcess(LearnedField):
     @property
     def effects(self) -> str:  # type: ignore[override]
         """The terms that are computed, for `summary.json`."""
-        if self._alone:
+        if self._is_process_alone:
             return "residual"
         base = "array" if self.settings.response.array else "image"
         return base + ("+residual" if self._average is not None else "")
@@ -81,7 +81,7 @@ class ImageProcess(LearnedField):
         # Settings of the field count as heeded only where the field has a part in the answer.
         with heeded.set_apart() as read:
             report = super().fit(data, fold, context)
-        if not self._alone:
+        if not self._is_process_alone:
             heeded.count_reads(*read)
         spent = dict(self.spent)
         if self._average is not None:
@@ -92,15 +92,15 @@ class ImageProcess(LearnedField):
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
-        log.info("%s: %s", self.name, self.made)
+        log.info("%s: %s", self.name, self.description)
         # Steps that no look kept, or all of the field: paid for, and not in the answer.
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
-        if self._alone:
+        if self._is_process_alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
         return report.with_cost(Cost(spent, unused))
 
     @property
-    def _alone(self) -> bool:  # type: ignore[override]
+    def _is_process_alone(self) -> bool:  # type: ignore[override]
         """Whether the averaged process has all the weight."""
         return self._average is not None and self._average[1] >= 1
 
@@ -133,11 +133,11 @@ class ImageProcess(LearnedField):
         process_only = self._average is not None and not self.count_components()
         return None if process_only else super().gradient_problem()
 
-    def reduced(self, settings: Settings, measured: dict[str, Any]) -> Method:  # type: ignore[override]
-        """See `Method.reduced`."""
+    def reduce(self, settings: Settings, measured: dict[str, Any]) -> Method:  # type: ignore[override]
+        """See `Method.reduce`."""
         twin = copy.copy(self)
         twin._average = None
-        result = LearnedField.reduced(twin, settings, measured)
+        result = LearnedField.reduce(twin, settings, measured)
         if self._average is None:
             return result
         assert self.site is not None
@@ -146,13 +146,15 @@ class ImageProcess(LearnedField):
 
     def count_components(self) -> int:
         """Return the number of Gaussians."""
-        return 0 if self._alone else super().count_components()
+        return 0 if self._is_process_alone else super().count_components()
 
     @property
-    def made(self) -> str:
+    def description(self) -> str:
         """See `Method`."""
         weight = 0.0 if self._average is None else self._average[1]
-        return super().made + (f"; weight of a plain Gaussian process {weight:.2g}" if self.plain else "")
+        return super().description + (
+            f"; weight of a plain Gaussian process {weight:.2g}" if self.plain else ""
+        )
 
     def without_process(self) -> Method | None:
         """See `Method.without_process`."""

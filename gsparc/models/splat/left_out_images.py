@@ -47,9 +47,9 @@ class LeftOut(Stored):
         kernel = choose_left_out_kernel(self.positions, vectors * lengths, len(mean))
         inverse = Factor.from_gram(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
-        return mean + predict_left_out(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
+        return mean + means_and_variances(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
 
-    def pairs_at_gap(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predictions_and_targets(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return predictions and targets (n, P) at one gap, of the samples that anything is left for."""
         seen = ~np.isnan(predicted[gap]).any(1)
         return predicted[gap][seen], self.images[self.centres][seen]
@@ -71,7 +71,7 @@ class LeftOut(Stored):
         return int(np.argmin(np.abs(np.log(medians + LEAST) - np.log(distance + LEAST))))
 
 
-def predict_left_out(
+def means_and_variances(
     inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and variance of each sample given all others outside a gap around it.

@@ -42,7 +42,7 @@ from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
-from gsparc.models.splat.closed_form_start import initialise
+from gsparc.models.splat.closed_form_start import start_in_closed_form
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
 from gsparc.processes.stored import from_plain, to_plain
@@ -75,7 +75,7 @@ class Stage:
     patience: int | None = None
 
     @property
-    def again(self) -> str:
+    def cost_suffix(self) -> str:
         """What is added to the names of its costs."""
         return "" if self.name == "train" else " again, on all rows"
 
@@ -103,7 +103,8 @@ class LearnedField(Method):
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
-    _alone = False  # whether a process beside it has all the weight: another stage is worth no seconds
+    # Whether a process beside it has all the weight: another stage is worth no seconds.
+    _is_process_alone = False
     _limited_by: Clock | None = None
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
@@ -163,32 +164,32 @@ class LearnedField(Method):
             origin.require_same(left)
         marks = {} if left is None else left.extra
         budget = context.time_budget(before=Spent(*marks.get("spent", ())))
-        self._begin(data, fold, marks)
-        for stage in self._stages(data, fold, context, budget, left):
-            module = self._start(stage, data, budget)
+        self._begin_fit(data, fold, marks)
+        for stage in self._plan_stages(data, fold, context, budget, left):
+            module = self._start_stage(stage, data, budget)
             if module is None:
                 continue
-            files = GsparcCheckpointIO(self, context.config_yaml, self._marks(stage, budget, origin))
+            files = GsparcCheckpointIO(self, context.config_yaml, self._extra(stage, budget, origin))
             heeded.count_reads("dataset.batch_size")
             began = budget.by_clock
             trainer, batches = gradient_stage.make_trainer(
-                module, data, stage.fold, stage.context, files, budget, self._watch(stage)
+                module, data, stage.fold, stage.context, files, budget, self._stage_callbacks(stage)
             )
             with gradient_stage.interruptible(trainer, batches):
                 trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
-            self._end(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
+            self._end_stage(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
         self.frozen = self._doubled = None
         what, count = f"final, {self.steps} of {self.steps_taken} steps kept", self.count_components()
         context.log_curve(budget.by_clock.wall, what, step=self.steps_taken, num_gaussians=count)
         return FitReport(budget.by_clock.wall, limited_by=self._limited_by)
 
-    def _begin(self, data: Measurements, fold: Fold, marks: Mapping[str, Any]) -> None:
+    def _begin_fit(self, data: Measurements, fold: Fold, extra: Mapping[str, Any]) -> None:
         """Look at the site, and take what an interrupted run has marked; {} of a new one.
 
         Raises:
             ValueError: it has no such field.
         """
-        self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
+        self.site, self._ends = data.site, _static_end_position(data, int(fold.train[0]))
         if data.site.kind == "csi":
             if np.isnan([data.tx, data.rx_position]).any():
                 lost = f"{data.site.name} does not say where its static end is"
@@ -197,13 +198,13 @@ class LearnedField(Method):
         self.choices, reasons = resolve_auto(self.settings, self.init.name, data.site)
         for reason in reasons:
             log.info("%s", reason)
-        self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
-        self.steps_taken, self._earlier_s = int(marks.get("taken", 0)), float(marks.get("earlier_s", 0.0))
-        self.spent, self._apart = {}, _apart(data, fold)
-        self._left_out = from_plain(marks.get("left_out"))  # an interrupted run's start is not repeated
-        self._billed, self._limited_by = Spent(), marks.get("limited_by")
+        self._paying, self.init_s = extra.get("paying"), float(extra.get("init_s", 0.0))
+        self.steps_taken, self._earlier_s = int(extra.get("taken", 0)), float(extra.get("earlier_s", 0.0))
+        self.spent, self._apart = {}, _validation_distance(data, fold)
+        self._left_out = from_plain(extra.get("left_out"))  # an interrupted run's start is not repeated
+        self._billed, self._limited_by = Spent(), extra.get("limited_by")
 
-    def _stages(
+    def _plan_stages(
         self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, resumed: Stored | None
     ) -> Iterator[Stage]:
         """Yield one stage after the other, each decided by what came of those before.
@@ -213,7 +214,7 @@ class LearnedField(Method):
         """
         assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
-        watched = _more_told(data, fold, context) if few else fold
+        watched = _hold_out_third(data, fold, context) if few else fold
         asked = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
         usual = budget.effort.steps_after_solving if solved else budget.effort.steps
         steps = usual if asked is None else asked
@@ -233,21 +234,21 @@ class LearnedField(Method):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
                 # No step was surely better, or none was asked for: the start, solved again on all rows.
-                self.steps, every = 0, _all_rows(fold) if self.refit else fold
+                self.steps, every = 0, _train_on_all(fold) if self.refit else fold
                 yield Stage("final", every, replace(context, resume=None), 0)
                 self._weigh_process(data, every)
                 return
             if not steps:
                 yield Stage("train", watched, context, 0)
-            self._calibrate(data, watched)
+            self._calibrate_errors(data, watched)
             self._weigh_process(data, watched)
-        if self.refit and len(watched.val) and not self._alone and not budget.is_spent():
+        if self.refit and len(watched.val) and not self._is_process_alone and not budget.is_spent():
             kept, resume = (self.model, self.steps, self._prior), context.resume if refits else None
-            yield Stage("refit", _all_rows(watched), context.for_part("refit", resume=resume), steps)
+            yield Stage("refit", _train_on_all(watched), context.for_part("refit", resume=resume), steps)
             if budget.limited and not refits:  # its schedule is cut: the first stage ended its own
                 self.model, self.steps, self._prior = kept
 
-    def _start(self, stage: Stage, data: Measurements, budget: TimeBudget) -> GaussianModule | None:
+    def _start_stage(self, stage: Stage, data: Measurements, budget: TimeBudget) -> GaussianModule | None:
         """Make a fresh model, or read one back; return what trains it, None where no step is taken.
 
         What an earlier stage learned of errors is kept by `refit`, which learns from the rows that told it.
@@ -259,10 +260,10 @@ class LearnedField(Method):
         if context.init_from is not None and context.resume is None:
             self._start_from(data.site, context.init_from)
         elif context.resume is None:
-            start = initialise(
+            start = start_in_closed_form(
                 InitTask(
                     apply_choices(self.settings, self.choices), self.choices.closed_form, data,
-                    stage.fold.train, self._receiver(), self._ends.get("tx_position"),
+                    stage.fold.train, self._static_receiver(), self._ends.get("tx_position"),
                     context.seed, folder,
                 )
             )  # fmt: skip
@@ -277,12 +278,12 @@ class LearnedField(Method):
             self.restore(data.site, checkpoint.read(context.resume).state)
         if stage.name == "refit":
             assert before is not None
-            self.fitted().confidence, self.fitted().error = before.confidence, before.error
+            self.fitted_model().confidence, self.fitted_model().error = before.confidence, before.error
             if before.confidence is not None:
                 before.confidence.requires_grad_(False)
         prepared = (budget.by_clock - started).wall
         self.init_s, self._earlier_s = (self.init_s or 0.0) + prepared, self._earlier_s + prepared
-        self.spent["initialiser" + stage.again] = prepared
+        self.spent["initialiser" + stage.cost_suffix] = prepared
         if not stage.steps:
             return None
         if budget.is_spent():
@@ -297,29 +298,29 @@ class LearnedField(Method):
         module.start = f"init={self.choices.init}" + (", closed form" if module.solved else "")
         return module
 
-    def _marks(self, stage: Stage, budget: TimeBudget, origin: Origin) -> dict[str, Any]:
+    def _extra(self, stage: Stage, budget: TimeBudget, origin: Origin) -> dict[str, Any]:
         """What `_begin` reads of a run that is interrupted in a stage."""
         return {
             "stage": stage.name, "earlier_s": self._earlier_s, "spent": astuple(budget.by_clock),
             "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
             "taken": self.steps_taken,
-            "left_out": to_plain(self._left_out), **origin.marks(),
+            "left_out": to_plain(self._left_out), **origin.to_extra(),
         }  # fmt: skip
 
-    def _watch(self, stage: Stage) -> list[L.Callback]:
+    def _stage_callbacks(self, stage: Stage) -> list[L.Callback]:
         """Callbacks that say which steps are kept."""
         if stage.name == "train":
             return [KeepBest(stage.patience)] if self.keep_best else []
         return [] if self._paying is None else [StopAt(self._paying)]
 
-    def _end(
+    def _end_stage(
         self, stage: Stage, result: gradient_stage.TrainerResult, began: Spent, budget: TimeBudget
     ) -> None:
         """Note what the steps of a stage were worth."""
         seconds = (budget.by_clock - began).wall
         self._earlier_s += seconds
         self.steps = result.taken if result.kept is None else result.kept
-        self.spent["gradient steps" + stage.again] = seconds
+        self.spent["gradient steps" + stage.cost_suffix] = seconds
         if result.timed_out or budget.limited:
             clock: Clock = "wall" if result.timed_out else budget.clock
             self._limited_by = worst_clock(self._limited_by, clock)
@@ -333,7 +334,7 @@ class LearnedField(Method):
         """Return what Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
         solved = self.choices is not None and self.choices.closed_form
         rates = self.rates.after_closed_form(steps) if solved else self.rates
-        return GaussianModule(self.fitted(), self.loss, rates, steps, run_dir)
+        return GaussianModule(self.fitted_model(), self.loss, rates, steps, run_dir)
 
     def _start_from(self, site: Site, path: Path) -> None:
         """Take the weights of another model of this site; what is learned anew are these rows.
@@ -354,19 +355,19 @@ class LearnedField(Method):
             )
         LearnedField.restore(self, site, {**state, "ends": self._ends, "shape": self._shape})
 
-    def _receiver(self) -> Pose | None:
+    def _static_receiver(self) -> Pose | None:
         ends = self._ends
         return Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
 
     def _new_model(self, site: Site) -> GaussianModel:
         assert self.choices is not None
         settings, transmitter = apply_choices(self.settings, self.choices), self._ends.get("tx_position")
-        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
+        return GaussianModel(settings, site, self._static_receiver(), transmitter, self._prior, self._shape)
 
     @torch.no_grad()
-    def _calibrate(self, data: Measurements, fold: Fold) -> None:
+    def _calibrate_errors(self, data: Measurements, fold: Fold) -> None:
         """Fit what tells errors on validation rows, which steps did not learn from."""
-        model = self.fitted()
+        model = self.fitted_model()
         rows = fold.val if len(fold.val) else fold.train
         if model.confidence is not None:
             model.confidence.store_range(torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32)))
@@ -379,7 +380,7 @@ class LearnedField(Method):
 
     # -- answering ---------------------------------------------------------------------------------
 
-    def fitted(self) -> GaussianModel:
+    def fitted_model(self) -> GaussianModel:
         """Return the trained model.
 
         Raises:
@@ -396,13 +397,13 @@ class LearnedField(Method):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        return Prediction.joined([self._rendered(part.tx, part.rx) for part in query.split(QUERY_CHUNK)])
+        return Prediction.joined([self._predict_at(part.tx, part.rx) for part in query.split(QUERY_CHUNK)])
 
-    def _rendered(self, tx: Tensor, rx: Pose) -> Prediction:
+    def _predict_at(self, tx: Tensor, rx: Pose) -> Prediction:
         if tx.dtype == torch.float64:
-            return self._answered(*self._exact(rx.to(torch.float32)), tx, rx)
+            return self._render_prediction(*self._in_float64(rx.to(torch.float32)), tx, rx)
         with torch.no_grad():
-            return self._answered(self.fitted(), self.frozen_at(rx), tx, rx)
+            return self._render_prediction(self.fitted_model(), self.frozen_at(rx), tx, rx)
 
     def gradient_problem(self) -> str | None:
         """Return a reason where the receiver moves: footprints that move have no gradient."""
@@ -411,16 +412,16 @@ class LearnedField(Method):
         return None
 
     @torch.no_grad()
-    def _exact(self, rx: Pose) -> tuple[GaussianModel, FrozenArray | None]:
+    def _in_float64(self, rx: Pose) -> tuple[GaussianModel, FrozenArray | None]:
         """The model and what an array sees of it, in float64; images are rendered: these have gradients."""
-        model, seen = self.fitted(), self.frozen_at(rx) if self.settings.response.array else None
+        model, seen = self.fitted_model(), self.frozen_at(rx) if self.settings.response.array else None
         frozen = seen if isinstance(seen, FrozenArray) else None
         of = int(model.gaussians.version), frozen is None
         if self._doubled is None or self._doubled[0] != of:
             self._doubled = of, to_double((model, frozen))
         return self._doubled[1]
 
-    def _answered(
+    def _render_prediction(
         self, model: GaussianModel, frozen: FrozenView | FrozenArray | None, tx: Tensor, rx: Pose
     ) -> Prediction:
         result = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
@@ -435,7 +436,7 @@ class LearnedField(Method):
 
     def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """Return the matrix of the static receiver, made anew after an edit; None for any other pose."""
-        model, static = self.fitted(), self._receiver()
+        model, static = self.fitted_model(), self._static_receiver()
         if model.site.kind != "spectrum" or static is None or rx.batched:
             return None
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
@@ -458,7 +459,7 @@ class LearnedField(Method):
 
     reduction_settings = reduce.reduction_settings
     reduction_inputs = reduce.reduction_inputs
-    reduced = reduce.reduced
+    reduce = reduce.reduce_field
 
     # -- storing -----------------------------------------------------------------------------------
 
@@ -466,7 +467,7 @@ class LearnedField(Method):
         """Return everything `restore` needs."""
         prior = None if self._prior is None else vars(self._prior)
         choices = None if self.choices is None else vars(self.choices)
-        model = self.fitted().state_dict()
+        model = self.fitted_model().state_dict()
         return {
             "choices": choices, "ends": self._ends, "prior": prior, "shape": self._shape, "model": model,
             "steps": (self.steps, self.steps_taken),
@@ -487,10 +488,10 @@ class LearnedField(Method):
 
     def count_components(self) -> int:
         """Return the number of Gaussians."""
-        return len(self.fitted().gaussians)
+        return len(self.fitted_model().gaussians)
 
     @property
-    def made(self) -> str:
+    def description(self) -> str:
         """See `Method`."""
         if self.choices is None or self.model is None:
             return self.label
@@ -516,12 +517,12 @@ class LearnedField(Method):
         }  # fmt: skip
 
 
-def _all_rows(fold: Fold) -> Fold:
+def _train_on_all(fold: Fold) -> Fold:
     """Training and validation rows as training rows."""
     return Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
 
 
-def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
+def _hold_out_third(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
     known = np.sort(np.concatenate([fold.train, fold.val]))
     if len(known) < THIRDS * LEAST_HELD:
@@ -530,14 +531,14 @@ def _more_told(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
 
 
-def _apart(data: Measurements, fold: Fold) -> float | None:
+def _validation_distance(data: Measurements, fold: Fold) -> float | None:
     """How far validation rows are from the nearest training row, median [m]; None where there are none."""
     if not len(fold.val):
         return None
     return float(np.median(cKDTree(data.moving[fold.train]).query(data.moving[fold.val])[0]))
 
 
-def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:
+def _static_end_position(data: Measurements, row: int) -> dict[str, Tensor]:
     """Where the end that never moves stands, local coordinates [m]."""
     one = data.batch(np.array([row]))
     if data.site.static_end == "rx":

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 
 def reduction_settings(method: LearnedField) -> tuple[str, ...]:
-    """See `Method.reduced`.
+    """See `Method.reduce`.
 
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
     places that the features are told by, which `keep` is a share of, and pixels.
     """
-    model = method.fitted()
+    model = method.fitted_model()
     if not model.settings.response.array:
         return ("confidence", "stride")
     return ("keep", "stride", "confidence") if model.tells_unknown else ("confidence",)
@@ -39,14 +39,14 @@ def reduction_settings(method: LearnedField) -> tuple[str, ...]:
 
 def reduction_inputs(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
     """Return `receiver` (4, 3), a static one's position [m] above its rotation; else nothing."""
-    if method.fitted().site.static_end != "rx":
+    if method.fitted_model().site.static_end != "rx":
         return {}
     rx = data.batch(rows[:1]).rx
     pose = rx[0] if rx.batched else rx
     return {"receiver": torch.cat([pose.position[None], pose.rotation])}
 
 
-def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
+def reduce_field(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
     """Return the field with what `settings` spare left out; the trained one stays as it is.
 
     Args:
@@ -55,7 +55,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
         measured: from `measure`.
     """
     twin = copy.copy(method)
-    twin.model = model = copy.deepcopy(method.fitted())
+    twin.model = model = copy.deepcopy(method.fitted_model())
     site, stride = model.site, int(settings.get("stride", 1))
     raster = model.settings.raster
     raster = replace(raster, low_pass=raster.low_pass / stride**2)  # as wide as before on the sky
@@ -67,7 +67,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
         model.confidence = model.error = None
     model.gaussians.version += 1  # a plan frozen before is stale
     if by_places:
-        twin.frozen, grid = _frozen_again(method, model, measured["receiver"], stride)
+        twin.frozen, grid = _freeze_coarse(method, model, measured["receiver"], stride)
         return Interpolated(twin, grid, stride) if stride > 1 else twin
     if stride == 1:
         return twin
@@ -80,7 +80,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     return Interpolated(twin, site.grid, stride)
 
 
-def _frozen_again(
+def _freeze_coarse(
     method: LearnedField, model: GaussianModel, receiver: Tensor, stride: int
 ) -> tuple[FrozenArray, SphereGrid]:
     """The field through its array with other features and on fewer pixels, and their full grid.

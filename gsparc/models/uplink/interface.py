@@ -18,10 +18,10 @@ from gsparc.models.target_rows import TINY_POWER
 class SeparatesPaths(Protocol):
     """Finds the propagation paths of an uplink."""
 
-    def sources(self, uplink: Tensor) -> Any:
+    def find_sources(self, uplink: Tensor) -> Any:
         """Return gains, delays and directions (B, N) of uplinks (B, U, L)."""
 
-    def from_uplink_at(
+    def predict_from_uplink(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
         """Return channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
@@ -64,7 +64,7 @@ class UplinkMethod(Method):
         assert self.site is not None
         return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
 
-    def _need_uplink(self, data: Measurements) -> Site:
+    def _require_uplink(self, data: Measurements) -> Site:
         if data.site.kind != "csi" or data.uplink is None or data.site.antennas is None:
             raise ValueError(
                 f"{self.name}: reads a fresh uplink, and {data.site.name} has none (dataset=argos does)"

@@ -17,7 +17,7 @@ from gsparc.models.method import Prediction
 from gsparc.models.relative_error import RelativeErrorRegression
 from gsparc.models.uplink.error_model import SearchedSnapshots, estimate_noise
 from gsparc.models.uplink.interface import UplinkMethod, mean_power
-from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
+from gsparc.models.uplink.search import Sources, SourceSearch, UplinkSearchSettings
 from gsparc.physics.plane_waves import Aperture, mean_delay, phasor, planar_places
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext, FitReport
@@ -44,8 +44,8 @@ class UplinkField(UplinkMethod):
     name = "uplink"
 
     def __init__(
-        self, search: SearchSettings = SearchSettings(), teachers: int = 1200, shrink: bool = True,
-        seed: int = 0,
+        self, search: UplinkSearchSettings = UplinkSearchSettings(), teachers: int = 1200,
+        shrink: bool = True, seed: int = 0,
     ) -> None:  # fmt: skip
         if teachers < 50:
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
@@ -57,24 +57,26 @@ class UplinkField(UplinkMethod):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the leakage on validation rows, fit the error model on training rows."""
         started = TimeBudget()
-        self.site = self._need_uplink(data)
+        self.site = self._require_uplink(data)
         self.error_model = None
         rng = np.random.default_rng(self.seed)
         few = rng.permutation(fold.val if len(fold.val) else fold.train)[:100]
         errors = {}
         for leakage in LEAKAGES:
-            self._prepare(self.site, replace(self.settings, leakage=leakage))
-            errors[leakage] = float(np.median(self._training_errors(data, few, rng, 0)[1]))
+            self._set_search(self.site, replace(self.settings, leakage=leakage))
+            errors[leakage] = float(np.median(self._features_and_errors(data, few, rng, 0)[1]))
         best = min(errors, key=lambda leakage: errors[leakage])
-        self._prepare(self.site, replace(self.settings, leakage=best))
+        self._set_search(self.site, replace(self.settings, leakage=best))
         # The search is not fitted to training rows: their errors are unbiased.
         rows = rng.permutation(fold.train)[: self.teachers]
-        self.error_model = RelativeErrorRegression.from_rows(*self._training_errors(data, rows, rng, PIECES))
+        self.error_model = RelativeErrorRegression.from_rows(
+            *self._features_and_errors(data, rows, rng, PIECES)
+        )
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
         return FitReport(started.spent, (note,))
 
     @torch.no_grad()
-    def _training_errors(
+    def _features_and_errors(
         self, data: Measurements, rows: np.ndarray, rng: np.random.Generator, pieces: int
     ) -> tuple[Tensor, Tensor]:
         """Error features (n, S) and relative errors (n,) of training snapshots, whole and in pieces.
@@ -88,12 +90,12 @@ class UplinkField(UplinkMethod):
         for start in range(0, len(rows), CHUNK):
             batch = data.batch(rows[start : start + CHUNK])
             assert batch.uplink is not None
-            result = self._search(batch.uplink, batch.noise_variance)
+            result = self._search_snapshots(batch.uplink, batch.noise_variance)
             views = [(slice(None), slice(None))]
             for _ in range(pieces if tones > PIECE_TONES else 0):
                 one, first = int(rng.integers(antennas)), int(rng.integers(tones - PIECE_TONES + 1))
                 views.append((slice(one, one + 1), slice(first, first + PIECE_TONES)))
-            everything = result.sources.response(whole)
+            everything = result.sources.channels(whole)
             for some, band in views:
                 aperture = Aperture(whole.places[some], whole.tones[band])
                 mean, true = everything[:, some, band], batch.target[:, some, band]
@@ -102,15 +104,15 @@ class UplinkField(UplinkMethod):
         return torch.cat(features), torch.cat(error)
 
     # ---- predicting ----
-    def sources(self, uplink: Tensor, noise: Tensor | None = None) -> Sources:
+    def find_sources(self, uplink: Tensor, noise: Tensor | None = None) -> Sources:
         """Return the sources of snapshots (B, U, L): directions, delays, gains."""
-        return self._search(uplink, noise).sources
+        return self._search_snapshots(uplink, noise).sources
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; of the uplink alone."""
         return self._predict_at(self.query_uplinks(query), query.noise_variance, self._downlink)
 
-    def from_uplink_at(
+    def predict_from_uplink(
         self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
         """Return the same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
@@ -120,16 +122,16 @@ class UplinkField(UplinkMethod):
     def _predict_at(self, uplink: Tensor, noise: Tensor | None, aperture: Aperture) -> Prediction:
         assert self.error_model is not None
         with torch.inference_mode():  # a fifth less overhead in a single query
-            result = self._search(uplink, noise)
-            mean = result.sources.response(aperture)
-            error = self.error_model.expected(result.features(mean, aperture))
+            result = self._search_snapshots(uplink, noise)
+            mean = result.sources.channels(aperture)
+            error = self.error_model.expected_error(result.features(mean, aperture))
             if self.shrink:
                 mean = mean / (1 + error)[:, None, None]
             variance = error * mean_power(mean)
         mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
         return Prediction(mean, variance, error / (1 + error))
 
-    def _search(self, uplink: Tensor, noise: Tensor | None) -> SearchedSnapshots:
+    def _search_snapshots(self, uplink: Tensor, noise: Tensor | None) -> SearchedSnapshots:
         aperture = self.search.aperture
         if noise is None:
             noise = estimate_noise(uplink, aperture, self.settings.delay_window)
@@ -143,19 +145,19 @@ class UplinkField(UplinkMethod):
             replace(sources, delay=sources.delay + mean[:, None]), torch.cat(left), uplink, noise
         )
 
-    def _prepare(self, site: Site, settings: SearchSettings) -> None:
+    def _set_search(self, site: Site, settings: UplinkSearchSettings) -> None:
         assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
         assert site.subcarriers_hz is not None and site.carrier_hz is not None
         self._middle_hz = float(site.uplink_hz.mean())
         self._spacing_hz = float(np.diff(np.sort(site.uplink_hz)).min())
         places = planar_places(site.uplink_array, LIGHT / site.carrier_hz)
 
-        def tones(frequency: np.ndarray) -> Tensor:
+        def relative_tones(frequency: np.ndarray) -> Tensor:
             return torch.from_numpy((frequency - self._middle_hz) / self._spacing_hz).float()
 
-        self.search = SourceSearch(Aperture(places, tones(site.uplink_hz)), settings)
+        self.search = SourceSearch(Aperture(places, relative_tones(site.uplink_hz)), settings)
         chosen = torch.from_numpy(np.asarray(site.antennas))
-        self._downlink = Aperture(places[chosen], tones(site.subcarriers_hz))
+        self._downlink = Aperture(places[chosen], relative_tones(site.subcarriers_hz))
 
     # ---- state ----
     def state(self) -> dict[str, Any]:
@@ -166,7 +168,7 @@ class UplinkField(UplinkMethod):
     def restore(self, site: Site, state: Mapping[str, Any]) -> None:
         """See `Method.restore`."""
         self.site = site
-        self._prepare(site, SearchSettings(**state["search"]))
+        self._set_search(site, UplinkSearchSettings(**state["search"]))
         said = state["error_model"]
         self.error_model = None if said is None else RelativeErrorRegression.read(said)
 

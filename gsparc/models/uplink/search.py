@@ -59,7 +59,7 @@ class Sources:
         variance = torch.diagonal(self.position_covariance, dim1=1, dim2=2)
         return variance[:, -self.delay.shape[1] :].clamp_min(0)
 
-    def response(self, aperture: Aperture) -> Tensor:
+    def channels(self, aperture: Aperture) -> Tensor:
         """Return channels (B, A, K) complex64."""
         over_antennas, over_tones = (
             antenna_responses(self.direction, aperture),
@@ -83,7 +83,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class SearchSettings:
+class UplinkSearchSettings:
     """Source search.
 
     Attributes:
@@ -113,9 +113,9 @@ class SourceSearch:
         settings: see there.
     """
 
-    def __init__(self, aperture: Aperture, settings: SearchSettings) -> None:
+    def __init__(self, aperture: Aperture, settings: UplinkSearchSettings) -> None:
         self.aperture, self.settings = aperture, settings
-        self.cosines, self.delays, self.shape = _grid(aperture, settings)
+        self.cosines, self.delays, self.shape = _make_grid(aperture, settings)
         self._over_antennas = antenna_responses(self.cosines[None], aperture)[0].conj()
         self._over_tones = tone_responses(self.delays[None], aperture)[0].conj().T.contiguous()
 
@@ -129,34 +129,34 @@ class SourceSearch:
         direction, delay = snapshot.real.new_zeros(count, 0, 2), snapshot.real.new_zeros(count, 0)
         prior, residual = delay, y
         for turn in range(s.rounds):
-            new_direction, new_delay = self._peaks(residual)
+            new_direction, new_delay = self._peak_directions_and_delays(residual)
             direction, delay = torch.cat([direction, new_direction], 1), torch.cat([delay, new_delay], 1)
             # Unit power in equal shares of all sources that there will be.
             prior = torch.cat([prior, torch.full_like(new_delay, 1 / (s.rounds * s.picks))], 1)
             last = turn == s.rounds - 1
             inflated_noise = noise + UNEXPLAINED * residual.abs().square().mean((1, 2))
             for _ in range(s.refinements + (s.final if last else 0)):
-                fit = self._fit(y, inflated_noise, direction, delay, prior)
-                turned, moved = self._step(fit, inflated_noise)
+                fit = self._fit_gains(y, inflated_noise, direction, delay, prior)
+                turned, moved = self._step_directions_and_delays(fit, inflated_noise)
                 direction, delay = direction + turned, delay + moved
                 # Tipping's update: a gain that noise explains shrinks its own prior, and with it its source.
                 prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(LEAST_SHARE)
             if not last:
                 residual = y - fit.columns.channels(fit.gain)
         # What was not found yet counted as noise above; the posterior is of the known noise.
-        fit = self._fit(y, noise, direction, delay, prior)
+        fit = self._fit_gains(y, noise, direction, delay, prior)
         residual = scale[:, None, None] * (y - fit.columns.channels(fit.gain))
-        return self._posterior(fit, noise, direction, delay, scale), residual
+        return self._to_sources(fit, noise, direction, delay, scale), residual
 
-    def _peaks(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+    def _peak_directions_and_delays(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest local maxima of the correlation with the grid's atoms."""
         score = torch.view_as_real(self._over_antennas @ (residual @ self._over_tones)).square().sum(-1)
         cube = score.view(-1, *self.shape)
-        peaks = torch.where(_largest_near(cube) == cube, cube, 0).flatten(1)
+        peaks = torch.where(_dilate(cube) == cube, cube, 0).flatten(1)
         at = peaks.topk(self.settings.picks, 1).indices
         return self.cosines[at // len(self.delays)], self.delays[at % len(self.delays)]
 
-    def _fit(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
+    def _fit_gains(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
         """Best gains of given sources, and the gradient by their directions and delays."""
         n = delay.shape[1]
         columns = Columns.from_sources(direction, delay, self.aperture)
@@ -172,35 +172,35 @@ class SourceSearch:
         curvature = (projected * gains[:, None] * gains.conj()[..., None]).real
         return _Fit(columns, gain, inverse, slope, curvature, gain_slopes)
 
-    def _step(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def _step_directions_and_delays(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
         """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on the residual of the best gains."""
         n = fit.gain.shape[1]
-        reach = self._reach(n)
-        factor = Factor.from_gram(self._scaled(fit, noise), "ignore")
+        reach = self._step_deviations(n)
+        factor = Factor.from_gram(self._scaled_curvature(fit, noise), "ignore")
         step = factor.solve((fit.slope * reach)[..., None])[..., 0] * reach
         step = step.clamp(-LARGEST * reach, LARGEST * reach)
         return step[:, : 2 * n].view(-1, 2, n).transpose(1, 2), step[:, 2 * n :]
 
-    def _scaled(self, fit: _Fit, noise: Tensor) -> Tensor:
+    def _scaled_curvature(self, fit: _Fit, noise: Tensor) -> Tensor:
         """Curvature (B, 3 N, 3 N) in units of `_reach`, with the prior of a small step."""
-        reach = self._reach(fit.gain.shape[1])
+        reach = self._step_deviations(fit.gain.shape[1])
         scaled = fit.curvature * (reach[:, None] * reach)
         torch.diagonal(scaled, dim1=1, dim2=2).add_(noise[:, None])
         return scaled
 
-    def _posterior(
+    def _to_sources(
         self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor
     ) -> Sources:
         """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
-        reach = self._reach(fit.gain.shape[1])
+        reach = self._step_deviations(fit.gain.shape[1])
         gains = repeat_per_coordinate(fit.gain * scale[:, None])
-        spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
+        spread = torch.linalg.inv(self._scaled_curvature(fit, noise)) * (reach[:, None] * reach)
         return Sources(
             direction, delay, fit.gain * scale[:, None], fit.inverse * (noise * scale**2)[:, None, None],
             spread * (noise / 2)[:, None, None], -(fit.gain_slopes.mH * gains[:, None]),
         )  # fmt: skip
 
-    def _reach(self, count: int) -> Tensor:
+    def _step_deviations(self, count: int) -> Tensor:
         """Standard deviations (3 N,) of a step before anything is known."""
         return torch.cat([torch.full((2 * count,), REACH[0]), torch.full((count,), REACH[1])])
 
@@ -230,7 +230,7 @@ class _Fit:
         return noise[:, None] * torch.diagonal(self.inverse, dim1=1, dim2=2).real
 
 
-def _largest_near(cube: Tensor) -> Tensor:
+def _dilate(cube: Tensor) -> Tensor:
     """The largest value within one step along every axis of cubes (B, ...)."""
     for axis in range(1, cube.ndim):
         size = cube.shape[axis] - 1
@@ -243,7 +243,7 @@ def _largest_near(cube: Tensor) -> Tensor:
     return cube
 
 
-def _grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+def _make_grid(aperture: Aperture, s: UplinkSearchSettings) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
     """Cosines (G, 2), delays (T,), and the shape of both together; one cosine where the array is a line."""
     axes = []
     for axis in range(2):

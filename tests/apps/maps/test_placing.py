@@ -15,7 +15,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
@@ -25,7 +25,7 @@ from gsparc.training.context import FitContext
 def together(tmp_path_factory):
     folder: Path = tmp_path_factory.mktemp("together")
     data = load_own(town_file(folder / "town.npz"))
-    method, rows = by_station(method_class("distance_law")(), data), np.arange(len(data))
+    method, rows = wrap_per_station(method_class("distance_law")(), data), np.arange(len(data))
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(folder, stations="together"))
     checkpoint.save(folder / "model.ckpt", method)
     return method, data, folder / "model.ckpt"

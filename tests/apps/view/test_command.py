@@ -87,7 +87,7 @@ def in_dbm(stored):
 
 def test_rendered_gaussians_are_drawn_where_they_lie(spectrum_view):
     scene = spectrum_view.station(None).scene
-    gaussians = spectrum_view.viewed.predictor.method.fitted().gaussians
+    gaussians = spectrum_view.viewed.predictor.method.fitted_model().gaussians
     origin = spectrum_view.viewed.site.origin
     drawn = scene.part(GAUSSIANS)
     np.testing.assert_allclose(drawn.places, gaussians.means.detach().numpy() + origin, atol=1e-6)

@@ -64,8 +64,12 @@ def test_one_table_one_figure_and_a_page(three, tmp_path, capsys):
     assert [row["method and setting"] for row in rows] == [
         "gsparc emission.hidden=8",
         "gsparc emission.hidden=64",
+        "mean (baseline)",
+        "gp (baseline)",
     ]
-    assert rows[0]["seeds"] == "2" and rows[0]["PSNR dB low"] == "28.0" and rows[0]["train s/fold"] == "10.0"
+    assert (
+        rows[0]["seeds"] == "2" and rows[0]["PSNR dB least"] == "28.0" and rows[0]["train s/fold"] == "10.0"
+    )
     assert (tmp_path / "sweep.png").stat().st_size > 20_000 and (tmp_path / "report.html").exists()
     facts = json.loads((tmp_path / "summary.json").read_text())
     assert facts["sweep/runs"] == 3 and rows[1]["PSNR dB"] == "29.5"
@@ -106,4 +110,4 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
     assert "1 jobs failed" in done.stdout
     timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
     assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stdout)
-    assert (sweep / "sweep.csv").read_text().count("\n") == 2
+    assert (sweep / "sweep.csv").read_text().count("\n") == 3  # heads, the run, its baseline

@@ -20,7 +20,7 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.vector_gp import (
     align_by_likelihood,
-    mirror_elements,
+    index_mirror_elements,
     refine_alignment,
     twin_vectors,
 )
@@ -76,7 +76,7 @@ def test_renderer_gradient():
 def test_alignment_undoes_phases_and_twins(known_campaign):
     """Scrambled vectors of a smooth field predict each other again."""
     data, truth = known_campaign
-    partner, rng = mirror_elements(data.site.array), np.random.default_rng(1)
+    partner, rng = index_mirror_elements(data.site.array), np.random.default_rng(1)
     scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
     seen, twins = (spectra(data.site, torch.from_numpy(v)) for v in (scale, twin_vectors(scale, partner)))
     torch.testing.assert_close(seen, twins)
@@ -90,7 +90,7 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     assert np.median(overlap) > 0.99
     assert np.allclose(refine_alignment(vectors, inverse, partner, 1), vectors, atol=0.02)
     assert partner.tolist() == list(range(15, -1, -1))
-    assert mirror_elements(np.array([[0.0, 0, 0], [0.16, 0, 0], [0.48, 0, 0]])) is None
+    assert index_mirror_elements(np.array([[0.0, 0, 0], [0.16, 0, 0], [0.48, 0, 0]])) is None
 
 
 def test_cross_validation_with_gaps_equals_refitting(known_campaign):
@@ -105,8 +105,8 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
     samples = cross_validation._Samples(
         np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
     )
-    unknown, predicted = samples.predictions(kernel, np.linalg.inv(kernel.gram(at).numpy()), v)
-    error = samples.error(predicted)
+    unknown, predicted = samples.predict(kernel, np.linalg.inv(kernel.gram(at).numpy()), v)
+    error = samples.squared_errors(predicted)
     far = distance[7] > 0.03
     cross = kernel.correlations(at[far], at[7:8]).numpy()
     weights = np.linalg.solve(kernel.gram(at[far]).numpy(), cross)[:, 0]
@@ -137,13 +137,16 @@ def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, 
         few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))
     )
     few.fit(data, _fold(160), FitContext(tmp_path))
-    assert few.fitted().emission.encoding.width == 40 and whole.fitted().emission.encoding.width == 128
+    assert (
+        few.fitted_model().emission.encoding.width == 40
+        and whole.fitted_model().emission.encoding.width == 128
+    )
     batch = data.batch(_fold(160).test)
     said = [m.predict(batch).mean for m in (whole, few)]
     assert (said[0] - said[1]).square().mean() < 5e-3 * batch.target.square().mean()
     monkeypatch.setattr(splat_init, "MOST_ROWS", 60)
     few.fit(data, _fold(160), FitContext(tmp_path))
-    assert few.fitted().emission.encoding.width == 40
+    assert few.fitted_model().emission.encoding.width == 40
     again = few.predict(batch).mean
     errors = [(found - batch.target).square().mean() for found in (again, said[1])]
     assert errors[0] < 1.5 * errors[1], errors

@@ -13,7 +13,7 @@ from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
 from gsparc.models.array_vectors import phase_retrieval, vector_cache
 from gsparc.models.array_vectors.phase_retrieval import recover_vectors
-from gsparc.models.array_vectors.vector_gp import mirror_elements, twin_vectors
+from gsparc.models.array_vectors.vector_gp import index_mirror_elements, twin_vectors
 from gsparc.ops import SphereGrid
 
 
@@ -29,8 +29,8 @@ def test_vectors_of_a_traced_room_come_back_and_redraw_its_spectra(known_campaig
     found = recover_vectors(data.site, data.target[:60], data.tx[:60])
     image = spectra(data.site, torch.from_numpy(found.vectors)).numpy()
     assert np.sqrt(((image - data.target[:60] / 255.0) ** 2).mean()) < 2 / 255
-    assert (found.residual < found.expected).all() and not found.suspect.any()
-    agreement = _agreement(found.vectors, truth[:60], mirror_elements(data.site.array))
+    assert (found.residual < found.expected).all() and not found.is_suspect.any()
+    agreement = _agreement(found.vectors, truth[:60], index_mirror_elements(data.site.array))
     assert np.median(agreement) > 0.9999 and (agreement > 0.99).mean() > 0.95
 
 
@@ -49,24 +49,24 @@ def test_a_subtracted_minimum_is_found():
     low, high = image.min((1, 2)), image.max((1, 2))
     published = (image - low[:, None, None]) / (high - low)[:, None, None]
     found = recover_vectors(site, published.astype(np.float32), rng.normal(size=(12, 3)))
-    agreement = _agreement(found.vectors, truth, mirror_elements(site.array))
+    agreement = _agreement(found.vectors, truth, index_mirror_elements(site.array))
     assert np.median(agreement) > 0.999
     assert np.median(np.abs(found.offset - low / (high - low))) < 2e-3
 
 
 def test_restarts_are_counted_and_no_clock_ends_them(known_campaign, monkeypatch):
     """Seconds of the processor gave up rows that another machine would have solved."""
-    starts, search = [], phase_retrieval._search
+    starts, search = [], phase_retrieval._minimise
 
     def counted(problem, rows, start, *rest):
         starts.append(len(start))
         return search(problem, rows, start, *rest)
 
-    monkeypatch.setattr(phase_retrieval, "_search", counted)
+    monkeypatch.setattr(phase_retrieval, "_minimise", counted)
     broken, rows = _spoilt(known_campaign[0], 2), np.arange(4)
     for most in (0, 96):
         starts.clear()
-        recover_vectors(broken.site, broken.target[rows], broken.tx[rows], most=most)
+        recover_vectors(broken.site, broken.target[rows], broken.tx[rows], max_restarts=most)
         assert (96 in starts) == (most >= 96) and 384 not in starts
 
 
@@ -100,8 +100,8 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
 def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
     broken, rows = _spoilt(data, 2), np.arange(4)
-    found = recover_vectors(data.site, broken.target[rows], data.tx[rows], most=0)
-    assert np.flatnonzero(found.suspect).tolist() == [2]
+    found = recover_vectors(data.site, broken.target[rows], data.tx[rows], max_restarts=0)
+    assert np.flatnonzero(found.is_suspect).tolist() == [2]
     vector_cache.write_recovery_report(found, broken, rows, tmp_path / "array_recovery.csv")
     lines = (tmp_path / "array_recovery.csv").read_text().splitlines()
     assert [line[-1] for line in lines[1:]] == ["0", "0", "1", "0"] and "row 2" in caplog.text
@@ -112,7 +112,7 @@ def test_real_spectra_are_sixteen_complex_numbers(real_rfid):
     data = load({"name": "rfid", "root": str(real_rfid)})
     rows = np.arange(40, 80)
     found = recover_vectors(data.site, data.target[rows], data.tx[rows])
-    assert np.median(found.residual) < 1e-3 and not found.suspect.any()
+    assert np.median(found.residual) < 1e-3 and not found.is_suspect.any()
 
 
 def test_an_array_without_mirror_symmetry_has_no_twins_to_confuse():

@@ -17,7 +17,7 @@ from gsparc.field.frozen import gaussian_vectors
 from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached
-from gsparc.models.array_vectors.vector_gp import align_by_likelihood, mirror_elements
+from gsparc.models.array_vectors.vector_gp import align_by_likelihood, index_mirror_elements
 from gsparc.models.registry import build
 from gsparc.physics.array_response import steering_matrix
 
@@ -49,7 +49,7 @@ def process(trained):
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = (
         steering_matrix(site.array, site.grid, site.wavelength).numpy(),
-        mirror_elements(site.array),
+        index_mirror_elements(site.array),
     )
     found, _ = recover_cached(data, fold.train)  # the same solutions
     kernel = choose_kernel(found.vectors, places, images, matrix, site.wavelength, partner).kernel
@@ -61,7 +61,7 @@ def process(trained):
 
 def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     method, data, fold = trained
-    model, batch = method.fitted(), data.batch(fold.test)
+    model, batch = method.fitted_model(), data.batch(fold.test)
     mean, variance = process
     emitted = torch.view_as_complex(model.emissions(batch.tx, batch.rx).contiguous()).detach()
     vectors = (emitted @ gaussian_vectors(model, batch.rx)).numpy()
@@ -86,19 +86,19 @@ def test_all_is_unknown_far_away_and_little_at_data(trained):
     method, data, fold = trained
     tx, rx = _ends(data, fold.train)
     far = method.predict(Query(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx))
-    background = method.fitted().response.background
+    background = method.fitted_model().response.background
     torch.testing.assert_close(far.mean, background.expand(10, -1, -1), atol=1e-5, rtol=0)
     assert (far.confidence == 0).all() and (far.variance == far.variance[0]).all()
     near = method.predict(Query(tx, rx))
     assert near.confidence.min() > 0.5 and near.variance.max() < 0.5 * far.variance[0]
-    assert (method.fitted().unknown_shares(tx, rx) < 0.05).all()
+    assert (method.fitted_model().unknown_shares(tx, rx) < 0.05).all()
 
 
 def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
     data, _ = known_campaign
     fold = Fold(np.arange(40), np.arange(40, 44), np.arange(44, 50))
     method = _trained(data, fold, tmp_path, "model.field.count=20", "init=sphere", steps=3)
-    assert not method.fitted().tells_unknown
+    assert not method.fitted_model().tells_unknown
     said = method.predict(Query(*_ends(data, fold.test)))
     assert (said.mean.flatten(1).amax(1) > 0.999).all() and said.variance is None
 
@@ -113,11 +113,11 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
     ).create_for(data)
     model.restore(data.site, method.state())
     with torch.no_grad():
-        model.fitted().gaussians.opacity_logits.fill_(-40.0)
+        model.fitted_model().gaussians.opacity_logits.fill_(-40.0)
     batch = data.batch(np.arange(1))
     few = replace(found, weights=torch.ones(100, 16, dtype=torch.complex128))
-    splat_init.set_emissions(model.fitted(), few, batch.rx)
-    assert torch.isfinite(model.fitted().emission.weight2).all()
+    splat_init.set_emissions(model.fitted_model(), few, batch.rx)
+    assert torch.isfinite(model.fitted_model().emission.weight2).all()
 
 
 def test_a_closed_form_that_cannot_be_is_refused(known_campaign, tmp_path):

@@ -15,7 +15,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.registry import method_class
-from gsparc.models.target_rows import from_real, to_real
+from gsparc.models.target_rows import to_real, to_targets
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
@@ -104,7 +104,9 @@ def test_entries_never_measured_do_not_leak(campaign, folds, tmp_path, name):
 def test_encoding_is_undone(campaign, kind):
     data = campaign(kind, 5)
     rows = torch.from_numpy(to_real(data.target, kind))
-    assert torch.allclose(from_real(rows, kind, data.target.shape[1:]), data.targets(np.arange(5)), rtol=1e-5)
+    assert torch.allclose(
+        to_targets(rows, kind, data.target.shape[1:]), data.targets(np.arange(5)), rtol=1e-5
+    )
 
 
 def test_asking_before_fitting_is_an_error():

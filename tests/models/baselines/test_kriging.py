@@ -20,7 +20,7 @@ def krige(places: np.ndarray, decibels: np.ndarray, queries: np.ndarray) -> tupl
     method = Kriging()
     method.positions, method.values, method.channels = places, decibels, None
     method.variogram = Variogram(0.25, 25.0, 5.0)
-    method._solve()
+    method._factor_system()
     place, weights, variance = method._weights(queries)
     return (weights * decibels[place, 0]).sum(1), variance
 

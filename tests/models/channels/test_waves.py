@@ -20,9 +20,9 @@ from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import (
-    bisected_cells,
     directional_correlation,
     fibonacci_sphere,
+    number_cells_by_bisection,
     spread_directions,
 )
 from gsparc.models.channels.prior import ChannelPrior
@@ -98,7 +98,7 @@ def test_isotropic_term_alone_is_the_plain_process():
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
     torch.testing.assert_close(after.variance, before.variance * level, rtol=2e-3, atol=1e-6)
     torch.testing.assert_close(1 - after.unknown, before.confidence, rtol=2e-3, atol=1e-4)
-    left, _ = plain._fitted().left_out_residuals()
+    left, _ = plain._require_fitted().left_out_residuals()
     own = torch.from_numpy(data.target[field.rows]) - field.left_out().mean
     torch.testing.assert_close(own.flatten(), left.flatten().to(own.dtype), rtol=1e-3, atol=1e-4)
 
@@ -130,7 +130,7 @@ def test_covariance_is_hermitian_and_its_diagonal_the_prior():
     data = _sent(60)
     field = _whole(data, correlated=True)
     group = group_channels(data, np.arange(40), True)[0]
-    (signal,) = field.prior.of_groups([group])
+    (signal,) = field.prior.signal_covariances([group])
     torch.testing.assert_close(signal, signal.mH)
     torch.testing.assert_close(signal.diagonal().real, field.prior.variance(group))
     assert torch.linalg.eigvalsh(signal + field.prior.disturbance(group)).min() > 0
@@ -141,7 +141,7 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
     prior = _prior(data, envelope=2.0)
     groups = tuple(map(evidence.normalise_power, group_channels(data, np.arange(120), True)))
     part = evidence.compress_groups(groups, prior)[0]
-    power = part.own(prior)
+    power = part.powers(prior)
     assert part.basis.shape[1] < 80
     at = evidence.solve_group(part, power)
     slope = evidence.power_gradient(part, power, at)
@@ -152,11 +152,11 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
         ]
         assert float(slope[number]) == pytest.approx((found[0] - found[1]) / 2e-5, rel=1e-4, abs=1e-4)
     group = groups[0]
-    whole = prior.of_groups(groups)[0] + prior.disturbance(group)
+    whole = prior.signal_covariances(groups)[0] + prior.disturbance(group)
     fit = (group.target.conj() * torch.linalg.solve(whole, group.target)).real.mean()
     expected = float(len(group) * fit.log() + torch.logdet(whole).real)
     assert at.nll == pytest.approx(expected, abs=1.0)
-    cell = bisected_cells(group.places.numpy(), 3)
+    cell = number_cells_by_bisection(group.places.numpy(), 3)
     (error,), inverse = evidence.left_out_errors(part, power, [rows_of_groups(cell)]), torch.linalg.inv(whole)
     mine = torch.from_numpy(np.flatnonzero(cell == 2))
     own = torch.linalg.solve(inverse[mine[:, None], mine], (inverse @ group.target)[mine])

@@ -21,7 +21,7 @@ from gsparc.models.channels.terms import Direct, Directions, Isotropic, Leakage,
 from gsparc.models.channels.terms.term import Frame
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.terms import EffectSettings
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -74,7 +74,7 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
         towards=torch.zeros(5).double(),
     )  # fmt: skip
     ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
-    found = term.ways([Slot(0, (0,), (0,), end, zero, K) for end in ends])
+    found = term.knot_weights([Slot(0, (0,), (0,), end, zero, K) for end in ends])
     torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())
     torch.testing.assert_close(found[0], found[1], atol=0.05, rtol=0)
 
@@ -98,7 +98,7 @@ def test_one_field_of_all_ends_is_better_than_plain_processes():
     fold = fold_of(data)
     field, notes = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
     assert len(field.stations) == 4 and any("angles to ends" in note for note in notes)
-    plain = by_station(ComplexGP(), data)
+    plain = wrap_per_station(ComplexGP(), data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.7 * answer_error(plain, data, fold.test)
 
@@ -139,9 +139,9 @@ def test_runs_of_all_ends_differ_by_one_phase():
 def test_stations_together_are_asked_for_any_pair():
     data = _ceiling(ends=4, count=36)
     rows = np.flatnonzero(data.station < 3)
-    method = by_station(Gsparc(), data)
+    method = wrap_per_station(Gsparc(), data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
-    again = by_station(Gsparc(), data)
+    again = wrap_per_station(Gsparc(), data)
     again.restore(data.site, method.state())
     places = data.site.stations.position + data.site.origin
     here = np.array([0.3, 0.3, 0.2])
@@ -158,7 +158,7 @@ def test_stations_together_are_asked_for_any_pair():
 def test_methods_of_one_end_are_refused_as_before():
     data = _ceiling(ends=3, count=30)
     rows = np.arange(len(data))
-    fold, method = Fold(rows, rows[:0], rows[:0]), by_station(ImageSourceGP(), data)
+    fold, method = Fold(rows, rows[:0], rows[:0]), wrap_per_station(ImageSourceGP(), data)
     with pytest.raises(ValueError, match="stations=each"):
         method.fit(data, fold, FitContext(stations="together"))
 
@@ -174,7 +174,7 @@ def test_measured_ceiling_in_squares():
     data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
     fold = fold_of(data, name="blocks", side_m=0.6)
     field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
-    plain = by_station(ComplexGP(), data)
+    plain = wrap_per_station(ComplexGP(), data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.55 * answer_error(plain, data, fold.test)
 
@@ -184,7 +184,7 @@ def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
     """Rows of a later station carry its number, of which a site of one end knew nothing."""
     data = _ceiling(ends=2, count=30)
     fold = fold_of(data)
-    method = by_station(Gsparc(EffectSettings(phase=False)), data)
+    method = wrap_per_station(Gsparc(EffectSettings(phase=False)), data)
     method.fit(data, fold, FitContext(stations="each"))
     batch = data.batch(fold.test)
     by_place, by_row = method.predict(Query(batch.tx, batch.rx)), method.predict(batch)

@@ -57,7 +57,7 @@ def test_a_search_starts_from_sources_where_rays_meet():
     rows = np.arange(60)
     fold, still = Fold(rows, rows[:0], rows[:0]), torch.from_numpy(data.site.static_position).double()
     method = fitted(data, fold)[0]
-    found = method.sources()
+    found = method.points_and_amplitudes()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
         settings = SearchSettings(order=order)
         start = Search(draw_rows(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
@@ -98,7 +98,7 @@ def test_rows_left_out_are_predicted_as_by_a_fit_without_the_receiver():
     shared *= given.kernel.correlation(rows.position[kept], rows.position[kept])
     shared.diagonal().add_(given.kernel.noise + 1e-5)
     probability = (
-        spherical_waves(rows.take(out), given.positions.points) * given.visibility.left_out[k].float()
+        spherical_waves(rows.select_rows(out), given.positions.points) * given.visibility.left_out[k].float()
     )
     cross = (probability * given.power) @ waves[kept].mH
     cross *= given.kernel.correlation(rows.position[out], rows.position[kept])
@@ -116,7 +116,7 @@ def test_visibility_is_predicted_without_the_receiver():
     right = (fitted.left_out[:, 0].round() == seen[:, 0]).double().mean()
     assert float(right) > 0.85
     query = torch.tensor([[0.5, 2.0, 2.0], [3.5, 2.0, 2.0]], dtype=torch.float64)
-    probability = fitted.probability(query)[:, 0]
+    probability = fitted.probability_seen(query)[:, 0]
     assert float(probability[0]) > 0.8 and float(probability[1]) < 0.2
 
 
@@ -132,7 +132,7 @@ def test_visibility_at_queries_is_the_sum_over_each_sources_kernel():
     each = [
         matern32_of_squares((apart / length[k]) ** 2) @ weights[:, k] + seen[:, k].mean() for k in range(4)
     ]
-    torch.testing.assert_close(fitted.probability(queries), torch.stack(each, 1).clamp(0, 1))
+    torch.testing.assert_close(fitted.probability_seen(queries), torch.stack(each, 1).clamp(0, 1))
 
 
 def test_paths_sum_to_the_prediction(pillar):
@@ -173,15 +173,15 @@ def test_a_channel_restores_a_missed_ray():
     rays = truth.clone()
     rays[torch.arange(20), torch.arange(20) % 4] = 0
     left = ((truth - rays)[:, :, None] * one).sum(1)
-    rates = RayErrorRates.initial(rays)
+    rates = RayErrorRates.from_rays(rays)
     assert rates.missed == 0.2  # a quarter, clipped at first
     probability = torch.full((20, 4), 0.75)
-    flip = entries_to_flip(rays, rates.odds(rays, probability), left, torch.full((20,), 1e-3), one)
+    flip = entries_to_flip(rays, rates.log_odds_seen(rays, probability), left, torch.full((20,), 1e-3), one)
     assert torch.equal(flip, (truth - rays).bool())
     estimated = RayErrorRates.from_visibility(rays, truth)
     assert abs(estimated.missed - 0.25) < 1e-6 and estimated.spurious == 1e-3
     # no neighbour sees it and the residual is zero: noise adds no visibility
-    quiet = entries_to_flip(rays, rates.odds(rays, 0 * probability), 0 * left, torch.ones(20), one)
+    quiet = entries_to_flip(rays, rates.log_odds_seen(rays, 0 * probability), 0 * left, torch.ones(20), one)
     assert not bool(quiet[rays == 0].any())
 
 
@@ -189,14 +189,16 @@ def test_a_channel_restores_a_missed_ray():
 def test_where_every_ray_was_wrong_the_odds_divided_by_zero(seen):
     """One channel of 80 dB too much hides all sources from all receivers: a share of one has no odds."""
     rays, truth = torch.full((4, 2), 1 - seen), torch.full((4, 2), seen)
-    assert torch.isfinite(RayErrorRates.from_visibility(rays, truth).odds(rays, 0.5 * torch.ones(4, 2))).all()
+    assert torch.isfinite(
+        RayErrorRates.from_visibility(rays, truth).log_odds_seen(rays, 0.5 * torch.ones(4, 2))
+    ).all()
 
 
 def test_sources_that_errors_blur_are_told_from_sharp_ones():
     blurred = torch.tensor([0.0, 1e-2])[:, None].expand(2, 3).diag_embed().double()
     sources = UncertainPositions(torch.tensor([[5.0, 0, 0], [0, 5, 0]]).double(), blurred)
     places = torch.rand(20, 3, generator=torch.manual_seed(0)).double()
-    assert sources.uncertain(places, torch.tensor(2.4e9)).tolist() == [1]
+    assert sources.incoherent(places, torch.tensor(2.4e9)).tolist() == [1]
 
 
 def _random_rays(data):

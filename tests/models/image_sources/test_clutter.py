@@ -117,13 +117,13 @@ def test_batched_queries_and_variance_include_clutter():
     members = [Posterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
     queries = _rows(6, seed=5).position
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    means, variance, _ = EnsembleMeans(members).means(queries, tone)
+    means, variance, _ = EnsembleMeans(members).predict(queries, tone)
     for member, mean in zip(members, means, strict=True):
         asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
         waves = member.scene.replace_sequences(member.scene.sequences).unobstructed_waves(asked)
         expected = (waves[:, :, None] * gains(member, queries)).sum(1)
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
-    bare = EnsembleMeans(members[1:]).means(queries, tone)[1]
+    bare = EnsembleMeans(members[1:]).predict(queries, tone)[1]
     assert not torch.allclose(variance, bare)
 
 
@@ -141,7 +141,7 @@ def test_score_is_what_the_best_multiple_gains():
     left = _unexplained(rows, _bare())
     scene, scorer = left.scene, left.scorer
     change = torch.randn(20, 8, dtype=torch.complex64)
-    score, multiple = scorer.gain_of_multiples(change)
+    score, multiple = scorer.gains_and_multiples(change)
     best = int(score.argmax())
     moved = replace(rows, target=rows.target - (multiple[best] * change[:, best])[:, None])
     gain = Posterior(rows, scene).nll - Posterior(moved, scene).nll
@@ -173,7 +173,7 @@ def _unexplained(rows: Rows, start: Scene) -> UnexplainedRows:
     """What is left of rows by a scene without clutter, with its noise."""
     residual = ClutterLikelihood(rows, start)
     scene, paths = residual.scene, start.unfolding.paths(rows.position)
-    scorer = residual.scorer(torch.ones(len(start.sequences), len(rows)), scene.log_amplitude)
+    scorer = residual.make_scorer(torch.ones(len(start.sequences), len(rows)), scene.log_amplitude)
     waves, generator = start.unobstructed_waves(rows), torch.Generator().manual_seed(0)
     return UnexplainedRows(rows, scene, scorer, paths, waves, _room(), generator)
 
@@ -190,7 +190,7 @@ def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
 def test_candidates_are_met_where_unfolded_paths_meet_them():
     """By itself, after a wall, and before one."""
     rows, planes = _rows(40), torch.cat([WALLS[:1], TABLE[None]])
-    found = finite_mirrors._sources(rows, TRANSMITTER, TABLE[None], WALLS[:1])
+    found = finite_mirrors._waves_and_meetings(rows, TRANSMITTER, TABLE[None], WALLS[:1])
     for (_, met), (word, corner) in zip(found, (((1,), 0), ((0, 1), 0), ((1, 0), 1)), strict=True):
         paths = Unfolding(TRANSMITTER, planes, (word,)).paths(rows.position)
         seen = torch.isfinite(met[0, :, 0]) & paths.valid[0]
@@ -239,11 +239,11 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         return torch.zeros(len(args[1])), torch.zeros(len(args[1]), 4)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finite_mirrors, "_raster", nothing)
+        patch.setattr(finite_mirrors, "_best_rectangles", nothing)
         patch.setattr(finite_mirrors, "MAX_CELLS", 1e12)
         find_small_mirrors(replace(left, room=room, scene=left.scene.select_sources([0, 1])), 3)
     count = sum(planes for planes, _ in cells) * math.prod(
-        finite_mirrors._cells(room, plane_tangents(WALLS[0]), cells[0][1])
+        finite_mirrors._count_cells(room, plane_tangents(WALLS[0]), cells[0][1])
     )
     assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
 
@@ -270,7 +270,8 @@ def test_an_infinite_mirror_becomes_finite():
     patch, score = find_patch(left, 6)
     assert score > 10
     learned, told = (
-        visible_share(left.paths.take([7]), Clutter(clutter.boxes, each[None], (6,)), planes) > 0.5
+        visible_share(left.paths.select_sequences([7]), Clutter(clutter.boxes, each[None], (6,)), planes)
+        > 0.5
         for each in (patch, clutter.patches[0])
     )
     assert (learned == told).float().mean() > 0.85
@@ -296,7 +297,7 @@ def test_walls_of_equal_phase_shift_give_a_phase_prior():
     phase_prior = ReflectionPhasePrior.from_scene(phased(scene, phase))
     assert phase_prior.turn == pytest.approx(np.pi)
     assert phase_prior.concentration > 3
-    expected = phase_prior.expected(phase[0], ((0, 1),))
+    expected = phase_prior.expected_phases(phase[0], ((0, 1),))
     assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
     scattered = phased(scene, torch.arange(7.0) * 2.1)
     assert ReflectionPhasePrior.from_scene(scattered).concentration < phase_prior.concentration

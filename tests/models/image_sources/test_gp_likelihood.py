@@ -76,11 +76,11 @@ def test_quadrature_one_is_the_circular_process():
 @pytest.mark.parametrize("quadrature", [0.1, 1.0])
 def test_left_out_by_refitting_without_the_receiver(quadrature):
     rows, scene = _rows(), _phased(quadrature)
-    left_out = Posterior(rows, scene).left_out()
+    left_out = Posterior(rows, scene).predict_left_out()
     for receiver in (0, 5):  # the first has two rows
         mine = rows.receiver == receiver
-        rest = Posterior(rows.take(torch.nonzero(~mine)[:, 0]), scene)
-        held = rows.take(torch.nonzero(mine)[:, 0])
+        rest = Posterior(rows.select_rows(torch.nonzero(~mine)[:, 0]), scene)
+        held = rows.select_rows(torch.nonzero(mine)[:, 0])
         waves = spherical_waves(held, scene.sources)
         predicted = (waves[:, :, None] * gains(rest, held.position)).sum(1)
         torch.testing.assert_close(left_out[mine], predicted, rtol=1e-3, atol=1e-3)
@@ -93,7 +93,7 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
     values = [scene.transmitter, *scene.planes.split((3, 1), 1), scene.log_amplitude]
     values += [torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
-    nll, gradient = refine._objective(rows, scene, values, seen)
+    nll, gradient = refine._cost_and_gradient(rows, scene, values, seen)
     assert nll == pytest.approx(Posterior(rows, scene).nll, rel=1e-5)
     for i, value in enumerate(values):
         step = 3e-4 if i < 3 else 2e-2
@@ -102,7 +102,7 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
             for sign in (1, -1):
                 moved = [v.clone() for v in values]
                 moved[i].view(-1)[j] += sign * step
-                ends.append(refine._objective(rows, scene, moved, seen)[0])
+                ends.append(refine._cost_and_gradient(rows, scene, moved, seen)[0])
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert gradient[i].reshape(-1)[j].item() == pytest.approx(numeric, rel=0.05, abs=0.15), (i, j)
     assert Posterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
@@ -112,8 +112,8 @@ def test_packed_queries_equal_the_processes():
     members = [Posterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
     tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
     queries = torch.rand(7, 3, dtype=torch.float64) * 3
-    means, _, _ = EnsembleMeans(members).means(queries, tones)
-    bare, variance, prior = EnsembleMeans(members, variance_rows=0).means(queries, tones)
+    means, _, _ = EnsembleMeans(members).predict(queries, tones)
+    bare, variance, prior = EnsembleMeans(members, variance_rows=0).predict(queries, tones)
     assert torch.equal(bare, means) and variance.tolist() == [0] * 7 and prior.tolist() == [1] * 7
     for member, mean in zip(members, means, strict=True):
         found = gains(member, queries)
@@ -128,7 +128,7 @@ def test_variance_is_that_of_the_joint_gaussian():
     rows, scene = _rows(), _phased()
     query = torch.tensor([[1.0, 1.2, 0.4]], dtype=torch.float64)
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    _, variance, _ = EnsembleMeans([Posterior(rows, scene)]).means(query, tone)
+    _, variance, _ = EnsembleMeans([Posterior(rows, scene)]).predict(query, tone)
     both = Rows(
         torch.cat([rows.position, query]),
         torch.cat([rows.frequency, tone]),
@@ -144,12 +144,12 @@ def test_variances_of_many_queries_are_those_of_each_alone():
     tones = torch.tensor([2.4e9], dtype=torch.float64)
     queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
     query = EnsembleMeans([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
-    _, variance, prior = query.means(queries, tones)
-    alone = [query.means(one[None], tones)[1:] for one in queries]
+    _, variance, prior = query.predict(queries, tones)
+    alone = [query.predict(one[None], tones)[1:] for one in queries]
     torch.testing.assert_close(
         torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
     )
-    whole = EnsembleMeans([Posterior(_rows(), _phased())]).means(queries, tones)[1]
+    whole = EnsembleMeans([Posterior(_rows(), _phased())]).predict(queries, tones)[1]
     assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
     assert bool((variance <= prior).all())
 

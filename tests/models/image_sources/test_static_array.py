@@ -13,8 +13,8 @@ from rooms import shoebox
 from scenes import error, fold_of
 
 from gsparc.data.own import from_arrays
-from gsparc.models.image_sources.backprojection import likelihood_gain, rough_likelihood_gain
-from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _cost
+from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
+from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
 from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
@@ -143,8 +143,8 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
     spread = reflect(rows.static_ends(scene.transmitter)[:, None], bisector(scene.transmitter, points))
     waves = spherical_waves(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
-    torch.testing.assert_close(rough_likelihood_gain(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert likelihood_gain(Posterior(rows, scene), spread)[0].shape == (300,)
+    torch.testing.assert_close(rough_gains(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
+    assert gains_and_amplitudes(Posterior(rows, scene), spread)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
         spherical_waves(rows, points)
 
@@ -192,7 +192,7 @@ def test_the_inner_matrix_of_hardly_any_noise_has_a_factor():
     columns = torch.cat([one, one * (1 + 1e-7)], 1)
     single = columns.T @ columns + torch.eye(2)
     assert torch.linalg.cholesky_ex(single)[1] > 0
-    assert torch.isfinite(_cost(columns, one[:, 0], 0.0))
+    assert torch.isfinite(_nll(columns, one[:, 0], 0.0))
 
 
 def test_clutter_is_looked_for_without_noise():
@@ -219,7 +219,7 @@ def test_an_interrupt_ends_all_searches(tmp_path, monkeypatch):
 def test_one_antenna_is_a_case_of_several():
     """The same likelihood with an array of one antenna at the static end's place."""
     rows, scene = _rows_and_scene()
-    mine = rows.take(torch.nonzero(rows.element == 0).flatten())
+    mine = rows.select_rows(torch.nonzero(rows.element == 0).flatten())
     alone = replace(mine, array=None, element=None)
     assert Posterior(mine, scene).nll == pytest.approx(Posterior(alone, scene).nll, rel=1e-4)
     one, other = (Posterior(each, estimate_phases(each, scene, 0.4, 1e-5)).nll for each in (mine, alone))

@@ -5,7 +5,7 @@ import pytest
 import torch
 from distances import far
 
-from gsparc.models.moving_array.error_regression import ImageErrors, _variance, fit_errors
+from gsparc.models.moving_array.error_regression import ImageErrors, _posterior_variance, fit_errors
 from gsparc.processes.kernel import Kernel
 
 KERNEL, REACH, PRIOR = Kernel.from_length(1.0, 0.1), 2.0, 0.05
@@ -18,7 +18,7 @@ def fit(places, errors, observed):
 
 def said_of(model, places, queries, observed):
     distances = far(queries, places)
-    return model.relative_error(distances, torch.from_numpy(observed).float())[0].numpy()
+    return model.error_and_nearest(distances, torch.from_numpy(observed).float())[0].numpy()
 
 
 def features(count, seed=0):
@@ -73,7 +73,7 @@ def test_a_variance_needs_the_nearest_rows_only():
     at = torch.from_numpy(places)
     cross, gram = KERNEL.correlations(torch.from_numpy(queries), at).numpy(), KERNEL.gram(at).numpy()
     exact = 1.1 - (cross * np.linalg.solve(gram, cross.T).T).sum(1)
-    near = _variance(KERNEL, distance.gather(1, model.near[row]), model.precision[row]).numpy()
+    near = _posterior_variance(KERNEL, distance.gather(1, model.near[row]), model.precision[row]).numpy()
     assert (near > exact - 1e-6).all() and (near < 1.5 * exact).all() and near.mean() < 1.1 * exact.mean()
 
 

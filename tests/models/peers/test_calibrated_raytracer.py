@@ -102,8 +102,8 @@ def test_settings_that_cannot_be_are_refused(settings):
 def test_other_data_are_refused():
     own = measurements(np.ones(60))
     unknown = from_arrays({"rssi": np.ones(60), "rx_position": places(), "tx_position": STATION})
-    assert CalibratedRayTracer().problem(own) is None
-    assert "carrier" in CalibratedRayTracer().problem(unknown)
+    assert CalibratedRayTracer().why_not(own) is None
+    assert "carrier" in CalibratedRayTracer().why_not(unknown)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from published_table import FILE, settings, table
 from scenes import lobes
 
 from gsparc.models.peers.nerf2 import REFERENCE, MarchedField, NeRF2
-from gsparc.models.peers.trained import _scene
+from gsparc.models.peers.trained import _make_scene
 
 
 def test_the_table_says_which_settings_are_the_papers():
@@ -19,7 +19,9 @@ def test_the_table_says_which_settings_are_the_papers():
 @pytest.fixture
 def published(tmp_path):
     data, fold = lobes(tmp_path)
-    return MarchedField(_scene(data, fold.train), NeRF2(**settings("paper", "nerf2"))), data.batch(fold.test)
+    return MarchedField(_make_scene(data, fold.train), NeRF2(**settings("paper", "nerf2"))), data.batch(
+        fold.test
+    )
 
 
 def test_published_nerf2_was_two_networks_of_eight_layers(published):

@@ -94,7 +94,9 @@ def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
     for slow_s, batch, steps in ((0.0, 8, 10), (0.4, 8, 10), (0.0, 16, 5), (1.5, 8, 0)):
         method = brief("swiftwrf", max_steps=None, budget_s=0.31, batch_size=batch)
         if batch == 8:  # the console said "within 0.31 s", which no clock ends
-            assert method.time_limit(data.site, 0.31) == "10 steps, about 0.31 s of an idle processor"
+            assert (
+                method.describe_time_limit(data.site, 0.31) == "10 steps, about 0.31 s of an idle processor"
+            )
         build = method.makes
         method.makes = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
         seen.clear()

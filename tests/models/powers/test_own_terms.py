@@ -83,7 +83,7 @@ def test_each_of_several_stations_has_the_term_of_paths_to_it(trees, caplog):
     copies = dict(given.method)
     assert len(copies) == 2
     for number, copy in copies.items():
-        own, _ = copy.single.trend.more
+        own, _ = copy.member.trend.more
         np.testing.assert_allclose(own.still.numpy() + own.origin.numpy(), where[number], atol=1e-3)
     assert given.rssi(rx=data["rx"]).shape == (60, 2)
 
@@ -94,18 +94,18 @@ def test_stations_say_one_weight_of_all():
     told = rng.normal(-3.0, np.hypot(0.5, 1.0), 12)  # 1 dB between stations beside what each is unsure of
     numbers = [np.array([[weight], [0.5], [0.0], [5.0]]) for weight in told]
     alone = [own_terms.LearnedWeights.from_numbers("Wood", one) for one in numbers]
-    (line,) = set(own_terms.over_stations(["a law", *alone]).values())
+    (line,) = set(own_terms.combine_stations(["a law", *alone]).values())
     mean, error = line.numbers[:2, 0]
     assert abs(mean + 3.0) < 3 * error and 0.2 < error < 0.5
     said = r"Wood: -\S+ \+- \S+ \(of 12 stations, which differ by \d\S+; prior_db=\[.*\] tells .*\)"
     assert re.fullmatch(said, line)
-    assert own_terms.over_stations(alone[:1])[alone[0]] == alone[0]
+    assert own_terms.combine_stations(alone[:1])[alone[0]] == alone[0]
 
 
 def test_a_prior_in_decibels_is_a_setting_of_the_term(trees):
     data = town(12)
     known = {"rx": data["rx"], "tx": STILL, "rssi": data["rssi"], "model": "powers"}
-    told = gsparc.fit(**known, terms=[trees(GROVE, (-0.4, 1e-4))]).method.single.trend.more[0]
+    told = gsparc.fit(**known, terms=[trees(GROVE, (-0.4, 1e-4))]).method.member.trend.more[0]
     assert told.prior[0] == -0.4 and told.prior[1] * told.unit == pytest.approx(1e-4)
     with pytest.raises(ValueError, match=r"Trees\.prior_db=3: say \[mean, deviation\]"):
         gsparc.fit(**known, terms=[trees(GROVE, 3)])
@@ -121,7 +121,7 @@ def test_a_term_behind_which_all_rows_lie_was_surely_nothing():
     rng = np.random.default_rng(0)
     at = np.c_[rng.uniform(0, 200, (60, 2)), np.zeros(60)]
     level = -60 - 3 * at[:, 0] / 100 - 18 + rng.normal(0, 1, 60)
-    field = gsparc.fit(rx=at, tx=[0, 0, 9], rssi=level, model="powers", terms=Band()).method.single
+    field = gsparc.fit(rx=at, tx=[0, 0, 9], rssi=level, model="powers", terms=Band()).method.member
     (said,) = own_terms.describe_weights(field.powers.posterior, field.trend.more)
     assert abs(said.numbers[0, 0] + 3) < 3 * said.numbers[1, 0]
 
@@ -146,7 +146,7 @@ def test_what_is_no_term_is_refused():
 
 def test_a_term_of_a_notebook_was_stored_without_a_word(trees, monkeypatch, caplog):
     monkeypatch.setattr(trees, "__module__", "__main__")
-    assert own_terms.as_terms(trees(GROVE))
+    assert own_terms.to_terms(trees(GROVE))
     assert "Trees is of a notebook or script" in caplog.text
     with pytest.raises(ValueError, match=r"'__main__\.Gone' is of a notebook or script: define it here"):
         stored.find_kind("__main__.Gone")

@@ -15,7 +15,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
-from gsparc.models.powers.settings import LEAST_SILENT, Candidate, _in_doubt, fit_power_process
+from gsparc.models.powers.settings import LEAST_SILENT, Candidate, _select_doubtful, process_and_notes
 from gsparc.models.reduced import reduce_method
 from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
@@ -54,7 +54,7 @@ def test_of_silent_rows_those_in_doubt_are_weighed():
     side = np.repeat([0, 1], [40, 101]).astype(np.int8)
     places = np.pad(np.r_[heard, silent][:, None], ((0, 0), (0, 2)))
     rows = PowerRows(places, np.where(side, -70.0, -60.0), side)
-    few = _in_doubt(rows, Candidate(0.0, Trend(-60.0), Kernel.from_length(100.0, 0.1, 16.0), 0.0))
+    few = _select_doubtful(rows, Candidate(0.0, Trend(-60.0), Kernel.from_length(100.0, 0.1, 16.0), 0.0))
     assert (few.side == 0).sum() == 40 and few.silent.sum() == LEAST_SILENT
     # Beside strong ones a silent row contradicts what is known; 2 km away it says little.
     assert (few.places[few.silent, 0] <= 400).sum() == (silent <= 400).sum()
@@ -67,7 +67,7 @@ def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
         number = stored["station"].tolist().index("law73-nuc2-b210")
     data = station(number, 97, 9)
     rows = power_rows(data, np.arange(97))
-    process, _ = fit_power_process(rows, data.site)
+    process, _ = process_and_notes(rows, data.site)
     assert process.kernel.amplitude < 3 * rows.decibels.var()  # 6.6 times without the bound
 
 
@@ -146,7 +146,7 @@ def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
     )
     arrays = {"rx_position": places, "tx_position": station, "rssi_db": decibels}
     data = from_arrays(arrays, {"name": "street"})
-    process, notes = fit_power_process(power_rows(data, np.arange(80)), data.site)
+    process, notes = process_and_notes(power_rows(data, np.arange(80)), data.site)
     assert process.trend.law is not None and "a distance law" in notes[0]
     near, far = np.array([[0.0, 400.0, 1.5], [0.0, 2400.0, 1.5]]) - data.site.origin
     mean, *_ = process.answer(torch.from_numpy(np.stack([near, far])))
@@ -163,7 +163,7 @@ def test_settings_of_many_rows_come_from_near_rows_too():
     decibels = -60 + short + 0.3 * rng.standard_normal(len(places))
     values = {"rx_position": places, "tx_position": np.zeros(3), "rssi_db": decibels}
     data = from_arrays(values, {"name": "pairs"})
-    process, notes = fit_power_process(power_rows(data, np.arange(len(data))), data.site)
+    process, notes = process_and_notes(power_rows(data, np.arange(len(data))), data.site)
     assert any("given its nearest" in note for note in notes)
     assert process.kernel.lengths[0] < 20
 
@@ -176,7 +176,7 @@ def test_rows_within_centimetres_said_infinite_powers_a_kilometre_away():
     still = np.array([-1.0, -0.7, 0.0])
     data = from_arrays({"rx_position": places, "tx_position": still, "rssi_db": decibels}, {"name": "shelf"})
     for mean in ("auto", "distance"):
-        process, _ = fit_power_process(power_rows(data, np.arange(8)), data.site, mean=mean)
+        process, _ = process_and_notes(power_rows(data, np.arange(8)), data.site, mean=mean)
         far = torch.eye(3, dtype=torch.float64) * 1000.0
         found, *_ = process.answer(far)
         assert (found + 67.5).abs().max() < 150, (mean, found)

@@ -23,7 +23,7 @@ from gsparc.models.baselines.mean import Mean
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings
+from gsparc.models.moving_array.triangulate import BearingSearchSettings
 from gsparc.models.splat.array import ArrayField
 from gsparc.training.context import FitContext
 
@@ -101,8 +101,8 @@ def test_fewer_places_say_what_all_of_them_said(through_array):
     case = through_array
     assert case.method.reduction_settings() == ("keep", "stride", "confidence")
     ways = [case.less(keep=share) for share in (1.0, 0.75, 0.1)]
-    assert [way.fitted().emission.encoding.width for way in ways] == [36, 27, 4]
-    assert case.method.fitted().emission.encoding.width == 36
+    assert [way.fitted_model().emission.encoding.width for way in ways] == [36, 27, 4]
+    assert case.method.fitted_model().emission.encoding.width == 36
     error = [case.away(way) for way in ways]
     assert error[0] < 1e-5 < error[1] < error[2]
     unsure = [float(case.answer(way, case.fold.train).confidence.mean()) for way in ways]
@@ -137,7 +137,7 @@ def test_a_gaussian_process_spares_components_pixels_and_its_variance(process):
 
 @pytest.fixture(scope="module")
 def crossings() -> Case:
-    search = SearchSettings(sources=17, rows=40, candidates=2000, steps=20)
+    search = BearingSearchSettings(sources=17, rows=40, candidates=2000, steps=20)
     return Case.fit(MovingArrayField(search, components=64, seed=0), room_of_spectra())
 
 

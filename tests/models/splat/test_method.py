@@ -98,14 +98,14 @@ def test_a_static_receiver_is_frozen_and_another_pose_and_an_edit_are_seen(still
     method, data = still
     batch = data.batch(np.arange(4))
     quick = method.predict(batch).mean
-    slow = method.fitted()(batch.tx, batch.rx).mean.clamp(0, 1).detach()
+    slow = method.fitted_model()(batch.tx, batch.rx).mean.clamp(0, 1).detach()
     assert torch.allclose(quick, slow, atol=1e-5)
     moved = Pose(batch.rx.position + 0.5, batch.rx.rotation)
     assert not torch.allclose(method.predict(Query(batch.tx, moved)).mean, quick, atol=1e-3)
     edited = copy.deepcopy(method)
     with torch.no_grad():
-        edited.fitted().gaussians.opacity_logits.fill_(-9.0)
-        edited.fitted().gaussians.version += 1
+        edited.fitted_model().gaussians.opacity_logits.fill_(-9.0)
+        edited.fitted_model().gaussians.version += 1
     assert edited.predict(batch).mean.sum() < 0.1 * quick.sum()
 
 
@@ -117,7 +117,7 @@ def test_a_run_on_a_single_tone_can_be_resumed(tmp_path, cut):
     resumed = learned(file)
     context = short(tmp_path / "on", 15, every=5, validate_every=10, resume=tmp_path / cut)
     resumed.fit(data, fold, context)
-    before, after = method.fitted().state_dict(), resumed.fitted().state_dict()
+    before, after = method.fitted_model().state_dict(), resumed.fitted_model().state_dict()
     assert all(torch.equal(before[key], after[key]) for key in before)
 
 
@@ -146,7 +146,7 @@ def test_the_test_rows_are_never_looked_at(tmp_path):
     for target in (data.target, poisoned):
         method = learned(file)
         method.fit(dataclasses.replace(data, target=target), fold, short(tmp_path, 15))
-        states.append(method.fitted().state_dict())
+        states.append(method.fitted_model().state_dict())
     assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
 
 
@@ -157,13 +157,13 @@ def test_seeds_repeat_and_differ(tmp_path):
     for seed in (0, 0, 1):
         method = learned(file)
         method.fit(data, fold, short(tmp_path / str(len(found)), 15, seed=seed))
-        found.append(method.fitted().gaussians.means)
+        found.append(method.fitted_model().gaussians.means)
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 
 def test_untrained_says_so():
     with pytest.raises(ValueError, match="has not been trained"):
-        LearnedField().fitted()
+        LearnedField().fitted_model()
 
 
 def test_a_closed_form_start_that_cannot_be_says_what_it_needs(tmp_path):
@@ -179,6 +179,6 @@ def test_few_validation_rows_chose_steps(tmp_path):
     moving = spectra(tmp_path / "own.npz", rows=30, moving="rx")
     data = load_data({"name": "own", "file": str(moving)})
     few = fold_of(data)
-    told = splatting._more_told(data, few, short(tmp_path, 5))
+    told = splatting._hold_out_third(data, few, short(tmp_path, 5))
     assert len(few.val) < 4 <= len(told.val) and np.array_equal(told.test, few.test)
     assert set(told.train) | set(told.val) == set(few.train) | set(few.val)

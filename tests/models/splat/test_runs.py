@@ -71,8 +71,8 @@ def test_aligned_channels_are_restored():
     data = from_arrays(arrays(World("tone", 5, 1, "rx", "metres", "none", "random", 30), 0))
     factors = torch.polar(torch.arange(1.0, 6.0).double(), torch.arange(5.0).double())
     runs = RunFactors(np.arange(5), factors)
-    aligned = runs.align_channels(data)
+    aligned = runs.remove_factors(data)
     assert aligned.run is None and RunFactors.has_several_runs(data, np.arange(30))
-    found = runs.restore_run(Prediction(aligned.targets(np.arange(30))), torch.from_numpy(data.run))
+    found = runs.apply_factors(Prediction(aligned.targets(np.arange(30))), torch.from_numpy(data.run))
     assert torch.allclose(found.mean, data.targets(np.arange(30)), atol=1e-6)
     assert runs.look_up(torch.tensor([7])).item() == 1  # nothing is known of that one

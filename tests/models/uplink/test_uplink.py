@@ -15,7 +15,7 @@ from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
-from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
+from gsparc.models.uplink.search import Sources, SourceSearch, UplinkSearchSettings
 from gsparc.physics.plane_waves import Aperture, Columns, antenna_responses, tone_responses
 from gsparc.training.context import FitContext
 
@@ -34,8 +34,8 @@ def _three() -> Sources:
 
 def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
     aperture, truth = _aperture(), _three()
-    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=6, leakage=1e-6))
-    heard = truth.response(aperture)
+    search = SourceSearch(aperture, UplinkSearchSettings(rounds=3, picks=1, final=6, leakage=1e-6))
+    heard = truth.channels(aperture)
     found, left = search(heard, torch.tensor([1e-6]))
     assert left.abs().square().mean() < 1e-5 * heard.abs().square().mean()
     for which in range(3):
@@ -43,22 +43,22 @@ def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
         assert (found.direction[0, near] - truth.direction[0, which]).abs().max() < 1e-2
         assert (found.gain[0, near] - truth.gain[0, which]).abs() < 1e-2
     other = replace(aperture, tones=aperture.tones + 27)
-    miss = (found.response(other) - truth.response(other)).abs().square().mean()
-    assert miss < 1e-3 * truth.response(other).abs().square().mean()
+    miss = (found.channels(other) - truth.channels(other)).abs().square().mean()
+    assert miss < 1e-3 * truth.channels(other).abs().square().mean()
 
 
 def test_noise_is_read_off_empty_delays() -> None:
     aperture = _aperture()
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(1, 64, 26, dtype=torch.complex64, generator=generator) * 0.1
-    guess = estimate_noise(_three().response(aperture) + noise, aperture, (-0.12, 0.3))
+    guess = estimate_noise(_three().channels(aperture) + noise, aperture, (-0.12, 0.3))
     assert 0.005 < float(guess) < 0.02
 
 
 @pytest.fixture(scope="module")
 def fitted():
     data = city("all")
-    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
+    method = UplinkField(UplinkSearchSettings(rounds=4, picks=4, final=2), teachers=60)
     method.fit(data, fold(), FitContext())
     return method, data
 
@@ -98,7 +98,7 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
     batch = data.batch(np.concatenate([fold().val, fold().test]))
     few = torch.from_numpy(data.site.subcarriers_hz[11:15])
     whole = method.predict(batch), batch.target, 1.0
-    piece = method.from_uplink_at(batch.uplink, few, batch.noise_variance, slice(0, 1))
+    piece = method.predict_from_uplink(batch.uplink, few, batch.noise_variance, slice(0, 1))
     for found, true, factor in (whole, (piece, batch.target[:, :1, 11:15], 0.5)):
         assert ((found.confidence > 0) & (found.confidence < 1)).all()
         error, sure = _relative(found.mean, true), found.confidence > found.confidence.median()
@@ -160,7 +160,7 @@ def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None
     (tmp_path / "base-station.yml").write_text("\n".join(kept))
     data = load_argos(tmp_path)
     assert data.noise_variance is None and data.uplink.shape[1] == 8
-    method = UplinkField(SearchSettings(rounds=3, picks=4, final=2), teachers=60)
+    method = UplinkField(UplinkSearchSettings(rounds=3, picks=4, final=2), teachers=60)
     method.fit(data, fold(), FitContext())
     assert method.search.shape[1] == 1
     assert float(_errors(method, data).median()) < 0.3
@@ -183,7 +183,7 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
     flat = torch.cat([atoms(torch.zeros(3).double()), *slopes])
     columns = Columns.from_sources(three.direction, three.delay, aperture)
     assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
-    snapshot = three.response(aperture)
+    snapshot = three.channels(aperture)
     wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)
     assert torch.allclose(
         columns.inner_products(snapshot)[0], wanted.to(torch.complex64), rtol=1e-3, atol=2.0
@@ -195,11 +195,11 @@ def test_posterior_tells_the_error_of_the_other_band() -> None:
     aperture, truth = _aperture(), _three()
     count, noise = 200, 0.05
     generator = torch.Generator().manual_seed(0)
-    heard = truth.response(aperture).expand(count, -1, -1)
+    heard = truth.channels(aperture).expand(count, -1, -1)
     heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
-    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
+    search = SourceSearch(aperture, UplinkSearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
     found, _ = search(heard, torch.full((count,), noise))
     other = replace(aperture, tones=aperture.tones + 27)
     for where in (other, Aperture(other.places[:1], other.tones[:5])):
-        miss = (found.response(where) - truth.response(where)).abs().square().mean((1, 2))
+        miss = (found.channels(where) - truth.channels(where)).abs().square().mean((1, 2))
         assert 0.6 < float(miss.median() / found.error_variance(where).median()) < 1.6

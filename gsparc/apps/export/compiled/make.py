@@ -105,7 +105,7 @@ _NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of
 def compile_exactly(method: Method, site: Site) -> Form | None:
     """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
-        return None if method.single is None else compile_exactly(method.single, site)
+        return None if method.member is None else compile_exactly(method.member, site)
     if isinstance(method, PowerField):
         if method.powers is None or method.fringes is not None:
             return None
@@ -129,7 +129,7 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
     place = torch.from_numpy(np.asarray(site.static_position, np.float32))
     frozen = method.frozen_at(Pose(place, torch.from_numpy(np.asarray(rotation, np.float32))))
     if isinstance(frozen, FrozenArray):
-        return compile_array(method.fitted(), frozen)
+        return compile_array(method.fitted_model(), frozen)
     return compile_view(frozen) if isinstance(frozen, FrozenView) else None
 
 
@@ -183,7 +183,7 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     # Without __init__: its sources are given, and searching is what would be repeated.
     alone = ImageSourceGP.__new__(ImageSourceGP)
     alone.__dict__.update(method.__dict__, weights=torch.ones(1))
-    alone._conditioned(rows, [scene])
+    alone._set_posteriors(rows, [scene])
     form = compile_sources(alone, data.site, alone.query)
     return replace(form, predictor=Predictor(alone, data.site))
 

@@ -42,7 +42,7 @@ class Dense:
     matrices: Tensor
 
     @property
-    def count(self) -> int:
+    def count_powers(self) -> int:
         """m."""
         return len(self.matrices)
 
@@ -51,14 +51,14 @@ class Dense:
         flat = self.matrices.view(len(power), -1)
         return covariance.add_((power.to(flat.dtype) @ flat).view(covariance.shape))
 
-    def traces(self, weight: Tensor) -> Tensor:
+    def traces_of_products(self, weight: Tensor) -> Tensor:
         """Return traces (m,) of products with a Hermitian matrix (r, r)."""
         return (self.matrices.reshape(len(self.matrices), -1) @ weight.T.reshape(-1)).real
 
-    def change_basis(self, mixed: Tensor) -> Dense:
+    def change_basis(self, coordinates: Tensor) -> Dense:
         """Return them in another basis, of which the old one is (s, r) float64 coordinates."""
         real, imag = self.matrices.real, self.matrices.imag
-        return Dense(torch.complex(mixed @ real @ mixed.T, mixed @ imag @ mixed.T))
+        return Dense(torch.complex(coordinates @ real @ coordinates.T, coordinates @ imag @ coordinates.T))
 
 
 @dataclass(frozen=True)
@@ -66,19 +66,19 @@ class Factored:
     """A covariance F F^H of few columns F (r, q) complex128; methods as of `Dense`."""
 
     factor: Tensor
-    count: ClassVar[int] = 1
+    count_powers: ClassVar[int] = 1
 
     def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
         """See `Dense`."""
         return covariance.addmm_(self.factor * power, self.factor.mH)
 
-    def traces(self, weight: Tensor) -> Tensor:
+    def traces_of_products(self, weight: Tensor) -> Tensor:
         """See `Dense`."""
         return (self.factor.conj() * (weight @ self.factor)).real.sum()[None]
 
-    def change_basis(self, mixed: Tensor) -> Factored:
+    def change_basis(self, coordinates: Tensor) -> Factored:
         """See `Dense`."""
-        return Factored(mixed.to(torch.complex128) @ self.factor)
+        return Factored(coordinates.to(torch.complex128) @ self.factor)
 
 
 Piece = Dense | Factored
@@ -102,23 +102,23 @@ class Basis:
 
     @staticmethod
     def from_matrix(
-        key: tuple[Hashable, ...], places: Tensor, alike: Callable[[], Tensor], noise: float, shared: Cache
+        key: tuple[Hashable, ...], places: Tensor, gram: Callable[[], Tensor], noise: float, shared: Cache
     ) -> Basis:
         """Return that of a correlation (n, n) float64 beside `noise`, its share."""
-        size, vectors = torch.linalg.eigh(alike())
+        size, vectors = torch.linalg.eigh(gram())
         mask = size > FLOOR * noise
         whole = int(mask.sum()) > WORTH * len(places)
         columns = torch.eye(len(places), dtype=torch.float64) if whole else vectors[:, mask]
         return Basis(key, places, columns, shared)
 
-    def dense(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Piece, ...]:
+    def dense_piece(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Piece, ...]:
         """Return a piece of covariances (n, n), which equal places and keys share."""
-        return (get_or_make(self.shared, (*self.key, key), lambda: self._dense(matrices())),)
+        return (get_or_make(self.shared, (*self.key, key), lambda: self._compress(matrices())),)
 
-    def _dense(self, matrices: list[Tensor]) -> Dense:
-        return Dense(torch.stack([self.of_rows(matrix) for matrix in matrices]))
+    def _compress(self, matrices: list[Tensor]) -> Dense:
+        return Dense(torch.stack([self.compress(matrix) for matrix in matrices]))
 
-    def of_rows(self, matrix: Tensor) -> Tensor:
+    def compress(self, matrix: Tensor) -> Tensor:
         """Return a matrix (n, n) of rows as (r, r) complex128."""
         if self.columns.shape[1] == len(self.columns):
             return matrix.to(torch.complex128)
@@ -127,15 +127,15 @@ class Basis:
         # The basis is real: two real products take half the time of a complex one.
         return torch.complex(*(self.columns.T @ part @ self.columns for part in (matrix.real, matrix.imag)))
 
-    def factored(self, length: float, waves: Tensor) -> tuple[Piece, ...]:
+    def wave_pieces(self, length: float, waves: Tensor) -> tuple[Piece, ...]:
         """Return pieces of waves (W, n) whose gains vary over `length` [m]."""
-        roots = get_or_make(self.shared, (self.key[0], length), lambda: self._roots(length))
+        roots = get_or_make(self.shared, (self.key[0], length), lambda: self._correlation_root(length))
         wide = self.columns.T.to(torch.complex128)
         factors = [wide @ (wave[:, None] * roots) for wave in waves]
         few = roots.shape[1] <= LOW * len(wide)
         return tuple(Factored(each) if few else Dense((each @ each.mH)[None]) for each in factors)
 
-    def _roots(self, length: float) -> Tensor:
+    def _correlation_root(self, length: float) -> Tensor:
         """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
         size, vectors = torch.linalg.eigh(squared_exponential(distances(self.places, self.places), length))
         mask = size > LOW_RANK * size[-1]

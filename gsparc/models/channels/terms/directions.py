@@ -45,9 +45,9 @@ class Directions(ChannelTerm):
         """Return powers (T, M) as ends have them; (1, M) where all have the same."""
         if not len(self.towards):
             return self.power[None]
-        return self.power * (self.ways(slots) @ self.towards).exp()
+        return self.power * (self.knot_weights(slots) @ self.towards).exp()
 
-    def ways(self, slots: Sequence[Slot]) -> Tensor:
+    def knot_weights(self, slots: Sequence[Slot]) -> Tensor:
         """Return weights (T, M, J) of the J knots in the angle between directions and ends.
 
         Directions of a half sphere stand for their mirror images as well: the nearer one counts.
@@ -92,17 +92,17 @@ class Directions(ChannelTerm):
         """Return one of M covariances, see `ChannelTerm`."""
         places, wavenumber = at.places, at.slot.wavenumber
 
-        def matrices() -> list[Tensor]:
+        def correlation_matrices() -> list[Tensor]:
             bound = matern_envelope(distances(places, places), self.frame.envelope)
             ones = self.angles.split(1)
             return [self.correlations(one, wavenumber, places, places)[0] * bound for one in ones]
 
-        return basis.dense((self.concentration, self.angles.numpy().tobytes()), matrices)
+        return basis.dense_piece((self.concentration, self.angles.numpy().tobytes()), correlation_matrices)
 
     def design(self, slot: Slot) -> Tensor:
         """Return the knots' weights beside the powers', see `ChannelTerm`."""
         own = super().design(slot)
-        return torch.cat([own, self.ways([slot])[0]], 1) if len(self.towards) else own
+        return torch.cat([own, self.knot_weights([slot])[0]], 1) if len(self.towards) else own
 
     def parameters(self) -> Tensor:
         """Return logarithms of powers, then of factors (M + J,), see `Term`."""

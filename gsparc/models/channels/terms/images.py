@@ -26,17 +26,17 @@ class Images(Spherical):
         """Return images of equal powers."""
         return cls(frame, torch.full((2 * len(planes),), level, dtype=torch.float64), planes=planes)
 
-    def select(self, heard: Tensor) -> Self:
-        """Return some of them, of `heard` (W,) bool."""
-        return replace(self, power=self.power[heard.repeat(2)], planes=self.planes[heard])
+    def select_planes(self, mask: Tensor) -> Self:
+        """Return some of them, of `mask` (W,) bool."""
+        return replace(self, power=self.power[mask.repeat(2)], planes=self.planes[mask])
 
-    def mirror(self, ends: Tensor) -> Tensor:
+    def mirror_ends(self, ends: Tensor) -> Tensor:
         """Return images (..., W, 3) [m] of ends (..., 3) where these are said to be."""
         return images(ends + self.frame.offset, self.planes, [(n,) for n in range(len(self.planes))])
 
     def sources(self, slot: Slot) -> Tensor:
         """Return the images (W, 3) [m], see `Spherical`."""
-        return self.mirror(slot.end)
+        return self.mirror_ends(slot.end)
 
     def waves(self, at: SlotPlaces) -> Tensor:
         """Return waves (W, n), see `Spherical`; 0 of planes that have the end and the middle on two sides."""

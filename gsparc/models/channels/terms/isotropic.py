@@ -35,4 +35,4 @@ class Isotropic(ChannelTerm):
 
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
-        return basis.dense("isotropic", lambda: [self.correlation(at, at)])
+        return basis.dense_piece("isotropic", lambda: [self.correlation(at, at)])

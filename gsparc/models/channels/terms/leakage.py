@@ -27,4 +27,4 @@ class Leakage(ChannelTerm):
 
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
-        return basis.factored(self.frame.reach, torch.ones(1, len(at.places), dtype=torch.complex128))
+        return basis.wave_pieces(self.frame.reach, torch.ones(1, len(at.places), dtype=torch.complex128))

@@ -26,7 +26,7 @@ class Spherical(ChannelTerm):
     def sources(self, slot: Slot) -> Tensor:
         """Return where waves come from (W, 3) [m]."""
 
-    def away(self, slot: Slot) -> Tensor:
+    def source_distances(self, slot: Slot) -> Tensor:
         """Return distances (W,) [m] from sources to the places' middle."""
         return torch.linalg.vector_norm(self.sources(slot) - self.frame.middle, dim=-1)
 
@@ -37,7 +37,7 @@ class Spherical(ChannelTerm):
         return torch.stack([spherical_wave(at.places, one, wavenumber, away) for one, away in both])
 
     @property
-    def gains(self) -> tuple[Tensor, Tensor]:
+    def split_powers(self) -> tuple[Tensor, Tensor]:
         """Powers (W,) of fixed gains, and of those that vary."""
         # In the order of `covariances_in_basis`: fixed gains of all waves, then varying ones.
         fixed, varying = self.power.view(2, -1)
@@ -46,7 +46,7 @@ class Spherical(ChannelTerm):
     def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return that of all waves (n, m) complex128, see `Term`."""
         distance, before, after = distances(a.places, b.places), self.waves(a), self.waves(b)
-        fixed, varying = ((before.T * power) @ after.conj() for power in self.gains)
+        fixed, varying = ((before.T * power) @ after.conj() for power in self.split_powers)
         return fixed * squared_exponential(distance, self.frame.reach) + varying * squared_exponential(
             distance, self.frame.gain
         )
@@ -58,4 +58,4 @@ class Spherical(ChannelTerm):
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return those of fixed gains, then of those that vary, see `ChannelTerm`."""
         waves, frame = self.waves(at), self.frame
-        return basis.factored(frame.reach, waves) + basis.factored(frame.gain, waves)
+        return basis.wave_pieces(frame.reach, waves) + basis.wave_pieces(frame.gain, waves)

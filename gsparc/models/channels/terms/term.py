@@ -68,7 +68,8 @@ class ChannelTerm(Term[SlotPlaces]):
     def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return covariances of unit power in a basis, as many in all as there are powers; here one."""
         # A logarithm of 0 is unit power.
-        return (Dense(basis.of_rows(self.with_values(self.power[:0].new_zeros(1)).covariance(at, at))[None]),)
+        unit = self.with_values(self.power[:0].new_zeros(1))
+        return (Dense(basis.compress(unit.covariance(at, at))[None]),)
 
     def design(self, slot: Slot) -> Tensor:
         """Return how logarithms of an end's own powers depend on `parameters` (p, q), linearly."""

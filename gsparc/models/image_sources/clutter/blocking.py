@@ -96,10 +96,10 @@ class Obstacles:
         if len(self.boxes):
             seen = seen * share_past_boxes(paths, self.boxes).prod(0)
         if len(self.patches):
-            seen = seen * self._past_patches(paths)
+            seen = seen * self._share_past_patches(paths)
         return seen
 
-    def _past_patches(self, paths: Paths) -> Tensor:
+    def _share_past_patches(self, paths: Paths) -> Tensor:
         turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
         height, *place = turned.unflatten(0, self.axes.shape[:2])  # each (Q, K, n, L + 1)
         height = height - self.offset
@@ -108,7 +108,7 @@ class Obstacles:
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [each[..., :-1] + share * each.diff() for each in place]
-        outside = 1 - _inside(met, self.patches) * ((crosses | ends_here) & paths.valid[..., None])
+        outside = 1 - _share_inside(met, self.patches) * ((crosses | ends_here) & paths.valid[..., None])
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.plane]
@@ -135,10 +135,10 @@ def share_past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
 
 def share_inside_patches(points: Tensor, patches: Tensor) -> Tensor:
     """Return the soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
-    return _inside([points[None, ..., 0], points[None, ..., 1]], patches)
+    return _share_inside([points[None, ..., 0], points[None, ..., 1]], patches)
 
 
-def _inside(place: list[Tensor], patches: Tensor) -> Tensor:
+def _share_inside(place: list[Tensor], patches: Tensor) -> Tensor:
     """Patches (Q, 4) against coordinates (1, ...), or (Q, ...), each against its own."""
     u, v = place
     low_u, low_v, high_u, high_v = (each.reshape(-1, *[1] * (u.dim() - 1)) for each in patches.T)

@@ -23,7 +23,7 @@ STRONGEST = 24  # number of sources that a box is searched with
 def maximise_by_evolution(
     parents: Tensor,
     score: Callable[[Tensor], Tensor],
-    repaired: Callable[[Tensor], Tensor],
+    repair: Callable[[Tensor], Tensor],
     generator: torch.Generator,
     rounds: int = 14,
 ) -> tuple[Tensor, float]:
@@ -32,7 +32,7 @@ def maximise_by_evolution(
     for number in range(rounds):
         born = parents.repeat_interleave(CHILDREN, 0)
         which = torch.rand(born.shape, generator=generator) < 0.5
-        born = repaired(born + spread * torch.randn(born.shape, generator=generator) * which)
+        born = repair(born + spread * torch.randn(born.shape, generator=generator) * which)
         scores, chosen = score(born).view(len(parents), -1).max(1)
         better = scores > best
         heirs = born.view(len(parents), -1, born.shape[1])[torch.arange(len(parents)), chosen]
@@ -54,17 +54,17 @@ def find_occluding_box(unexplained: UnexplainedRows, draws: int = 1000) -> tuple
     """
     waves = unexplained.waves * unexplained.scorer.gains
     chosen = waves.abs().square().sum(0).topk(min(STRONGEST, waves.shape[1])).indices
-    few, waves = unexplained.paths.take(chosen), waves[:, chosen]
+    few, waves = unexplained.paths.select_sequences(chosen), waves[:, chosen]
 
-    def score(boxes: Tensor) -> Tensor:
-        return unexplained.scorer.gain_of_shares(boxes, lambda part: share_past_boxes(few, part) - 1, waves)
+    def gain_of_boxes(boxes: Tensor) -> Tensor:
+        return unexplained.scorer.gains_of_shares(boxes, lambda part: share_past_boxes(few, part) - 1, waves)
 
-    def repaired(boxes: Tensor) -> Tensor:
+    def clip(boxes: Tensor) -> Tensor:
         return clip_boxes(boxes, unexplained.room)
 
-    starts = repaired(_random(draws, unexplained.room, unexplained.generator))
-    starts = starts[score(starts).topk(min(PARENTS, draws)).indices]
-    return maximise_by_evolution(starts, score, repaired, unexplained.generator)
+    starts = clip(_draw_boxes(draws, unexplained.room, unexplained.generator))
+    starts = starts[gain_of_boxes(starts).topk(min(PARENTS, draws)).indices]
+    return maximise_by_evolution(starts, gain_of_boxes, clip, unexplained.generator)
 
 
 def clip_boxes(boxes: Tensor, room: Tensor) -> Tensor:
@@ -74,7 +74,7 @@ def clip_boxes(boxes: Tensor, room: Tensor) -> Tensor:
     return torch.cat([torch.maximum(low, room[0]), torch.minimum(high, room[1])], 1)
 
 
-def _random(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
+def _draw_boxes(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
     lowest, highest = room
     middle = draw_in_box(lowest, highest, count, generator)
     kind = torch.rand(count, generator=generator)

@@ -43,27 +43,27 @@ MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]:
     """Return the patch (4,) on a plane that explains most if sequences end on it alone, and its nats."""
     mine = [k for k, sequence in enumerate(unexplained.scene.sequences) if plane in sequence]
-    few, waves = unexplained.paths.take(mine), unexplained.waves[:, mine]
+    few, waves = unexplained.paths.select_sequences(mine), unexplained.waves[:, mine]
     along = plane_tangents(unexplained.scene.planes[plane])
     met, here = few.end @ along.T, few.plane == plane
     ends = unexplained.room @ along.T
     low, high = ends.amin(0), ends.amax(0)
 
-    def score(patches: Tensor) -> Tensor:
-        return unexplained.scorer.gain_of_shares(
+    def gain_of_patches(patches: Tensor) -> Tensor:
+        return unexplained.scorer.gains_of_shares(
             patches, lambda part: torch.where(here, share_inside_patches(met, part), 1.0).prod(-1), waves
         )
 
-    def repaired(patches: Tensor) -> Tensor:
+    def repair(patches: Tensor) -> Tensor:
         lower, upper = patches.chunk(2, 1)
         lower = torch.minimum(lower, upper - MIN_SIDE)
         return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
     middle = draw_in_box(low, high, DRAWS, unexplained.generator)
     side = draw_lengths(SMALLEST, LARGEST, middle, unexplained.generator)
-    starts = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
-    starts = starts[score(starts).topk(8).indices]
-    return maximise_by_evolution(starts, score, repaired, unexplained.generator, rounds=10)
+    starts = repair(torch.cat([middle - side / 2, middle + side / 2], 1))
+    starts = starts[gain_of_patches(starts).topk(8).indices]
+    return maximise_by_evolution(starts, gain_of_patches, repair, unexplained.generator, rounds=10)
 
 
 @dataclass(frozen=True)
@@ -80,16 +80,16 @@ class SmallMirror:
     patch: Tensor
     score: float
 
-    def overlaps(self, other: SmallMirror, apart: float) -> bool:
-        """Whether both are parallel, closer than `apart` [m] and overlap."""
+    def overlaps(self, other: SmallMirror, max_gap: float) -> bool:
+        """Whether both are parallel, closer than `max_gap` [m] and overlap."""
         (normal, offset), (normal2, offset2) = map(hesse_form, (self.plane, other.plane))
-        if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > apart:
+        if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > max_gap:
             return False
         low, high = torch.maximum(self.patch, other.patch)[:2], torch.minimum(self.patch, other.patch)[2:]
         return bool((high > low).all())
 
 
-def find_small_mirrors(unexplained: UnexplainedRows, most: int) -> list[SmallMirror]:
+def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMirror]:
     """Return at most so many small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its sequences (itself, after
@@ -97,7 +97,11 @@ def find_small_mirrors(unexplained: UnexplainedRows, most: int) -> list[SmallMir
     Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
     `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
     """
-    rows, room, known = unexplained.rows, unexplained.room, unexplained.scene.planes[unexplained.scene.walls]
+    rows, room, known = (
+        unexplained.rows,
+        unexplained.room,
+        unexplained.scene.planes[unexplained.scene.walls],
+    )
     wavelength = LIGHT / float(rows.frequency.mean())
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []
@@ -112,36 +116,38 @@ def find_small_mirrors(unexplained: UnexplainedRows, most: int) -> list[SmallMir
         )
         candidates = torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1)
         many = 1 + 2 * len(known)
-        count = math.prod(_cells(room, plane_tangents(candidates[0]), CELL)) * many * len(candidates)
+        count = math.prod(_count_cells(room, plane_tangents(candidates[0]), CELL)) * many * len(candidates)
         if count > MAX_CELLS:
             log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
             continue
         cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
-        each = max(math.prod(_cells(room, plane_tangents(candidates[0]), cell)), len(rows)) * many
+        each = max(math.prod(_count_cells(room, plane_tangents(candidates[0]), cell)), len(rows)) * many
         blocks = candidates.split(max(1, int(BLOCK_CELLS / each)))
-        parts = [_raster(unexplained, block, known, cell) for block in blocks]
+        parts = [_best_rectangles(unexplained, block, known, cell) for block in blocks]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
-        for number in total.topk(min(2 * most, len(total))).indices.tolist():
+        for number in total.topk(min(2 * limit, len(total))).indices.tolist():
             mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
-    return _apart(mirrors, 0.5 * wavelength)[:most]
+    return _drop_overlapping(mirrors, 0.5 * wavelength)[:limit]
 
 
-def _apart(mirrors: list[SmallMirror], least: float) -> list[SmallMirror]:
+def _drop_overlapping(mirrors: list[SmallMirror], max_gap: float) -> list[SmallMirror]:
     apart: list[SmallMirror] = []
     for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(mirror.overlaps(other, least) for other in apart):
+        if not any(mirror.overlaps(other, max_gap) for other in apart):
             apart.append(mirror)
     return apart
 
 
-def _raster(
+def _best_rectangles(
     unexplained: UnexplainedRows, candidates: Tensor, known: Tensor, cell: float
 ) -> tuple[Tensor, Tensor]:
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
     along = plane_tangents(candidates[0])
-    low, cells = (unexplained.room @ along.T).amin(0), _cells(unexplained.room, along, cell)
-    tables, alpha, scale = [], unexplained.scorer.alpha, unexplained.scorer.scale
-    for arriving, met in _sources(unexplained.rows, unexplained.scene.transmitter, candidates, known):
+    low, cells = (unexplained.room @ along.T).amin(0), _count_cells(unexplained.room, along, cell)
+    tables, alpha, scale = [], unexplained.scorer.solved_residual, unexplained.scorer.precision_diagonal
+    for arriving, met in _waves_and_meetings(
+        unexplained.rows, unexplained.scene.transmitter, candidates, known
+    ):
         raise_if_cancelled()
         at = ((met @ along.T - low) / cell).floor().long()
         inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
@@ -172,28 +178,28 @@ def _raster(
     return total, best
 
 
-def _cells(room: Tensor, along: Tensor, cell: float) -> list[int]:
+def _count_cells(room: Tensor, along: Tensor, cell: float) -> list[int]:
     """Cells of that side [m] in a raster along each of two tangents (2, 3)."""
     ends = room @ along.T
     return ((ends.amax(0) - ends.amin(0)) / cell).ceil().long().clamp_min(1).tolist()
 
 
-def _sources(
+def _waves_and_meetings(
     rows: Rows, transmitter: Tensor, candidates: Tensor, known: Tensor
 ) -> list[tuple[Tensor, Tensor]]:
     """Waves (C, n) of every sequence over a candidate, and where it is met (C, n, 3), NaN if not."""
     places = rows.position.float()
-    once, *more = _images(transmitter, candidates, known)
-    meetings = [_meeting(places, once, candidates)]
+    once, *more = _images_over_candidates(transmitter, candidates, known)
+    meetings = [_intersect_planes(places, once, candidates)]
     for wall, after, before in zip(known, more[::2], more[1::2], strict=True):
-        meetings.append(_meeting(places, after, candidates))
-        first = _meeting(places, before, wall.expand_as(candidates))
-        meetings.append(_meeting(first, once, candidates))
-    sources = _images(rows.static_ends(transmitter), candidates, known)
+        meetings.append(_intersect_planes(places, after, candidates))
+        first = _intersect_planes(places, before, wall.expand_as(candidates))
+        meetings.append(_intersect_planes(first, once, candidates))
+    sources = _images_over_candidates(rows.static_ends(transmitter), candidates, known)
     return [(spherical_waves(rows, source).T, met) for source, met in zip(sources, meetings, strict=True)]
 
 
-def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
+def _images_over_candidates(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
     """Images (..., C, 3) of (..., 3) in each candidate, then after and before each wall."""
     start = static[..., None, :]
     once = reflect(start, candidates)
@@ -201,7 +207,7 @@ def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
     return [once, *(image for pair in pairs for image in pair)]
 
 
-def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
+def _intersect_planes(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
     """Where lines from (n, 3) or (C, n, 3) to (C, 3) meet planes (C, 4); NaN where not between."""
     normal, offset = (part.float() for part in hesse_form(planes[:, None]))
     offset, end = offset[..., 0], end[:, None].float()

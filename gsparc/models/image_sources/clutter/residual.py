@@ -44,50 +44,50 @@ class ClutterLikelihood:
         self.rows, self.noise_floor = rows, scene.noise_floor
         self.target = stack_real_imag(rows.target)[0][:, 0]
         self.waves = scene.unobstructed_waves(rows)
-        self._cached = self._parts(scene)
-        self.scene = self._tuned(scene)
+        self._cached = self._gain_covariances(scene)
+        self.scene = self._tune_share_and_noise(scene)
         constant = float(self.scene.visibility.constant)
-        self._factor(constant, self.scene.log_noise, scene.quadrature)
-        self.share = self._constant(constant, scene.quadrature)
+        self._factor_covariance(constant, self.scene.log_noise, scene.quadrature)
+        self.share = self._constant_scale(constant, scene.quadrature)
         self.root = self._own.root
         self.white = self.root @ self.target
         # Two matrices (2 n, 2 n) go; the root is all that is asked from here on.
         del self._cached, self._own
 
-    def _parts(self, scene: Scene) -> tuple[Tensor, Tensor]:
+    def _gain_covariances(self, scene: Scene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
         varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
         across = stack_real_imag(scaled)[1]
         return varying.source_gram.matrix, quadrature_variances(scene.quadrature)[1] * (across @ across.T)
 
-    def _tuned(self, scene: Scene) -> Scene:
+    def _tune_share_and_noise(self, scene: Scene) -> Scene:
         """Constant share and noise by likelihood, in turn on a grid."""
         columns = stack_real_imag(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
         kernel, noise = scene.visibility, scene.log_noise
         # The nearest on the grid, from which steps go either way.
         constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
 
-        def cost(constant: float, noise: float) -> float:
-            self._factor(constant, noise, scene.quadrature)
-            whitened = self._own.whiten(columns * self._constant(constant, scene.quadrature))
+        def nll(constant: float, noise: float) -> float:
+            self._factor_covariance(constant, noise, scene.quadrature)
+            whitened = self._own.whiten(columns * self._constant_scale(constant, scene.quadrature))
             white = self._own.whiten(self.target[:, None])[:, 0]
-            return _cost(whitened, white, self._determinant).item()
+            return _nll(whitened, white, self._determinant).item()
 
-        best = cost(constant, noise)
+        best = nll(constant, noise)
         # Twice: the likeliest noise moves with the constant share, and the share with it.
         for _ in range(2):
             place = CONSTANTS.index(constant)
             for direction in (-1, 1):
                 at = place + direction
-                while 0 <= at < len(CONSTANTS) and (new := cost(CONSTANTS[at], noise)) < best:
+                while 0 <= at < len(CONSTANTS) and (new := nll(CONSTANTS[at], noise)) < best:
                     best, constant, at = new, CONSTANTS[at], at + direction
             for step in (-math.log(TRIED), math.log(TRIED)):
-                while noise + step > math.log(LEAST_NOISE) and (new := cost(constant, noise + step)) < best:
+                while noise + step > math.log(LEAST_NOISE) and (new := nll(constant, noise + step)) < best:
                     best, noise = new, noise + step
         return replace(scene, visibility=replace(kernel, constant=constant), log_noise=noise)
 
-    def _factor(self, constant: float, noise: float, quadrature: float) -> None:
+    def _factor_covariance(self, constant: float, noise: float, quadrature: float) -> None:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
         # Half of the variance in the real parts, half in the imaginary ones.
@@ -96,7 +96,7 @@ class ClutterLikelihood:
         self._determinant = 0.5 * float(self._own.log_determinant)
 
     @staticmethod
-    def _constant(constant: float, quadrature: float) -> float:
+    def _constant_scale(constant: float, quadrature: float) -> float:
         return math.sqrt(constant * (1 - quadrature / 2))
 
     # ---- the constant part ----
@@ -109,12 +109,12 @@ class ClutterLikelihood:
 
     def nll(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
         """Return the negative log likelihood (), in nats; differentiable."""
-        return _cost(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
+        return _nll(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
 
-    def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
+    def make_scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
         """Return a scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
-        inner, seen = _inner(columns, self.white)
+        inner, seen = _gram_and_product(columns, self.white)
         own = Factor.from_gram(inner)
         mean, projection = own.solve(seen[:, None])[:, 0].float(), own.whiten(columns.T.double()).float()
         gains = mean * self.share * log_amplitude.exp()
@@ -132,18 +132,18 @@ class CandidateScorer:
         self.root, self.projection, self.residual, self.gains = root, projection, residual, gains
 
     @property
-    def alpha(self) -> Tensor:
+    def solved_residual(self) -> Tensor:
         """K^-1 y (n,) complex64, constant parts removed."""
         n = len(self.residual) // 2
         both = self.root.T @ self.residual
         return torch.complex(both[:n], both[n:])
 
     @property
-    def scale(self) -> Tensor:
+    def precision_diagonal(self) -> Tensor:
         """Diagonal of K^-1 (n,), mean of both parts."""
         return self.root.square().sum(0).view(2, -1).mean(0)
 
-    def gain_of_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
+    def gains_of_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
         """Return the log likelihood (m,) [nats] that m candidates gain by adding waves times their shares.
 
         Args:
@@ -156,10 +156,10 @@ class CandidateScorer:
             raise_if_cancelled()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
-            scores.append(self.gain_of_multiples(torch.complex(*change))[0])
+            scores.append(self.gains_and_multiples(torch.complex(*change))[0])
         return torch.cat(scores)
 
-    def gain_of_multiples(self, change: Tensor) -> tuple[Tensor, Tensor]:
+    def gains_and_multiples(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """Return nats (M,) float32 that positive multiples (M,) of complex changes (n, M) gain, and these."""
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
@@ -168,7 +168,7 @@ class CandidateScorer:
         multiple = torch.where(power > NEGLIGIBLE, matched / power.clamp_min(NEGLIGIBLE), 0.0)
         return multiple * matched / 2, multiple
 
-    def gain_of_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
+    def gains_and_amplitudes(self, waves: Tensor) -> tuple[Tensor, Tensor]:
         """Return nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
         parts = [self.root @ part for part in stack_real_imag(waves)]
         seen = [self.projection @ part for part in parts]
@@ -207,7 +207,7 @@ class UnexplainedRows:
     generator: torch.Generator
 
 
-def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
+def _gram_and_product(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
     """`I + C^T C` (K, K) and `C^T y` (K,), float64, of whitened columns (2 n, K) and targets (2 n,).
 
     Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
@@ -217,8 +217,8 @@ def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
     return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
 
 
-def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
-    inner, seen = _inner(columns, white)
+def _nll(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
+    inner, seen = _gram_and_product(columns, white)
     own = Factor.from_gram(inner)
     explained = white.double().square().sum() - own.whiten(seen[:, None]).square().sum()
     return determinant + 0.5 * (own.log_determinant + explained)

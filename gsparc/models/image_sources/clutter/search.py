@@ -79,12 +79,12 @@ class _ClutterSearcher:
         self.residual.waves = self.waves
         self.nll = self.residual.nll(self.visible, scene.log_amplitude).item()
 
-    def _left(self) -> UnexplainedRows:
-        scorer = self.residual.scorer(self.visible, self.scene.log_amplitude)
+    def _unexplained_rows(self) -> UnexplainedRows:
+        scorer = self.residual.make_scorer(self.visible, self.scene.log_amplitude)
         waves = self.waves * self.visible.T
         return UnexplainedRows(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
-    def _try(self, scene: Scene, parameters: int, refactor: bool = False) -> bool:
+    def _try_scene(self, scene: Scene, parameters: int, refactor: bool = False) -> bool:
         """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
 
         Varying part and noise are those last factored; with `refactor` they are the new scene's, since the
@@ -92,19 +92,19 @@ class _ClutterSearcher:
         """
         nll, least = self.nll, parameters * self.parameter_cost
 
-        def change() -> None:
+        def descend_from_scene() -> None:
             self._set_scene(scene)
             self._descend(6)
             if refactor and self.nll < nll - least:
                 self._refactor(self.scene)
 
-        return self._changed(change, least)
+        return self._keep_if_better(descend_from_scene, least)
 
-    def _changed(self, change: Callable[[], None], least: float) -> bool:
-        """Change something, and undo it where that gains fewer than `least` nats."""
+    def _keep_if_better(self, change: Callable[[], None], min_gain: float) -> bool:
+        """Change something, and undo it where that gains fewer than `min_gain` nats."""
         residual, before, nll = self.residual, self.scene, self.nll
         change()
-        if self.nll < nll - least:
+        if self.nll < nll - min_gain:
             return True
         self.residual = residual
         self._set_scene(before)
@@ -123,7 +123,7 @@ class _ClutterSearcher:
             with cancel_when(out_of_time):  # within a step, too
                 for epoch in range(EPOCHS):
                     before = self.nll
-                    self._improve()
+                    self._run_round()
                     best = min(best, self.whole, key=lambda b: b[0])
                     log.debug(
                         "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
@@ -138,23 +138,23 @@ class _ClutterSearcher:
             best = min(best, self.whole, key=lambda b: b[0])
         return best[1]
 
-    def _improve(self) -> None:
+    def _run_round(self) -> None:
         """One round of everything; what each step leaves is `whole`."""
-        for step in (self._mirrors, self._patches, self._boxes, self._sequences, self._settle):
+        for step in (self._try_mirrors, self._try_patches, self._try_boxes, self._try_sequences, self._prune):
             step()
             self.whole = self.nll, self.scene
 
-    def _settle(self) -> None:
+    def _prune(self) -> None:
         """Move what there is, drop what the likelihood no longer supports, and factor anew."""
         self._descend(10)
-        self._drop()
+        self._drop_clutter()
         self._refactor(self.scene)
         self._refactor(refine_scene(self.rows, self.scene, STEPS))
 
-    def _mirrors(self) -> None:
+    def _try_mirrors(self) -> None:
         """Try small mirrors, each with its best sequences."""
         added: list[SmallMirror] = []
-        for mirror in find_small_mirrors(self._left(), 2 * MIRRORS):
+        for mirror in find_small_mirrors(self._unexplained_rows(), 2 * MIRRORS):
             if len(added) == MIRRORS or mirror.score < MIN_GAIN:
                 break
             double = any(mirror.overlaps(other, self.wavelength) for other in added)
@@ -168,31 +168,31 @@ class _ClutterSearcher:
         sequences += [(wall, number) for wall in scene.walls] + [(number, wall) for wall in scene.walls]
         clutter = scene.clutter.add_patch(mirror.patch, number)
         trial = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter)
-        return self._add(trial, sequences, 1.5, MIRROR, len(sequences))
+        return self._add_sequences(trial, sequences, 1.5, MIRROR, len(sequences))
 
-    def _add(
-        self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, most: int
+    def _add_sequences(
+        self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, limit: int
     ) -> bool:
         """Try sequences of at least `min_score` nats, on a scene of so many more parameters of planes."""
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
-        scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
+        scorer = self.residual.make_scorer(hidden, self.scene.log_amplitude)
         new = scene.replace_sequences(sequences)
         paths = new.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
-        scores, gains = scorer.gain_of_waves(new.unobstructed_waves(self.rows) * seen.T)
+        scores, gains = scorer.gains_and_amplitudes(new.unobstructed_waves(self.rows) * seen.T)
         chosen = select_separated(
-            new.sources, scores, 0.5 * self.wavelength, most, min_score, self.scene.sources
+            new.sources, scores, 0.5 * self.wavelength, limit, min_score, self.scene.sources
         )
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
         more = [sequences[i] for i in chosen]
-        return self._try(scene.add_sequences(more, strong, gains[chosen].angle()), parameters)
+        return self._try_scene(scene.add_sequences(more, strong, gains[chosen].angle()), parameters)
 
-    def _patches(self) -> None:
+    def _try_patches(self) -> None:
         """Try patches on infinite mirrors."""
-        left, patches = self._left(), []
+        left, patches = self._unexplained_rows(), []
         for number in set(range(len(self.scene.planes))) - set(self.scene.clutter.plane):
             patch, score = find_patch(left, number)
             patches.append((score, number, patch))
@@ -204,31 +204,32 @@ class _ClutterSearcher:
             louder[own] = louder[own].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.add_patch(patch, number)
             trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
-            self._try(trial, PATCH, refactor=True)
+            self._try_scene(trial, PATCH, refactor=True)
 
-    def _boxes(self) -> None:
+    def _try_boxes(self) -> None:
         for _ in range(BOXES):
-            box, score = find_occluding_box(self._left())
+            box, score = find_occluding_box(self._unexplained_rows())
             if score < MIN_GAIN:
                 break
-            if not self._try(replace(self.scene, clutter=self.scene.clutter.add_box(box)), BOX):
+            if not self._try_scene(replace(self.scene, clutter=self.scene.clutter.add_box(box)), BOX):
                 break
 
-    def _sequences(self) -> None:
+    def _try_sequences(self) -> None:
         """Try more sequences over the present planes."""
         scene, sequences = self.scene, self.scene.longer_sequences(ORDER)
         if not sequences:
             return
-        scores, _ = self._left().scorer.gain_of_waves(
+        scores, _ = self._unexplained_rows().scorer.gains_and_amplitudes(
             scene.replace_sequences(sequences).unobstructed_waves(self.rows)
         )
         best = scores.topk(min(60, len(sequences))).indices.tolist()
-        self._add(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
+        self._add_sequences(scene, [sequences[i] for i in best], 6.0, SEQUENCE, SEQUENCES)
 
-    def _drop(self) -> None:
+    def _drop_clutter(self) -> None:
         """Remove clutter that the likelihood no longer supports."""
         number = 0
         while number < len(clutter := self.scene.clutter):
             parameters = BOX if number < len(clutter.boxes) else PATCH
             less = replace(self.scene, clutter=clutter.remove_piece(number))
-            number += not self._changed(partial(self._set_scene, less), -parameters * self.parameter_cost)
+            cost = parameters * self.parameter_cost
+            number += not self._keep_if_better(partial(self._set_scene, less), -cost)

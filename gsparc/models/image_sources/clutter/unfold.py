@@ -45,7 +45,7 @@ class Paths:
         """(K, n, L, 3) of each leg [m]."""
         return self.points[:, :, 1:]
 
-    def take(self, sequences: Tensor | list[int]) -> Paths:
+    def select_sequences(self, sequences: Tensor | list[int]) -> Paths:
         """Return the paths of some sequences."""
         return Paths(self.points[sequences], self.plane[sequences], self.valid[sequences])
 
@@ -103,15 +103,15 @@ class Unfolding:
             points.append(here)
         points.append(self.chain[0].expand_as(here))
         chosen = valid.int().argmax(1)  # the first valid variant, else the first
-        plane = _pick(self.plane.expand(*shape, -1), chosen)
-        return Paths(_pick(torch.stack(points, -2), chosen), plane, valid.any(1))
+        plane = _select_variants(self.plane.expand(*shape, -1), chosen)
+        return Paths(_select_variants(torch.stack(points, -2), chosen), plane, valid.any(1))
 
 
-def _pick(values: Tensor, chosen: Tensor) -> Tensor:
-    """(K, M, n, ...) at variant `chosen` (K, n)."""
+def _select_variants(values: Tensor, variants: Tensor) -> Tensor:
+    """(K, M, n, ...) at variant `variants` (K, n)."""
     if values.shape[1] == 1:
         return values[:, 0]
-    index = chosen[:, None]
+    index = variants[:, None]
     while index.dim() < values.dim():
         index = index[..., None]
     return values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]

@@ -57,18 +57,18 @@ class Mirrors:
             origin: (3,) float64 [m], of the frame in the file's coordinates.
         """
         faces = [face - origin for face in walls.faces]
-        grouped = _by_plane(faces)
+        grouped = _group_by_plane(faces)
         planes = torch.cat([NO_PLANES, *(torch.from_numpy(plane)[None] for plane, _ in grouped)])
         patches: list[Tensor] = []
         indices: list[int] = []
         for number, (_, members) in enumerate(grouped):
             along = plane_tangents(planes[number]).double()
-            for part in _touching(members):
+            for part in _join_touching(members):
                 ends = torch.from_numpy(part) @ along.T
                 patches.append(torch.cat([ends.amin(0), ends.amax(0)]))
                 indices.append(number)
         rectangles = torch.stack(patches) if patches else torch.zeros(0, PATCH).double()
-        size = _sides(rectangles).prod(1)
+        size = _side_lengths(rectangles).prod(1)
         top = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
         boxes = torch.from_numpy(walls.boxes - origin).flatten(1).float()
         plane = tuple(indices[i] for i in top)
@@ -79,7 +79,7 @@ class Mirrors:
 
         Others only block.
         """
-        sides = _sides(self.clutter.patches)
+        sides = _side_lengths(self.clutter.patches)
         size: dict[int, float] = {}
         for plane, (one, other) in zip(self.clutter.plane, sides.tolist(), strict=True):
             if min(one, other) >= smallest:
@@ -91,42 +91,42 @@ class Mirrors:
         return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
 
     def visible_sequences(
-        self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, most: int, hidden: bool
+        self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, limit: int, hidden: bool
     ) -> tuple[Reflections, ...]:
-        """Return at most `most` sequences, the static end's own first, then by power expected at the places.
+        """Return at most `limit` sequences, the static end's own first, then by power expected at the places.
 
         Args:
             indices: planes that mirror, the largest first.
             transmitter: (3,) float64 [m].
             places: (n, 3) float64 [m] of receivers.
             order: largest number of reflections.
-            most: sequences.
+            limit: sequences.
             hidden: whether walls end and hide; else every image is seen from everywhere.
         """
         places = places[torch.linspace(0, len(places) - 1, min(LOOKED_FROM, len(places))).long()]
         candidates = [
             sequence
             for length in range(1, order + 1)
-            for sequence in all_sequences(indices[: most_mirrors(len(indices), length)], length)
+            for sequence in all_sequences(indices[: limit_mirrors(len(indices), length)], length)
             if len(sequence) == length
         ]
-        sequences = _distinct(candidates, transmitter, self.planes)
-        if not sequences or most < 2:
+        sequences = _drop_doubles(candidates, transmitter, self.planes)
+        if not sequences or limit < 2:
             return ((),)
 
-        def each(said: Callable[..., Tensor], numbers: Tensor) -> Tensor:
+        def evaluate_parts(evaluate: Callable[..., Tensor], numbers: Tensor) -> Tensor:
             """What is said of some sequences."""
             parts = ([sequences[i] for i in part.tolist()] for part in numbers.split(AT_ONCE))
-            return torch.cat([said(part, transmitter, places, hidden) for part in parts])
+            return torch.cat([evaluate(part, transmitter, places, hidden) for part in parts])
 
-        scores = each(self._power, torch.arange(len(sequences)))
-        best = scores.topk(min(SHORTLIST * most, len(sequences))).indices
+        scores = evaluate_parts(self._expected_powers, torch.arange(len(sequences)))
+        best = scores.topk(min(SHORTLIST * limit, len(sequences))).indices
         best = best[scores[best] > 0]
         if hidden and len(best):
-            seen = each(self._share, best)
+            seen = evaluate_parts(self._mean_visible_shares, best)
             best, power = best[seen > SEEN], (scores[best] * seen)[seen > SEEN]
             best = best[power.argsort(descending=True)]
-        return ((), *(sequences[i] for i in best[: most - 1].tolist()))
+        return ((), *(sequences[i] for i in best[: limit - 1].tolist()))
 
     def obstacles_of(
         self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor
@@ -143,7 +143,7 @@ class Mirrors:
         kept = tuple(clutter.plane[i] for i in numbers)
         return replace(clutter, patches=clutter.patches[numbers], plane=kept)
 
-    def _power(
+    def _expected_powers(
         self, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
     ) -> Tensor:
         """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them; nothing hides."""
@@ -152,10 +152,10 @@ class Mirrors:
         order = torch.tensor([len(sequence) for sequence in sequences])
         power = away.square().reciprocal()
         if hidden:
-            power = power * self._reflected(self.paths(sequences, transmitter, places))
+            power = power * self._are_reflected(self.paths(sequences, transmitter, places))
         return power.mean(1) * REFLECTED ** (2 * order)
 
-    def _reflected(self, paths: Paths) -> Tensor:
+    def _are_reflected(self, paths: Paths) -> Tensor:
         """Whether (W, n) every leg of a sequence ends on a rectangle of its plane, as 0 and 1."""
         inside = paths.plane < 0
         for patch, plane in zip(self.clutter.patches, self.clutter.plane, strict=True):
@@ -165,12 +165,12 @@ class Mirrors:
                 inside[here] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
         return (inside.all(-1) & paths.valid).float()
 
-    def _share(self, sequences: list[Reflections], *ends: Tensor) -> Tensor:
+    def _mean_visible_shares(self, sequences: list[Reflections], *ends: Tensor) -> Tensor:
         """Mean visible share (W,) of sequences, walls and boxes in the way included."""
         return visible_share(self.paths(sequences, *ends[:2]), self.clutter, self.planes).mean(1)
 
 
-def walls_of_file(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
+def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray | None) -> Walls:
     """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     known = Mirrors.from_walls(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
@@ -178,17 +178,17 @@ def walls_of_file(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | Non
     normal, offset = hesse_form(planes)
     axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
     corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
-    end = torch.from_numpy(np.zeros(0) if still is None else still).double()
-    return Walls(axes, corners, _sides(patches), end)
+    end = torch.from_numpy(np.zeros(0) if static_end is None else static_end).double()
+    return Walls(axes, corners, _side_lengths(patches), end)
 
 
-def _sides(patches: Tensor) -> Tensor:
+def _side_lengths(patches: Tensor) -> Tensor:
     """Lengths (Q, 2) [m] of patches (Q, 4)."""
     low, high = patches.chunk(2, 1)
     return high - low
 
 
-def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+def _group_by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
     """Planes (4,) and the faces on each; the largest face gives the plane."""
     planes: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for face in sorted(faces, key=polygon_area, reverse=True):
@@ -204,7 +204,7 @@ def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray
     return planes
 
 
-def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
+def _join_touching(faces: list[np.ndarray]) -> list[np.ndarray]:
     """Corners (C, 3) of each group of faces that share corners."""
     face = np.repeat(np.arange(len(faces)), [len(corners) for corners in faces])
     corners = np.concatenate(faces)
@@ -214,7 +214,7 @@ def _touching(faces: list[np.ndarray]) -> list[np.ndarray]:
     return [corners[group[face] == number] for number in range(count)]
 
 
-def most_mirrors(mirrors: int, length: int) -> int:
+def limit_mirrors(mirrors: int, length: int) -> int:
     """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences of so many reflections."""
     count = mirrors
     while count > 1 and count * (count - 1) ** (length - 1) > MOST_SEQUENCES:
@@ -222,7 +222,7 @@ def most_mirrors(mirrors: int, length: int) -> int:
     return count
 
 
-def _distinct(sequences: list[Reflections], transmitter: Tensor, planes: Tensor) -> list[Reflections]:
+def _drop_doubles(sequences: list[Reflections], transmitter: Tensor, planes: Tensor) -> list[Reflections]:
     """One sequence of each image: perpendicular mirrors have the same in both orders."""
     if not sequences:
         return []

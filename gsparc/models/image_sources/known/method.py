@@ -13,9 +13,9 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.search import INITIAL_KERNEL
-from gsparc.models.image_sources.ensemble import Look, Member, left_out_nmse, shares_occlusion
+from gsparc.models.image_sources.ensemble import Look, Member, left_out_nmse, occludes_antennas_alike
 from gsparc.models.image_sources.gp_likelihood import estimate_phases
-from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, log_amplitudes, most_mirrors
+from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, limit_mirrors, log_amplitudes
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
@@ -47,8 +47,8 @@ class KnownWallsGP(ImageSourceGP):
 
     name = "known_walls"
 
-    def __init__(self, walls: SceneWalls, **rest: Any) -> None:
-        super().__init__(**{**rest, "searches": 1})
+    def __init__(self, walls: SceneWalls, **settings: Any) -> None:
+        super().__init__(**{**settings, "searches": 1})
         self.walls = walls
         self.kernel = KERNEL if self.settings.clutter else KernelVisibility()
 
@@ -57,24 +57,24 @@ class KnownWallsGP(ImageSourceGP):
         """See `Method`; what was found needs no walls to answer."""
         return ImageSourceGP
 
-    def _search(
+    def _run_searches(
         self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
         look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search, so that nothing is looked at or started from."""
         rows = row_sets[0]
-        given = self._scene(rows, settings)
+        given = self._initial_scene(rows, settings)
 
-        def cost(moved: Scene) -> Tensor:
-            assert moved.phase is not None
-            near = walls_prior_cost(given.planes, given.sequences, moved.planes, moved.log_amplitude)
-            return near + prior.cost(moved.phase, given.sequences)
+        def negative_log_prior(scene: Scene) -> Tensor:
+            assert scene.phase is not None
+            near = walls_prior_cost(given.planes, given.sequences, scene.planes, scene.log_amplitude)
+            return near + prior.negative_log_density(scene.phase, given.sequences)
 
         with end_when(budget.is_spent):
             scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
             scene = learn_visibility(rows, scene, self.kernel)
             prior = ReflectionPhasePrior.from_scene(scene)
-            scene = refine_scene(rows, scene, settings.final_steps, cost)
+            scene = refine_scene(rows, scene, settings.final_steps, negative_log_prior)
         error = left_out_nmse(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",
@@ -82,10 +82,10 @@ class KnownWallsGP(ImageSourceGP):
         )  # fmt: skip
         return [Member(scene, error)]
 
-    def _scene(self, rows: Rows, settings: SearchSettings) -> Scene:
+    def _initial_scene(self, rows: Rows, settings: SearchSettings) -> Scene:
         """The static end and its images that some receiver sees, with amplitudes to start from."""
         assert self.site is not None
-        transmitter = self._transmitter()
+        transmitter = self._transmitter_in_frame()
         mirrors = Mirrors.from_walls(self.walls, self.site.origin + self.frame.middle.numpy())
         if mirrors.left_out:
             log.info(
@@ -93,10 +93,10 @@ class KnownWallsGP(ImageSourceGP):
             )
         indices = mirrors.large_planes(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
         order = settings.order
-        if order > 1 and most_mirrors(len(indices), order) < len(indices):
-            few = most_mirrors(len(indices), order)
+        if order > 1 and limit_mirrors(len(indices), order) < len(indices):
+            few = limit_mirrors(len(indices), order)
             log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
-        hidden = settings.clutter and shares_occlusion(rows)
+        hidden = settings.clutter and occludes_antennas_alike(rows)
         ends = transmitter, rows.position
         sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
         obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.empty()
@@ -143,13 +143,13 @@ class ReflectionPhasePrior:
         share = min(max(share, 0.0), 0.97)
         return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
 
-    def expected(self, first: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
+    def expected_phases(self, direct_phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """Return phases (K,) of sequences, given the transmitter's own."""
-        return first + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
+        return direct_phase + self.turn * torch.tensor([float(len(sequence)) for sequence in sequences])
 
-    def cost(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
+    def negative_log_density(self, phase: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """Return the negative log prior of phases (K,), the transmitter's first."""
-        return self.concentration * (1 - (phase - self.expected(phase[0], sequences)).cos()).sum()
+        return self.concentration * (1 - (phase - self.expected_phases(phase[0], sequences)).cos()).sum()
 
 
 def walls_prior_cost(

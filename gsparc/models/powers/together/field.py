@@ -31,8 +31,8 @@ from gsparc.models.powers.together.learning import (
     learn_station_priors,
 )
 from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
-from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations, station_places
-from gsparc.models.target_rows import entry_variance, from_real
+from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, rows_of_stations
+from gsparc.models.target_rows import to_entry_variance, to_targets
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.places import moving_end, other_end
@@ -94,7 +94,7 @@ class JointPowerField(ClosedForm):
     def _learn(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the processes and what they share; what must be said of them."""
         assert data.site.stations is not None
-        self.places, notes = station_places(data, rows)
+        self.places, notes = places_and_notes(data, rows)
         used = rows_of_stations(data, rows, self.places)
         network = find_sectors(data, self.places)
         if network is None:
@@ -119,7 +119,7 @@ class JointPowerField(ClosedForm):
             f"{after:.3g} dB with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
         )
         if terms.place_db:
-            self.unheard = terms.known_at(used, PLACES, self.seed)
+            self.unheard = terms.set_inducing(used, PLACES, self.seed)
         return (*notes, *remarks)
 
     @property
@@ -145,7 +145,7 @@ class JointPowerField(ClosedForm):
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
             elsewhere = self.own.condition(used.thin_rows(UNHEARD_EACH, self.seed), self.unheard, self.seed)
-        self.elsewhere = self._elsewhere((elsewhere.factor, elsewhere.mean))
+        self.elsewhere = self._unheard_posterior((elsewhere.factor, elsewhere.mean))
         self.whole = max(float(used.heard_rows.decibels.var()), self.own.variance)
         self.rows = {n: torch.from_numpy(used.select_station(n).measured_rows.index) for n in used.stations}
 
@@ -157,8 +157,8 @@ class JointPowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        posterior, elsewhere = self._conditioned()
-        places, number = self._by_process(*self._ends(query))
+        posterior, elsewhere = self._require_posteriors()
+        places, number = self._process_places(*self._places_and_stations(query))
         mean = torch.zeros(len(places), dtype=torch.float64)
         spread, share = torch.zeros_like(mean), torch.zeros_like(mean)
         heard = torch.isin(number, torch.tensor([*posterior.processes]))
@@ -167,10 +167,10 @@ class JointPowerField(ClosedForm):
             if chosen.any():
                 mean[chosen], left = of.answer(places[chosen], number[chosen], exact)
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
-        share = (share + self._by_law(moving_end(places))).clamp_max(1.0)
+        share = (share + self._law_share(moving_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
-        power = self._power(mean)
-        return Prediction(power, entry_variance(spread, power, "rssi"), share)
+        power = self._to_powers(mean)
+        return Prediction(power, to_entry_variance(spread, power, "rssi"), share)
 
     @torch.no_grad()
     def predict_joint(self, moving: Tensor, stations: Tensor) -> JointLevels:
@@ -180,10 +180,10 @@ class JointPowerField(ClosedForm):
             moving: (G, k, 3) places of the moving end [m].
             stations: (k,) int64, of each place of a group: several of one place, or one of several.
         """
-        posterior, elsewhere = self._conditioned()
+        posterior, elsewhere = self._require_posteriors()
         still = torch.from_numpy(self.places)[stations].expand_as(moving)
         places = torch.cat([moving.double(), still], 2).flatten(0, 1)
-        places, number = self._by_process(places, stations.repeat(len(moving)))
+        places, number = self._process_places(places, stations.repeat(len(moving)))
         places, number = places.unflatten(0, moving.shape[:2]), number[: len(stations)]
         groups, count = moving.shape[:2]
         mean, noise = torch.zeros(groups, count).double(), torch.zeros(count).double()
@@ -203,15 +203,15 @@ class JointPowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        posterior, _ = self._conditioned()
+        posterior, _ = self._require_posteriors()
         means, spreads = [], []
         for number, process in posterior.processes.items():
             error, variance = posterior.left_out(number)
             loud = process.extra == 0
             means.append((process.given_values()[:, 0] - error)[loud])
             spreads.append(variance[loud])
-        mean = self._power(torch.cat(means).float())
-        variance = entry_variance(torch.cat(spreads).float(), mean, "rssi")
+        mean = self._to_powers(torch.cat(means).float())
+        variance = to_entry_variance(torch.cat(spreads).float(), mean, "rssi")
         return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), mean, variance)
 
     def state(self) -> dict[str, Any]:
@@ -242,9 +242,9 @@ class JointPowerField(ClosedForm):
             processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
             weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
             self.posterior = SharedTermsPosterior(processes, never, self.heard.columns, weights[0])
-            self.elsewhere = self._elsewhere(weights[1])
+            self.elsewhere = self._unheard_posterior(weights[1])
 
-    def _elsewhere(self, weights: tuple[Factor, Tensor]) -> SharedTermsPosterior:
+    def _unheard_posterior(self, weights: tuple[Factor, Tensor]) -> SharedTermsPosterior:
         """What is said of stations that have no rows; of a network's, of a sector without pattern, too."""
         never, network = self.own.never, self.network
         never = never if network is None else replace(never, trend=network.add_sectors(ROUND))
@@ -261,7 +261,7 @@ class JointPowerField(ClosedForm):
             DataError: azimuths, and this is no network.
             ValueError: before `condition`.
         """
-        _, elsewhere = self._conditioned()
+        _, elsewhere = self._require_posteriors()
         result, network = copy(self), self.network
         result.places = np.concatenate([self.places, np.tile(place, (len(sectors), 1))])
         if network is None and (sectors[:, 0] != NO_AZIMUTH).any():
@@ -269,15 +269,15 @@ class JointPowerField(ClosedForm):
         if network is not None:
             never = replace(self.own.never, trend=network.add_sectors(sectors))
             result.own = replace(self.own, never=never)
-        result.elsewhere = result._elsewhere((elsewhere.factor, elsewhere.mean))
+        result.elsewhere = result._unheard_posterior((elsewhere.factor, elsewhere.mean))
         return result
 
-    def _conditioned(self) -> tuple[SharedTermsPosterior, SharedTermsPosterior]:
+    def _require_posteriors(self) -> tuple[SharedTermsPosterior, SharedTermsPosterior]:
         if self.posterior is None or self.elsewhere is None:
             raise ValueError("a field of powers: condition it first")
         return self.posterior, self.elsewhere
 
-    def _ends(self, query: Query) -> tuple[Tensor, Tensor]:
+    def _places_and_stations(self, query: Query) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
         sender = query.tx.cpu().double()
         receiver = query.rx.position.expand(len(query), -1).cpu().double()
@@ -287,13 +287,13 @@ class JointPowerField(ClosedForm):
             number = query.station.cpu().long()
             still = torch.where(number[:, None] >= 0, table[number.clamp_min(0)], still)
             return torch.cat([moving, still], 1), number
-        number = self._standing(still)
-        turned = (number < 0) & (self._standing(moving) >= 0)  # asked the other way round
+        number = self._station_at(still)
+        turned = (number < 0) & (self._station_at(moving) >= 0)  # asked the other way round
         here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
         places = torch.where(turned[:, None], there, here)
-        return places, self._standing(other_end(places))
+        return places, self._station_at(other_end(places))
 
-    def _by_process(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+    def _process_places(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
         """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
         if self.network is None:
             return places, number
@@ -301,13 +301,13 @@ class JointPowerField(ClosedForm):
         sector = torch.where(number < 0, len(self.network.table), number)  # the last, without a pattern
         return torch.cat([places, sector[:, None]], 1), torch.where(number < 0, NEVER, site)
 
-    def _by_law(self, moving: Tensor) -> Tensor:
+    def _law_share(self, moving: Tensor) -> Tensor:
         """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.
 
         Its slope says nothing of places far from all data.
         """
         if self._reach is None:
-            posterior, _ = self._conditioned()
+            posterior, _ = self._require_posteriors()
             known = torch.cat([moving_end(one.rows) for one in posterior.processes.values()]).numpy()
             self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), TINY_M)
         tree, reach = self._reach
@@ -315,14 +315,14 @@ class JointPowerField(ClosedForm):
         law = max(1 - self.own.variance / self.whole, 0.0)
         return law * (1 - (-(far / reach).square()).exp())
 
-    def _standing(self, places: Tensor) -> Tensor:
+    def _station_at(self, places: Tensor) -> Tensor:
         """Numbers (B,) of the stations at places (B, 3), negative where none stands."""
         table = torch.from_numpy(self.places).nan_to_num(math.inf)
         apart, number = torch.cdist(places.detach(), table).min(1)
         return torch.where(apart <= SAME_PLACE_M, number, NEVER)
 
-    def _power(self, decibels: Tensor) -> Tensor:
-        return from_real(decibels[:, None], "rssi", (1,))
+    def _to_powers(self, decibels: Tensor) -> Tensor:
+        return to_targets(decibels[:, None], "rssi", (1,))
 
 
 def rows_per_station(stations: int) -> int:

@@ -94,11 +94,11 @@ def learn_station_priors(
     Searches end with what they have when the budget is over; single stations then have no settings of
     their own.
     """
-    trend, notes = _site_law(rows, seed)
+    trend, notes = _fit_site_law(rows, seed)
     heard = rows.heard_rows
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else end_when(budget.is_spent):
-        kernel, priors = _common_settings(heard, trend, seed)
+        kernel, priors = _fit_common_kernel(heard, trend, seed)
         if budget is not None and budget.is_spent():
             numbers = []
         for number in numbers:
@@ -109,7 +109,7 @@ def learn_station_priors(
     return StationPriors(Prior(kernel, trend), priors), notes
 
 
-def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
+def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     """The law of all stations, of their median level, and what must be said of it."""
     few = rows.thin_rows(LEARNED_EACH, seed)
     law = fit_law(few, None)
@@ -123,7 +123,7 @@ def _site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
 
 
-def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
+def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thin_rows(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
     views = {number: few.select_station(number).distances_terms_values(trend) for number in few.stations}
@@ -132,15 +132,15 @@ def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kerne
     middle = float(np.median(far.numpy())) or 1.0
     start = Kernel.from_lengths([length * middle for length in START.lengths], START.shares, START.noise)
 
-    def density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
+    def left_out_density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
         distance, columns, values = views[number]
         return LeftOutDensity.apply(covariance_of(start.with_values(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
 
-    def objective(at: Tensor) -> Tensor:
-        return torch.stack([density(at, number)[0] for number in views]).sum() / len(few.places)
+    def mean_density(at: Tensor) -> Tensor:
+        return torch.stack([left_out_density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    best, _ = minimise(objective, [start.parameters().numpy()], start.bounds(far), tolerance=SETTLED)
-    logs = np.log([float(density(torch.from_numpy(best), number)[1]) for number in views])
+    best, _ = minimise(mean_density, [start.parameters().numpy()], start.bounds(far), tolerance=SETTLED)
+    logs = np.log([float(left_out_density(torch.from_numpy(best), number)[1]) for number in views])
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
     logs = (count * logs + ALIKE * mean) / (count + ALIKE)
@@ -152,13 +152,13 @@ def _common_settings(heard: StationRows, trend: Trend, seed: int) -> tuple[Kerne
 
 
 def learn_shared_terms(
-    rows: StationRows, own: StationPriors, seed: int, budget: TimeBudget | None = None
+    rows: StationRows, priors: StationPriors, seed: int, budget: TimeBudget | None = None
 ) -> tuple[SharedTerms, float, ErrorGain | None]:
     """Return shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
         rows: of all stations.
-        own: of the stations' own processes.
+        priors: of the stations' own processes.
         seed: of rows and places drawn.
         budget: no further length is tried when it is over.
 
@@ -168,18 +168,18 @@ def learn_shared_terms(
     """
     heard = rows.heard_rows
     few = heard.thin_rows(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
-    short = min(own.never.kernel.lengths)
-    bare = SharedTerms.from_rows(few, own.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
+    short = min(priors.never.kernel.lengths)
+    bare = SharedTerms.from_rows(few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, None
-    processes = own.condition(few, bare, seed).processes
-    best = plain = bare, *_left_out(processes, bare)
+    processes = priors.condition(few, bare, seed).processes
+    best = plain = bare, *_left_out_errors(processes, bare)
     for length in LENGTHS:
         if length != LENGTHS[0] and budget is not None and budget.is_spent():
             break
         for share in PLACE:
-            terms = replace(bare, length=length * short, place_db=math.sqrt(share * own.variance))
-            result = _left_out(processes, terms)
+            terms = replace(bare, length=length * short, place_db=math.sqrt(share * priors.variance))
+            result = _left_out_errors(processes, terms)
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
     (_, errors, *_), (_, others, _, station) = best, plain
@@ -188,7 +188,9 @@ def learn_shared_terms(
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
 
 
-def _left_out(processes: Mapping[int, Exact], terms: SharedTerms) -> tuple[np.ndarray, float, np.ndarray]:
+def _left_out_errors(
+    processes: Mapping[int, Exact], terms: SharedTerms
+) -> tuple[np.ndarray, float, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
 
     Between them the mean square of errors without that constant over their predicted variances.

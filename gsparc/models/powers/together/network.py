@@ -135,11 +135,11 @@ def learn_network(
         levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
     )  # fmt: skip
     with nullcontext() if budget is None else end_when(budget.is_spent):
-        rough, gains, scale = _rough(few, start)
-        turned, notes = _turned(few, rough, gains, scale, names)
+        rough, gains, scale = _fit_rough(few, start)
+        turned, notes = _correct_azimuths(few, rough, gains, scale, names)
         if notes:
-            rough, gains, scale = _rough(few, turned)
-        trend, kernel = _by_evidence(rows, rough, gains, scale, seed)
+            rough, gains, scale = _fit_rough(few, turned)
+        trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
     shadowing = cast(SectorShadowing, kernel.terms[0])
     variances = (kernel.amplitude * float(part) for part in (*shadowing.shares, kernel.noise))
     (site, own, bearing, gain, noise), (wide, near) = map(math.sqrt, variances), shadowing.lengths
@@ -158,7 +158,7 @@ def learn_network(
     return Prior(kernel, trend), [law_note, *aimed, *notes]
 
 
-def _misfit(mean: Tensor, rows: StationRows, scale: Tensor) -> Tensor:
+def _misfits(mean: Tensor, rows: StationRows, scale: Tensor) -> Tensor:
     """Negative log likelihood of each row (..., n), independent of the others."""
     z = (torch.from_numpy(rows.decibels) - mean) / scale
     side = torch.from_numpy(rows.side)
@@ -166,7 +166,7 @@ def _misfit(mean: Tensor, rows: StationRows, scale: Tensor) -> Tensor:
     return torch.where(side != 0, beyond, 0.5 * z.square() + torch.log(scale))
 
 
-def _off(shared: Tensor) -> Tensor:
+def _penalty(shared: Tensor) -> Tensor:
     """Negative log prior of what sectors share."""
     return 0.5 * ((shared - SHARED) / SHARED_SPREAD).square().sum()
 
@@ -176,27 +176,31 @@ def _shared_bounds() -> list[tuple[float, float]]:
     return list(zip(*(end.tolist() for end in ends), strict=True))
 
 
-def _rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
+def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     """Shared parameters, gains (T,) and the deviation [dB] of rows taken as independent."""
     places, number = torch.from_numpy(rows.places), torch.from_numpy(sector_of(rows.places).astype(np.int64))
     bands, count = len(start.levels), len(start.table)
 
-    def objective(at: Tensor) -> Tensor:
+    def negative_log_posterior(at: Tensor) -> Tensor:
         shared, levels, scale, gains = at.split((len(SHARED), bands, 1, count))
         mean = start.powers_at(places, shared, levels) + gains[number]
-        return _misfit(mean, rows, scale.exp()).sum() + _off(shared) + 0.5 * (gains / GAIN_DB).square().sum()
+        return (
+            _misfits(mean, rows, scale.exp()).sum()
+            + _penalty(shared)
+            + 0.5 * (gains / GAIN_DB).square().sum()
+        )
 
     begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(2 * GAIN_DB), np.zeros(count)]
     free = [(-math.inf, math.inf)]
     # A deviation of 1 dB at least.
     bounds = [*_shared_bounds(), *free * bands, (0.0, math.inf), *free * count]
-    best, _ = minimise(objective, [begin], bounds, ROUGH_LOOKS)
+    best, _ = minimise(negative_log_posterior, [begin], bounds, ROUGH_LOOKS)
     shared, levels, scale, gains = torch.from_numpy(best).split((len(SHARED), bands, 1, count))
     return replace(start, shared=shared.clone(), levels=levels.clone()), gains, float(scale.exp())
 
 
 @torch.no_grad()
-def _turned(
+def _correct_azimuths(
     rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
 ) -> tuple[Sectors, list[str]]:
     """Azimuths that rows contradict turned to where they fit, and a note of each."""
@@ -209,7 +213,7 @@ def _turned(
         own = torch.cat([TURNS.double()[:, None], rest], 1)
         mean = trend.powers_at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
         levels = (gains[t] + GAINS)[:, None]
-        likely = _misfit(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
+        likely = _misfits(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
         likely = (likely + 0.5 * (levels[:, 0] / GAIN_DB).square()).amin(1)
         best = int(likely.argmin())
         gained, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
@@ -223,12 +227,12 @@ def _turned(
     return replace(trend, table=table), notes
 
 
-def _by_evidence(
+def _fit_by_evidence(
     rows: StationRows, rough: Sectors, gains: Tensor, scale: float, seed: int
 ) -> tuple[Sectors, Kernel]:
     """All settings of largest evidence of some rows of each site."""
-    rows, bands = _whole(rows), len(rough.levels)
-    parts = [_stretches(rows.select_station(number), LEARNED_ON, seed) for number in rows.stations]
+    rows, bands = _select_complete_places(rows), len(rough.levels)
+    parts = [_select_stretches(rows.select_station(number), LEARNED_ON, seed) for number in rows.stations]
     places = [torch.from_numpy(part.places) for part in parts]
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
@@ -239,9 +243,12 @@ def _by_evidence(
     start = _usual_kernel(rough, middle, max(scale**2, 1.0), max(float(gains.var()), 1.0))
     usual = start.parameters()
 
-    def objective(at: Tensor) -> Tensor:
+    def negative_log_evidence(at: Tensor) -> Tensor:
         shared, levels, logs = at.split((len(SHARED), bands, len(usual)))
-        total, kernel = _off(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(), start.with_values(logs)
+        total, kernel = (
+            _penalty(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(),
+            start.with_values(logs),
+        )
         for i, at_ in enumerate(places):
             gram, rest = own[i] + kernel.gram(at_), values[i] - rough.powers_at(at_, shared, levels)
             total = total + LogEvidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
@@ -250,7 +257,7 @@ def _by_evidence(
     *bounds, noise = start.terms[0].bounds(middle)
     bounds = [*_shared_bounds(), *[(-math.inf, math.inf)] * bands, *bounds, noise, noise]
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
-    best, _ = minimise(objective, [begin], bounds)
+    best, _ = minimise(negative_log_evidence, [begin], bounds)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
     learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.with_values(logs)
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
@@ -260,7 +267,7 @@ def _by_evidence(
             gram.diagonal()[quiet] += last[i][0].variance
         columns = Factor.from_gram(gram, "raise").whiten(learned.shared_columns(at_))
         precision += columns.T @ columns
-    doubt, kernel = Factor.from_gram(precision, "raise").root.T, _relative(kernel)
+    doubt, kernel = Factor.from_gram(precision, "raise").root.T, _to_unit_amplitude(kernel)
     return replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude)), kernel
 
 
@@ -272,7 +279,7 @@ def _usual_kernel(trend: Sectors, middle: float, variance: float, level: float) 
     return Kernel((signal, WhiteNoise(noise)))
 
 
-def _relative(kernel: Kernel) -> Kernel:
+def _to_unit_amplitude(kernel: Kernel) -> Kernel:
     """The same with parts relative to the amplitude."""
     signal = cast(SectorShadowing, kernel.terms[0])
     amplitude = sum(map(float, signal.shares))
@@ -280,7 +287,7 @@ def _relative(kernel: Kernel) -> Kernel:
     return Kernel((replace(signal, shares=shares), WhiteNoise(kernel.noise / amplitude)), amplitude)
 
 
-def _whole(rows: StationRows) -> StationRows:
+def _select_complete_places(rows: StationRows) -> StationRows:
     """Those of places that have as many rows as any, if these are enough; else all."""
     place = np.unique(moving_end(rows.places), axis=0, return_inverse=True)[1].reshape(-1)
     sectors = np.unique(np.stack([place, sector_of(rows.places).astype(np.int64)], 1), axis=0)[:, 0]
@@ -289,7 +296,7 @@ def _whole(rows: StationRows) -> StationRows:
     return rows.subset(np.flatnonzero(whole[place])) if whole.sum() >= LEAST_WHOLE else rows
 
 
-def _stretches(rows: StationRows, most: int, seed: int) -> StationRows:
+def _select_stretches(rows: StationRows, limit: int, seed: int) -> StationRows:
     """At most so many rows, all that there are of places that follow each other in short stretches.
 
     To take some of the rows of a place would tell of stronger or weaker ones than there are.
@@ -299,4 +306,4 @@ def _stretches(rows: StationRows, most: int, seed: int) -> StationRows:
     np.minimum.at(first, place, rows.index)
     stretch = np.argsort(np.argsort(first)) // STRETCH
     rank = np.random.default_rng(seed).permutation(int(stretch.max()) + 1)[stretch[place]]
-    return rows.subset(np.sort(np.argsort(rank, kind="stable")[:most]))
+    return rows.subset(np.sort(np.argsort(rank, kind="stable")[:limit]))

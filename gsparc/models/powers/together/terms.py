@@ -50,7 +50,7 @@ class StationRows(PowerRows):
         """Return the rows of one station."""
         return self.subset(np.flatnonzero(self.station == number))
 
-    def thin_rows(self, each: int, seed: int) -> StationRows:
+    def thin_rows(self, per_station: int, seed: int) -> StationRows:
         """Return at most so many rows of each station, at places that they share where they do.
 
         Rows where something was heard come first where there are too many, up to half of them.
@@ -63,15 +63,15 @@ class StationRows(PowerRows):
         for number in self.stations:
             own = np.flatnonzero(self.station == number)
             own = own[np.argsort(rank[own], kind="stable")]
-            if len(own) > each:
+            if len(own) > per_station:
                 loud, quiet = own[~self.silent[own]], own[self.silent[own]]
-                share = max(round(each * len(loud) / len(own)), min(len(loud), each // 2))
-                own = np.concatenate([loud[:share], quiet[: each - share]])
+                share = max(round(per_station * len(loud) / len(own)), min(len(loud), per_station // 2))
+                own = np.concatenate([loud[:share], quiet[: per_station - share]])
             chosen.append(own)
         return self.subset(np.sort(np.concatenate(chosen)))
 
 
-def station_places(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
     site, notes = data.site, []
     assert site.stations is not None and data.station is not None
@@ -119,21 +119,21 @@ class SharedTerms(Columns):
     @classmethod
     def from_rows(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
         """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
-        decades = _decades(trend, torch.from_numpy(rows.places))
+        decades = _centred_decades(trend, torch.from_numpy(rows.places))
         bare = cls(trend, float(decades.min()), float(decades.max()), NO_PLACES, length)
-        return bare.known_at(rows, places, seed)
+        return bare.set_inducing(rows, places, seed)
 
-    def known_at(self, rows: StationRows, most: int, seed: int) -> SharedTerms:
+    def set_inducing(self, rows: StationRows, limit: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
         every = np.unique(moving_end(rows.places), axis=0)
-        order = np.random.default_rng(seed).permutation(len(every))[:most]
+        order = np.random.default_rng(seed).permutation(len(every))[:limit]
         return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
 
     def columns(self, places: Tensor) -> Tensor:
         """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
         if isinstance(self.trend, Sectors):
             return places.new_zeros(len(places), 0)  # each site has its own
-        decades = _decades(self.trend, places)
+        decades = _centred_decades(self.trend, places)
         inside = decades.clamp(self.nearest, self.farthest)
         # Beyond what was heard the parabola goes on as its tangent.
         bend = inside.square() + 2 * inside * (decades - inside)
@@ -141,16 +141,16 @@ class SharedTerms(Columns):
         if not self.place_db:
             return law / self.unit
         near = matern32(distances(self.inducing, moving_end(places)), self.length)
-        return torch.cat([law, self.place_db * self._factor.whiten(near).T], 1) / self.unit
+        return torch.cat([law, self.place_db * self._inducing_factor.whiten(near).T], 1) / self.unit
 
     @cached_property
-    def _factor(self) -> Factor:
+    def _inducing_factor(self) -> Factor:
         gram = matern32(distances(self.inducing, self.inducing), self.length)
         # Places next to each other are alike to the last digit.
         gram.diagonal().add_(JITTER)
         return Factor.from_gram(gram, "raise")
 
 
-def _decades(trend: Trend, places: Tensor) -> Tensor:
+def _centred_decades(trend: Trend, places: Tensor) -> Tensor:
     assert trend.law is not None
     return trend.law.decades(places) - trend.middle

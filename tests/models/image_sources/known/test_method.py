@@ -48,7 +48,7 @@ def test_known_walls_tell_all_from_few_rows(room):
     known, report = fitted("scene", data, fold.train[:60], file=str(file))
     missed_here = missed(known, data, fold.test)
     assert missed_here < 0.05
-    assert known.terms[:2] == ("phase", "visibility") and known.count > 20
+    assert known.terms[:2] == ("phase", "visibility") and known.count_gaussians > 20
     assert any("occluding boxes" in note for note in report.notes)
     again = read_back(known)
     assert missed(again, data, fold.test) == pytest.approx(missed_here, rel=1e-3)
@@ -59,4 +59,4 @@ def test_without_visibility_every_image_is_seen_everywhere(room):
     settings = InitSettings("scene", file=str(file), order=1)
     field = CANDIDATES["scene"](settings, False, FitContext())
     fitted_to(field, data, fold.train[:40], budget_s=30.0)
-    assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count == 7
+    assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count_gaussians == 7

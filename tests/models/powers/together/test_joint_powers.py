@@ -20,11 +20,11 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.gsparc import Gsparc, choose
-from gsparc.models.per_station import by_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.powers.together import field as together
 from gsparc.models.powers.together.field import JointPowerField, rows_per_station
 from gsparc.models.powers.together.learning import StationPriors, learn_shared_terms, learn_station_priors
-from gsparc.models.powers.together.terms import SharedTerms, rows_of_stations, station_places
+from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, rows_of_stations
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -70,7 +70,7 @@ def prior_of(data: Measurements) -> tuple[StationPriors, SharedTerms]:
 
 def rows_of(data: Measurements, rows: np.ndarray | None = None):
     rows = np.arange(len(data)) if rows is None else rows
-    return rows_of_stations(data, rows, station_places(data, rows)[0])
+    return rows_of_stations(data, rows, places_and_notes(data, rows)[0])
 
 
 def dense(rows, own: StationPriors, terms: SharedTerms) -> tuple[np.ndarray, np.ndarray]:
@@ -231,7 +231,7 @@ def test_silent_rows_say_that_powers_are_low():
     (own, terms), rows = prior_of(data), np.arange(len(data))
     errors = []
     for used in (rows, rows[~quiet]):
-        field = known_field(data.site, station_places(data, rows)[0], own, terms)
+        field = known_field(data.site, places_and_notes(data, rows)[0], own, terms)
         field.condition(silent, used)
         batch = data.batch(np.flatnonzero(quiet))
         errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
@@ -275,7 +275,7 @@ def test_what_it_refuses():
 def test_gsparc_learns_stations_together(tmp_path):
     data = town()
     fold = fold_of(data)
-    method = by_station(Gsparc(), data)
+    method = wrap_per_station(Gsparc(), data)
     report = method.fit(data, fold, FitContext(tmp_path, stations="together"))
     assert any("6 stations in one model" in note for note in report.notes)
     batch = data.batch(fold.test)
@@ -300,7 +300,7 @@ def test_stations_at_one_place_are_told_apart_by_their_numbers():
     decibels = -20 - 30 * np.log10(far) + 10 * (data.station == 1)
     data = replace(data, target=(10 ** (decibels / 10)).astype(np.float32)[:, None])
     rows = np.flatnonzero(data.station < 4)
-    method = by_station(Gsparc(), data)
+    method = wrap_per_station(Gsparc(), data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
     batch = data.batch(np.flatnonzero(data.station < 2))
     assert np.abs(db(method.predict(batch).mean) - db(batch.target)).max() < 2
@@ -311,7 +311,7 @@ def test_halls_gain_over_a_process_of_each_sensor():
     fold = fold_of(data, name="blocks", side_m=3.0)
     errors = []
     for make, stations in ((Gsparc, "together"), (method_class("gp"), "each")):
-        method = by_station(make(), data)
+        method = wrap_per_station(make(), data)
         method.fit(data, fold, FitContext(stations=stations))
         batch = data.batch(fold.test)
         errors.append(np.mean((db(method.predict(batch).mean) - db(batch.target)) ** 2))

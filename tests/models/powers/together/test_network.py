@@ -16,7 +16,7 @@ from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import PerStation, by_station
+from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.learning import StationPriors
 from gsparc.models.powers.together.network import find_sectors
@@ -35,7 +35,7 @@ NONE = np.zeros(0, np.int64)
 def fitted(one: Network, count: int, folder: Path, azimuths: bool = True) -> tuple[PerStation, FitReport]:
     """The recommended model of a drive's lists."""
     data = one.data(count, azimuths)
-    method = by_station(Gsparc(), data)
+    method = wrap_per_station(Gsparc(), data)
     assert isinstance(method, PerStation)
     return method, method.fit(data, Fold(np.arange(len(data)), NONE, NONE), FitContext(folder))
 
@@ -47,7 +47,7 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
     rx, result = Pose(places, torch.eye(3).expand(len(places), 3, 3)), []
     for number, still in enumerate(one.place):
         tx = torch.from_numpy(still - site.origin).float().expand(len(places), 3)
-        said = method.copy_for(number).predict(Query(tx, rx))
+        said = method.station_method(number).predict(Query(tx, rx))
         assert said.variance is not None
         result.append(power_in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
     mean, spread = (np.stack(part, 1) for part in zip(*result, strict=True))
