@@ -62,7 +62,7 @@ class Densify(Checked, L.Callback):
     statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
 
-    def _blank(self, model: GaussianModel) -> dict[str, Tensor]:
+    def _zero_statistics(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)
         device = model.gaussians.means.device
         return {key: torch.zeros(count, device=device) for key in ("gradient", "seen", "radius")}
@@ -75,7 +75,7 @@ class Densify(Checked, L.Callback):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
-            self.statistics = self._blank(module.model)
+            self.statistics = self._zero_statistics(module.model)
         gradient = raster.means2d.grad
         if gradient is None:
             return
@@ -117,7 +117,7 @@ class Densify(Checked, L.Callback):
             if solved is not None:
                 model.emission.weight2.copy_(solved.weight)
                 model.emission.bias2.copy_(solved.bias)
-            self.statistics = self._blank(model)
+            self.statistics = self._zero_statistics(model)
         _log_edit(trainer, module, planned, before, step)
 
     def plan(self, model: GaussianModel, generator: torch.Generator, in_place: bool = False) -> edit.Edit:
@@ -140,12 +140,12 @@ class Densify(Checked, L.Callback):
         prune = gaussians.opacities < self.min_opacity
         if self.max_radius is not None:
             prune |= self.statistics["radius"] > self.max_radius
-        prune = self._keep_at_least(prune, gaussians.opacities)
+        prune = self._limit_pruning(prune, gaussians.opacities)
 
         room = max(self.max_gaussians - int((~prune).sum()), 0)
         # A split removes its parent, a clone leaves it there.
         cost = torch.where(large | in_place, self.children - 1, 1)
-        chosen = self._strongest(under_reconstructed & ~prune, mean_gradient, cost, room)
+        chosen = self._choose_within_room(under_reconstructed & ~prune, mean_gradient, cost, room)
         clone, split = (chosen & ~large, chosen & large) if not in_place else (chosen & False, chosen)
         clones = clone.nonzero().squeeze(1)
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
@@ -164,7 +164,7 @@ class Densify(Checked, L.Callback):
         moved = {"gaussians.means": means, "gaussians.log_scales": scales}
         return edit.Edit(~(prune | split), parents, moved)
 
-    def _keep_at_least(self, prune: Tensor, opacities: Tensor) -> Tensor:
+    def _limit_pruning(self, prune: Tensor, opacities: Tensor) -> Tensor:
         short = min(self.min_gaussians, len(prune)) - int((~prune).sum())
         if short > 0:
             # Of those that were to go, the most opaque stay.
@@ -174,7 +174,7 @@ class Densify(Checked, L.Callback):
         return prune
 
     @staticmethod
-    def _strongest(under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
+    def _choose_within_room(under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
         rank = torch.where(under_reconstructed, gradient, -torch.ones_like(gradient))
         # Stable: where gradients are equal, a resumed run chooses the same.
         order = rank.argsort(descending=True, stable=True)

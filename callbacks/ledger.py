@@ -33,17 +33,17 @@ class CostLedger(L.Callback):
         """Stop the watch for work that is not training."""
         # A pause within a pause must not start the watch when it ends.
         was_running = self._running_since is not None
-        self._stop()
+        self._stop_clock()
         try:
             yield
         finally:
             if was_running:
-                self._start()
+                self._start_clock()
 
-    def _start(self) -> None:
+    def _start_clock(self) -> None:
         self._running_since = time.perf_counter()
 
-    def _stop(self) -> None:
+    def _stop_clock(self) -> None:
         self.seconds = self.elapsed()
         self._running_since = None
 
@@ -58,11 +58,11 @@ class CostLedger(L.Callback):
             # Rows after the checkpoint are of steps that are taken again.
             self._rows = [row for row in self._rows if int(row["step"]) <= trainer.global_step]
             curve.write_curve(module.run_dir, self._rows)
-        self._start()
+        self._start_clock()
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         """Stop the watch; also for a validation, which does not count as training time."""
-        self._stop()
+        self._stop_clock()
         module.train_seconds = self.seconds
 
     on_validation_start = on_train_end  # type: ignore[assignment]
@@ -70,19 +70,19 @@ class CostLedger(L.Callback):
 
     def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
         """Stop the watch."""
-        self._stop()
+        self._stop_clock()
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Write a row of the learning curve and go on."""
         # `trainer.validate` by itself is no training: neither a row of the curve nor a running watch.
         fitting = trainer.state.fn == "fit"
         if trainer.is_global_zero and fitting and module.figures:
-            self._note(trainer, module)
+            self._log_seconds(trainer, module)
         # Lightning's check of validation comes before the first step: nothing is learned yet.
         if fitting and not trainer.sanity_checking:
-            self._start()
+            self._start_clock()
 
-    def _note(self, trainer: L.Trainer, module: Any) -> None:
+    def _log_seconds(self, trainer: L.Trainer, module: Any) -> None:
         step, loss = trainer.global_step, trainer.callback_metrics.get("train/task_loss")
         shown = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
         # What was solved before the first step is part of what an accuracy costs.

@@ -48,7 +48,7 @@ class StepProgress(L.Callback):
             figures += [] if module.count is None else [f"{module.count} Gaussians"]
             self._bar.update(task, figures=", ".join(figures))
 
-    def on_train_end(self, *unused: Any, **named: Any) -> None:
+    def on_train_end(self, *args: Any, **kwargs: Any) -> None:
         """Leave the bar as it is on the screen; also after an error."""
         if self._bar is not None:
             self._bar.stop()

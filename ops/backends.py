@@ -36,14 +36,14 @@ def backend_named(name: str) -> ModuleType:
     if name == "reference":
         return reference_backend
     if name == "cpu":
-        return _cpu()
+        return _load_cpu()
     if name == "cuda":
-        return _cuda()
+        return _load_cuda()
     raise ValueError(f"backend is 'reference', 'cpu' or 'cuda', got {name!r}")
 
 
 @cache
-def _cpu() -> ModuleType:
+def _load_cpu() -> ModuleType:
     try:
         from gsparc.ops import native
     except ImportError as error:
@@ -54,8 +54,8 @@ def _cpu() -> ModuleType:
     return native
 
 
-def _cuda() -> ModuleType:
-    _cpu()  # defines the operators
+def _load_cuda() -> ModuleType:
+    _load_cpu()  # defines the operators
     from gsparc.ops import cuda, cuda_library
 
     try:

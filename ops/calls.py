@@ -53,11 +53,11 @@ class Call(ctypes.Structure):
 
 
 @lru_cache(maxsize=64)
-def _in_c(settings: KernelSettings) -> _Settings:
+def _to_c_settings(settings: KernelSettings) -> _Settings:
     return _Settings(*settings)
 
 
-def call_for(
+def make_call(
     like: Tensor,
     *tensors: Tensor | None,
     sizes: Sequence[int] = (),
@@ -74,17 +74,17 @@ def call_for(
     addresses = [0 if t is None else t.data_ptr() for t in tensors]
     struct.pack_into(f"{len(addresses)}Q", call, Call.tensors.offset, *addresses)  # ctypes takes far longer
     if settings is not None:
-        call.settings = _in_c(settings)
+        call.settings = _to_c_settings(settings)
     return call
 
 
-def run(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int:
-    """Return the result of the kernel `name` on the device of `like`. `numbers` as `call_for`.
+def launch(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int:
+    """Return the result of the kernel `name` on the device of `like`. `numbers` as `make_call`.
 
     Sizes, numbers and tensors are in the order in which the kernel reads them; tensors are contiguous. On
     a GPU the kernel has scratch memory and runs on torch's current stream.
     """
-    call = call_for(like, *tensors, **numbers)
+    call = make_call(like, *tensors, **numbers)
     if not like.is_cuda and "cpu" not in libraries:
         return getattr(kernels(), name)(ctypes.addressof(call))
     device, library = like.device, libraries[like.device.type]

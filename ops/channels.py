@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import calls
-from gsparc.ops.operators import KERNELS, contiguous, differentiable, register_kernel, run_kernel
+from gsparc.ops.operators import KERNELS, call_differentiable, contiguous, register_kernel, run_kernel
 from gsparc.ops.transforms import needs_reference
 
 
@@ -57,7 +57,7 @@ def channels(
     tones = [first_hz, step_hz]
     served = not needs_reference(gains, steering, delays)
     if served and calls.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
-        return differentiable(_outputs, _gradients, (tones, subcarriers), gains, steering, delays)
+        return call_differentiable(_run_forward, _run_backward, (tones, subcarriers), gains, steering, delays)
     return plain_channels(gains, steering, delays, tones, subcarriers)
 
 
@@ -77,13 +77,13 @@ def plain_channels(
     return torch.view_as_real(torch.einsum("bn,na,nk->bak", *weights, factor).contiguous())
 
 
-def _outputs(fixed: Any, gains: Tensor, steering: Tensor, delays: Tensor) -> Tensor:
+def _run_forward(fixed: Any, gains: Tensor, steering: Tensor, delays: Tensor) -> Tensor:
     tones, subcarriers = fixed
     out = gains.new_empty(len(gains), steering.shape[1], subcarriers, 2)
     return run_kernel("channels", gains, out, gains, steering, delays, tones)
 
 
-def _gradients(fixed: Any, slope: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+def _run_backward(fixed: Any, slope: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
     out = tuple(part.new_empty(part.shape) for part in inputs)
     return run_kernel("channels_backward", slope, out, slope, *inputs, fixed[0])
 
@@ -91,7 +91,7 @@ def _gradients(fixed: Any, slope: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]
 @register_kernel("channels", "cpu")
 def _channels(out: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]) -> None:
     sizes = (*gains.shape[:2], *out.shape[1:3])
-    calls.run("channels", gains, *contiguous((gains, steering, delays)), out, sizes=sizes, numbers=tones)
+    calls.launch("channels", gains, *contiguous((gains, steering, delays)), out, sizes=sizes, numbers=tones)
 
 
 @register_kernel("channels_backward", "cpu")
@@ -100,4 +100,4 @@ def _channels_backward(
 ) -> None:
     sizes = (*gains.shape[:2], *slope.shape[1:3])
     inputs = contiguous((gains, steering, delays, slope))
-    calls.run("channels_backward", gains, *inputs, *out, sizes=sizes, numbers=tones)
+    calls.launch("channels_backward", gains, *inputs, *out, sizes=sizes, numbers=tones)

@@ -32,7 +32,7 @@ from gsparc.ops.operators import (
 from gsparc.ops.results import Plan
 from gsparc.ops.settings import KernelSettings
 
-__all__ = ["composite", "freeze", "load", "make_plan", "mean_weights", "thaw"]
+__all__ = ["composite", "draw_frozen", "freeze", "load", "make_plan", "mean_weights"]
 
 BYTES_PER_ENTRY = 36  # entries and what sorting them takes
 MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
@@ -51,21 +51,21 @@ def count_tiles(settings: KernelSettings) -> int:
     return -(-settings.height // _native.TILE_HEIGHT) * -(-settings.width // _native.TILE_WIDTH)
 
 
-def _with_headroom(entries: int) -> int:
+def _capacity_with_headroom(entries: int) -> int:
     """Capacity of a captured plan where the largest plan so far had so many entries."""
     # A quarter more, since a captured graph cannot grow when Gaussians move.
     return entries + entries // 4 + 1024
 
 
-def _capturing(tensor: Tensor) -> bool:
+def _is_capturing(tensor: Tensor) -> bool:
     return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
 @cache
-def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) -> Tensor:
+def _sincos(device: torch.device, dtype: torch.dtype, settings: KernelSettings) -> Tensor:
     """Sines and cosines of the grid's rows and columns, kept for good: captured graphs hold their address."""
     library = calls.libraries[device.type]
-    call = calls.call_for(torch.empty(0, dtype=dtype), settings=settings)
+    call = calls.make_call(torch.empty(0, dtype=dtype), settings=settings)
     numbers = torch.empty(library.run("tables", call), dtype=dtype)
     call.tensors[0] = numbers.data_ptr()
     library.run("tables", call)
@@ -86,10 +86,10 @@ def run_on_plan(
     entries, capacity = None, 0
     if buffers.entries.numel():
         entries, capacity = buffers.entries, entry_capacity(plan)
-    view = (_tables(means.device, means.dtype, plan.settings), *buffers[:5], buffers.starts[-1:], entries)
+    view = (_sincos(means.device, means.dtype, plan.settings), *buffers[:5], buffers.starts[-1:], entries)
     inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
     counts = (plan.num_poses, len(means), capacity, *sizes)
-    calls.run(name, means, *view, *inputs, sizes=counts, settings=plan.settings)
+    calls.launch(name, means, *view, *inputs, sizes=counts, settings=plan.settings)
 
 
 @register_kernel("plan", "cuda")
@@ -108,10 +108,10 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     verdict = means.new_empty(2, dtype=torch.int64)
     run_on_plan("plan", plan, gaussians, ids, plan.means2d, plan.radii, plan.visible, verdict)
     key = (count, n, plan.settings)
-    if _capturing(means):
+    if _is_capturing(means):
         if key not in _capacities:
             raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
-        capacity = _with_headroom(_capacities[key])
+        capacity = _capacity_with_headroom(_capacities[key])
     else:
         status, capacity = verdict.tolist()
         validation.raise_for_status(status, plan.pose)
@@ -125,7 +125,7 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     return plan
 
 
-def _by_gaussian(features: Tensor, poses: int) -> Tensor:
+def _stack_features(features: Tensor, poses: int) -> Tensor:
     """Features (B, N, C) as (P, N, K) with the K channels of a pose side by side."""
     # One pose is seen by all samples: their channels side by side share its weights.
     if poses != 1:
@@ -134,7 +134,7 @@ def _by_gaussian(features: Tensor, poses: int) -> Tensor:
     return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
 
 
-def _zero(gradients: Gaussians) -> None:
+def _zero_gradients(gradients: Gaussians) -> None:
     """Gradients where no kernel runs: of no Gaussians, or over no poses."""
     for gradient in gradients:
         gradient.zero_()
@@ -142,7 +142,7 @@ def _zero(gradients: Gaussians) -> None:
 
 @register_kernel("composite", "cuda")
 def _composite(out: Any, plan: Plan, gaussians: Gaussians, features: Tensor) -> None:
-    rows = _by_gaussian(features, plan.num_poses)
+    rows = _stack_features(features, plan.num_poses)
     if plan.num_poses > 0:
         run_on_plan("composite", plan, gaussians, rows, *out, sizes=rows.shape[2:])
 
@@ -159,7 +159,7 @@ def _composite_backward(
     features: Tensor,
 ) -> Any:
     samples, n, channels = features.shape
-    rows = _by_gaussian(features, plan.num_poses)
+    rows = _stack_features(features, plan.num_poses)
     check_memory(entry_capacity(plan), features.element_size() * (_native.MOMENTS + rows.shape[2]))
     grads, _, grad_means2d = out
     grad_rows = torch.empty_like(rows)
@@ -168,7 +168,7 @@ def _composite_backward(
         tensors = (rows, *images, *grads, grad_rows, grad_means2d)
         run_on_plan("composite_backward", plan, gaussians, *tensors, sizes=rows.shape[2:])
     else:
-        _zero(grads)
+        _zero_gradients(grads)
     if plan.num_poses == 1:
         grad_rows = grad_rows.reshape(n, samples, channels).permute(1, 0, 2).contiguous()
     return grads, grad_rows, grad_means2d
@@ -189,7 +189,7 @@ def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tenso
     if slopes[0].numel() > 0:
         run_on_plan("weights_backward", plan, gaussians, *slopes, *out, sizes=(1,))
     else:
-        _zero(out)
+        _zero_gradients(out)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -211,12 +211,12 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return order, (starts, ends, rank_of[of_entries].to(torch.int32), blocks)
 
 
-def thaw(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+def draw_frozen(
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
-    columns = validation.seen_features(features, order, picked).contiguous()
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C)."""
+    columns = validation.seen_features(features, order, visible_only).contiguous()
     image = columns.new_empty(columns.shape[1], grid.height, grid.width)
     if image.numel():
-        calls.run("thaw", columns, *buffers, columns, image, sizes=image.shape)
+        calls.launch("thaw", columns, *buffers, columns, image, sizes=image.shape)
     return image

@@ -48,19 +48,19 @@ class FrozenPlan:
             raise StalePlan(
                 f"this view was frozen at version {self.version}, the field is at {version}: freeze again"
             )
-        return self._render(features, picked=False)
+        return self._render(features, visible_only=False)
 
     @torch.no_grad()
-    def compose(self, seen: Tensor) -> Tensor:
+    def render_visible(self, seen: Tensor) -> Tensor:
         """Render as `render` does, features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
         if seen.dim() not in (2, 3) or seen.shape[-2] != len(self.order):
             count = len(self.order)
             raise ValueError(
                 f"features must be ({count}, C) or (B, {count}, C) of those seen, got {tuple(seen.shape)}"
             )
-        return self._render(seen, picked=True)
+        return self._render(seen, visible_only=True)
 
-    def _render(self, features: Tensor, *, picked: bool) -> Tensor:
+    def _render(self, features: Tensor, *, visible_only: bool) -> Tensor:
         if needs_reference(features):
             raise RuntimeError(
                 "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
@@ -77,6 +77,8 @@ class FrozenPlan:
         if features.dim() not in (2, 3):
             raise ValueError(f"features must be (N, C) or (B, N, C), got {tuple(features.shape)}")
         batch = features if features.dim() == 3 else features.unsqueeze(0)
-        image = backends.backend_named(self.backend).thaw(self.grid, self.buffers, batch, self.order, picked)
+        image = backends.backend_named(self.backend).draw_frozen(
+            self.grid, self.buffers, batch, self.order, visible_only
+        )
         # The first and last of (B, N, C): B and C.
         return image.unflatten(0, batch.shape[::2]) if features.dim() == 3 else image

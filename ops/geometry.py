@@ -147,7 +147,7 @@ class SphereGrid:
         return abs(self.width * self.azimuth_step - 2 * math.pi) < 1e-6
 
     @property
-    def turn(self) -> float:
+    def per_turn(self) -> float:
         """Columns in a full circle: the width where they close it, if only nearly; as in csrc/pixels.h."""
         return float(self.width) if self.periodic else 2 * math.pi / self.azimuth_step
 

@@ -22,10 +22,10 @@ from gsparc.ops.operators import (
     mean_weights,
     register_kernel,
 )
-from gsparc.ops.results import Plan
+from gsparc.ops.results import Plan, Raster
 from gsparc.ops.settings import KernelSettings
 
-__all__ = ["composite", "freeze", "instruction_set", "make_plan", "mean_weights", "rasterize", "thaw"]
+__all__ = ["composite", "draw_frozen", "freeze", "instruction_set", "make_plan", "mean_weights", "rasterize"]
 
 NO_PLAN = (None,) * len(Buffers._fields)
 
@@ -36,13 +36,13 @@ def run_on_plan(
     """Call a kernel that begins with `ViewArgs` of csrc/layout.h, then `tensors`."""
     inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
     counts = (plan.num_poses, plan.num_gaussians, *sizes)
-    return calls.run(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
+    return calls.launch(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
 
 
 @register_kernel("plan", "cpu")
 def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     means, pose = gaussians.means, plan.pose
-    call = partial(calls.run, sizes=(plan.num_poses, len(means)), settings=plan.settings)
+    call = partial(calls.launch, sizes=(plan.num_poses, len(means)), settings=plan.settings)
     inputs = contiguous((*gaussians, pose.position, pose.rotation, ids))
     # In two passes: how many entries there are is known when all footprints have been placed.
     status = call("plan", means, *inputs, *plan.buffers[:-1], plan.means2d, plan.radii, plan.visible)
@@ -56,8 +56,8 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
 
 def rasterize(
     gaussians: Gaussians, ids: Tensor | None, pose: Pose, features: Tensor, settings: KernelSettings
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return what a `Raster` holds, in one call that keeps no plan and passes no gradient.
+) -> Raster:
+    """Render in one call that keeps no plan and passes no gradient.
 
     Raises:
         ValueError, MemoryError: as `make_plan` and `composite`.
@@ -73,13 +73,15 @@ def rasterize(
     # The kernel counts the entries, and refuses more than the bound before it allocates them.
     sizes, bound = (poses, n, samples, channels), (operators.MEMORY_BOUND,)
     screen = means2d, radii, visible
-    status = calls.run("rasterize", means, *tensors, *screen, sizes=sizes, numbers=bound, settings=settings)
+    status = calls.launch(
+        "rasterize", means, *tensors, *screen, sizes=sizes, numbers=bound, settings=settings
+    )
     if status <= _native.REFUSED:
         check_memory(_native.REFUSED - status, 4)
     if status == _native.UNSOUND_FEATURES:
         validation.check_features(features)
     validation.raise_for_status(status, pose)
-    return image, transmittance, radii, visible, means2d
+    return Raster(image, transmittance, radii, visible, means2d)
 
 
 @register_kernel("composite", "cpu")
@@ -136,21 +138,21 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return order, (starts, ranks, weights)
 
 
-def thaw(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+def draw_frozen(
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C).
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C).
 
     Raises:
         ValueError: features that are not finite, or not as many as `order` speaks of.
     """
     samples, count, channels = features.shape
     image = features.new_empty(samples * channels, grid.height, grid.width)
-    tensors = contiguous((features, None if picked else order))
+    tensors = contiguous((features, None if visible_only else order))
     sizes = (samples, channels, grid.height, grid.width, len(order), count)
-    status = calls.run("thaw", features, *buffers, *tensors, image, sizes=sizes)
+    status = calls.launch("thaw", features, *buffers, *tensors, image, sizes=sizes)
     if status >= 0:
-        validation.seen_features(features, order, picked)  # says what is wrong
+        validation.seen_features(features, order, visible_only)  # says what is wrong
     return image
 
 

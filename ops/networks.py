@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import backends, calls
-from gsparc.ops.operators import contiguous, differentiable, empty_like, register_kernel, run_kernel
+from gsparc.ops.operators import call_differentiable, contiguous, empty_like, register_kernel, run_kernel
 from gsparc.ops.transforms import full_precision, needs_reference
 
 
@@ -27,7 +27,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     Raises:
         ValueError, TypeError: shapes, devices or dtypes that do not fit.
     """
-    _check(encoded, Layers(weight1, bias1, weight2, bias2))
+    _check_layers(encoded, Layers(weight1, bias1, weight2, bias2))
     encoded = encoded.to(weight1.dtype)  # it comes in half precision from `torch.autocast`
     if encoded.requires_grad or needs_reference(encoded, weight1, bias1, weight2, bias2):
         return plain_networks(encoded, weight1, bias1, weight2, bias2)
@@ -39,7 +39,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
         backends.backend_named(encoded.device.type)  # loads its kernels
-        return differentiable(_outputs, _gradients, None, encoded, weight1, bias1, weight2, bias2)
+        return call_differentiable(_run_forward, _run_backward, None, encoded, weight1, bias1, weight2, bias2)
     return plain_networks(encoded, weight1, bias1, weight2, bias2)
 
 
@@ -63,13 +63,13 @@ class Layers(NamedTuple):
     bias2: Tensor
 
 
-def _outputs(_: None, encoded: Tensor, *weights: Tensor) -> Tensor:
+def _run_forward(_: None, encoded: Tensor, *weights: Tensor) -> Tensor:
     layers = Layers(*weights)
     out = encoded.new_empty(len(encoded), len(layers.weight1), layers.weight2.shape[2])
     return run_kernel("networks", encoded, out, encoded, layers)
 
 
-def _gradients(_: None, slope: Tensor, encoded: Tensor, *weights: Tensor) -> tuple[Tensor | None, ...]:
+def _run_backward(_: None, slope: Tensor, encoded: Tensor, *weights: Tensor) -> tuple[Tensor | None, ...]:
     layers = Layers(*weights)
     return None, *run_kernel("networks_backward", encoded, empty_like(layers), slope, encoded, layers)
 
@@ -77,20 +77,20 @@ def _gradients(_: None, slope: Tensor, encoded: Tensor, *weights: Tensor) -> tup
 @register_kernel("networks", "cpu", "cuda")
 def _networks(out: Tensor, encoded: Tensor, layers: Layers) -> None:
     if out.numel():
-        calls.run("networks", encoded, *contiguous((encoded, *layers)), out, sizes=_sizes(encoded, layers))
+        calls.launch("networks", encoded, *contiguous((encoded, *layers)), out, sizes=_sizes(encoded, layers))
 
 
 @register_kernel("networks_backward", "cpu", "cuda")
 def _networks_backward(out: Layers, slope: Tensor, encoded: Tensor, layers: Layers) -> None:
     if slope.numel():
         tensors = (*contiguous((encoded, *layers, slope)), *out)
-        calls.run("networks_backward", encoded, *tensors, sizes=_sizes(encoded, layers))
+        calls.launch("networks_backward", encoded, *tensors, sizes=_sizes(encoded, layers))
     else:
         for gradient in out:
             gradient.zero_()
 
 
-def _check(encoded: Tensor, layers: Layers) -> None:
+def _check_layers(encoded: Tensor, layers: Layers) -> None:
     """What a kernel reads by address alone (ValueError, TypeError)."""
     first, bias1, second, bias2 = layers
     fits = encoded.dim() == 2 and first.dim() == second.dim() == 3

@@ -1,7 +1,7 @@
 """What kernels compute on a plan: shapes and gradients stated once, filled on each device.
 
 An operator makes its empty outputs and has them filled by the function that `kernel` marks for its name and
-the device; `differentiable` joins it with its gradient, another operator.
+the device; `call_differentiable` joins it with its gradient, another operator.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsparc.ops import calls
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
-from gsparc.ops.results import Plan, visible_share
+from gsparc.ops.results import Plan, Weights, visible_share
 from gsparc.ops.settings import Optics
 
 KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
@@ -105,7 +105,7 @@ class _Operator(torch.autograd.Function):
         return None, None, None, None, *gradients
 
 
-def differentiable(
+def call_differentiable(
     operator: Callable[..., Any],
     gradient: Callable[..., Any],
     fixed: Any,
@@ -191,7 +191,7 @@ def composite_gradient(
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Return image (B, C, H, W), transmittance (P, H, W) of (B, N, C); `means2d` only gets a gradient."""
     inputs = means2d, features, *gaussians
-    return differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
+    return call_differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
 
 
 def _weights(plan: Plan, *parts: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,10 +209,10 @@ def _weights_gradient(
     return run_kernel("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    seen, total = differentiable(_weights, _weights_gradient, plan, *gaussians)
-    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+    seen, total = call_differentiable(_weights, _weights_gradient, plan, *gaussians)
+    return Weights(seen / (plan.grid.height * plan.grid.width), visible_share(seen, total))
 
 
 def check_memory(entries: int, bytes_each: int) -> None:

@@ -76,7 +76,7 @@ def _equirect_offsets(seen: Projected, grid: SphereGrid, shift: Tensor) -> tuple
     center = seen.center + shift
     column = torch.arange(grid.width, dtype=shift.dtype, device=shift.device) - center[:, :1]
     row = torch.arange(grid.height, dtype=shift.dtype, device=shift.device) - center[:, 1:]
-    turn = grid.turn
+    turn = grid.per_turn
     # The shorter way around the circle; which way it is has no derivative.
     column = column - turn * torch.round(column.detach() / turn)
     size = (-1, grid.height, grid.width)

@@ -46,7 +46,7 @@ def array_spectrum(
     # Only planar arrays have the second pair of tables.
     absent = (None,) * (4 - len(rest))
     inputs = contiguous((places, *features, *read_out, pairs, *rest))
-    calls.run(
+    calls.launch(
         "array_spectrum", places, *inputs, *absent, square, image, unknown, numbers=numbers,
         sizes=(*places.shape, *features[1].shape, read_out[1].numel() // 2 - 1, height, columns,
                *sizes[0], *sizes[1]),
@@ -78,6 +78,6 @@ def nearest_weights(
     inputs = contiguous((queries, places, noise, rows))
     sizes = (*queries.shape, rows.shape[1])
     numbers = (*two, float(len(lengths)))
-    failed = calls.run("nearest_weights", queries, *inputs, weights, known, sizes=sizes, numbers=numbers)
+    failed = calls.launch("nearest_weights", queries, *inputs, weights, known, sizes=sizes, numbers=numbers)
     # -1 where every covariance has a factor.
     return None if failed >= 0 else (weights, known)

@@ -14,7 +14,7 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.projection import Projection
 from gsparc.ops.results import Plan, Raster, Weights
 from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, kernel_settings
-from gsparc.ops.transforms import detached, is_differentiated, needs_reference, no_transforms
+from gsparc.ops.transforms import detach, is_differentiated, needs_reference, no_transforms
 
 
 def make_plan(
@@ -52,10 +52,10 @@ def make_plan(
     """
     gaussians = validation.check_gaussians(means, quats, scales, opacities, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
-    return _plan(gaussians, ids, pose, grid, optics, backend)
+    return _make_plan(gaussians, ids, pose, grid, optics, backend)
 
 
-def _plan(
+def _make_plan(
     gaussians: Gaussians,
     ids: Tensor | None,
     pose: Pose,
@@ -64,19 +64,19 @@ def _plan(
     backend: str | None,
 ) -> Plan:
     """`make_plan` of Gaussians whose shapes agree."""
-    # Read before `detached`, which takes gradients off: a pose's would then be none without a word.
+    # Read before `detach`, which takes gradients off: a pose's would then be none without a word.
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
     validation.check_transforms(gaussians, pose, pose_trained)
     chosen = backends.choose_backend(backend, gaussians.means.device)
     with torch.no_grad() if torch.is_grad_enabled() else nullcontext(), no_transforms():
         # Order and visibility are choices without a derivative: neither autograd nor `torch.func` sees them.
-        still = Gaussians._make(map(detached, gaussians))
-        poses = validation.check_poses(Pose(detached(pose.position), detached(pose.rotation)), still.means)
-        plan = chosen.make_plan(still, detached(ids), poses, grid, optics)
+        still = Gaussians._make(map(detach, gaussians))
+        poses = validation.check_poses(Pose(detach(pose.position), detach(pose.rotation)), still.means)
+        plan = chosen.make_plan(still, detach(ids), poses, grid, optics)
     return replace(plan, pose_trained=True) if pose_trained else plan
 
 
-def _planned(plan: Plan, *parameters: Tensor) -> Gaussians:
+def _check_against_plan(plan: Plan, *parameters: Tensor) -> Gaussians:
     """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
     gaussians = validation.check_gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
     validation.check_transforms(gaussians, plan.pose, plan.pose_trained)
@@ -87,7 +87,7 @@ def _planned(plan: Plan, *parameters: Tensor) -> Gaussians:
     return gaussians
 
 
-def _trained(plan: Plan, *tensors: Tensor) -> bool:
+def _needs_gradient(plan: Plan, *tensors: Tensor) -> bool:
     """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
     requires_grad = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     # Tensors of inference mode can never become part of a graph.
@@ -116,12 +116,12 @@ def composite(
         ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
         RuntimeError: gradients over a plan that was made in `torch.inference_mode`.
     """
-    gaussians = _planned(plan, means, quats, scales, opacities)
+    gaussians = _check_against_plan(plan, means, quats, scales, opacities)
     values = validation.features_per_pose(features, means, plan.pose)
     validation.check_features(features)
     # Kernels have first derivatives in reverse mode alone.
     plain = needs_reference(*gaussians, features)
-    trained = _trained(plan, *gaussians, features) and not plain
+    trained = _needs_gradient(plan, *gaussians, features) and not plain
     # A leaf of its own: after `backward` its `.grad` is the screen-space gradient that densification reads.
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
     backend = reference_by_rows if plain else backends.backend_named(plan.backend)
@@ -168,8 +168,8 @@ def rasterize(
     if at_once is not None and not is_differentiated(*inputs):
         poses = validation.check_poses(pose, means)
         values = validation.features_per_pose(features, means, poses)
-        return Raster(*at_once(gaussians, ids, poses, values, kernel_settings(grid, optics)))
-    plan = _plan(gaussians, ids, pose, grid, optics, backend)
+        return at_once(gaussians, ids, poses, values, kernel_settings(grid, optics))
+    plan = _make_plan(gaussians, ids, pose, grid, optics, backend)
     return composite(plan, means, quats, scales, opacities, features)
 
 
@@ -185,11 +185,11 @@ def mean_weights(
     Raises:
         ValueError, TypeError, RuntimeError: as `composite`.
     """
-    gaussians = _planned(plan, means, quats, scales, opacities)
+    gaussians = _check_against_plan(plan, means, quats, scales, opacities)
     # Called for its refusal of plans that were made in inference mode.
-    _trained(plan, *gaussians)
+    _needs_gradient(plan, *gaussians)
     backend = reference_by_rows if needs_reference(*gaussians) else backends.backend_named(plan.backend)
-    return Weights(*backend.mean_weights(plan, gaussians))
+    return backend.mean_weights(plan, gaussians)
 
 
 @torch.no_grad()
@@ -213,7 +213,7 @@ def freeze(
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
-    gaussians = _planned(plan, means, quats, scales, opacities)
+    gaussians = _check_against_plan(plan, means, quats, scales, opacities)
     # To `torch.func` a frozen view would be a constant, its derivative 0 without a word.
     if needs_reference(*gaussians):
         raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")

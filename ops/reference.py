@@ -166,7 +166,7 @@ def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
     return by_id[torch.argsort(seen.distance.detach()[by_id], stable=True)]
 
 
-def layers(seen: Projected, shapes: Tensor, opacities: Tensor, optics: Optics) -> Tensor:
+def layer_opacities(seen: Projected, shapes: Tensor, opacities: Tensor, optics: Optics) -> Tensor:
     """Return the opacity alpha of each layer at each pixel (N, H W), before occlusion."""
     alpha = (seen.gain * opacities)[:, None] * shapes
     strength = shapes if optics.cutoff.relative else alpha
@@ -190,7 +190,7 @@ def transmittances(alpha: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     return torch.where(lit, light[:-1], 0.0), light[-1]
 
 
-def radii(seen: Projected, opacities: Tensor, optics: Optics) -> Tensor:
+def cutoff_radii(seen: Projected, opacities: Tensor, optics: Optics) -> Tensor:
     """Return long half axes (N,) [px] at the cut-off."""
     k11, k12, k22 = seen.covariance.unbind(-1)
     # The larger eigenvalue of a symmetric 2 x 2 matrix; `hypot` does not overflow where squares would.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.ops import reference, validation
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
-from gsparc.ops.results import Plan, visible_share
+from gsparc.ops.results import Plan, Weights, visible_share
 from gsparc.ops.settings import Optics
 from gsparc.ops.transforms import full_precision
 
@@ -24,7 +24,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
     for index in range(len(pose)):
         seen = reference.project(means, quats, scales, pose[index], grid, optics)
         shapes = reference.footprints(seen, grid, optics, torch.zeros_like(means[:, :2]))
-        alpha = reference.layers(seen, shapes, opacities, optics)
+        alpha = reference.layer_opacities(seen, shapes, opacities, optics)
         orders.append(reference.depth_order(seen, ids))
         # An absent Gaussian, such as one at the receiver, has no centre that may be read.
         centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
@@ -34,13 +34,13 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
             ranks = orders[-1][visible[-1][orders[-1]]]
             if bool(((seen.distance[ranks].diff() == 0) & (ids[ranks].diff() == 0)).any()):
                 validation.raise_for_ids()
-        radii.append(torch.where(visible[-1], reference.radii(seen, opacities, optics), 0.0))
+        radii.append(torch.where(visible[-1], reference.cutoff_radii(seen, opacities, optics), 0.0))
     return Plan(
         *(pose, grid, optics, "reference"),
-        means2d=_stacked(centers, means.new_empty(0, len(means), 2)),
-        radii=_stacked(radii, means.new_empty(0, len(means))),
-        visible=_stacked(visible, means.new_empty(0, len(means), dtype=torch.bool)),
-        buffers=(_stacked(orders, means.new_empty(0, len(means), dtype=torch.int64)),),
+        means2d=_stack_or_empty(centers, means.new_empty(0, len(means), 2)),
+        radii=_stack_or_empty(radii, means.new_empty(0, len(means))),
+        visible=_stack_or_empty(visible, means.new_empty(0, len(means), dtype=torch.bool)),
+        buffers=(_stack_or_empty(orders, means.new_empty(0, len(means), dtype=torch.int64)),),
     )
 
 
@@ -56,9 +56,9 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
         transmittances.append(transmittance)
     size = (plan.grid.height, plan.grid.width)
     # No poses: images of no rows that all the same depend on the tensors, with a gradient of 0.
-    none = _nothing(*gaussians, features)
+    none = _zero_of(*gaussians, features)
     image = torch.cat(images) if images else none.expand(0, features.shape[2], size[0] * size[1])
-    transmittance = _stacked(transmittances, none.expand(0, size[0] * size[1]))
+    transmittance = _stack_or_empty(transmittances, none.expand(0, size[0] * size[1]))
     return image.unflatten(-1, size), transmittance.unflatten(-1, size)
 
 
@@ -73,14 +73,14 @@ def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
         inverse = torch.argsort(plan.buffers[0][index])
         seen.append(weights.sum(1)[inverse])
         total.append(alpha.sum(1)[inverse])
-    none = _nothing(*gaussians).expand(0, len(gaussians.means))
-    return _stacked(seen, none), _stacked(total, none)
+    none = _zero_of(*gaussians).expand(0, len(gaussians.means))
+    return _stack_or_empty(seen, none), _stack_or_empty(total, none)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = weight_sums(plan, gaussians)
-    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+    return Weights(seen / (plan.grid.height * plan.grid.width), visible_share(seen, total))
 
 
 @full_precision
@@ -93,20 +93,20 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 @full_precision
-def thaw(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, picked: bool
+def draw_frozen(
+    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`picked`) of those in `order` alone, (B, V, C)."""
-    columns = validation.seen_features(features, order, picked)
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C)."""
+    columns = validation.seen_features(features, order, visible_only)
     return (columns.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
 
 
-def _stacked(parts: list[Tensor], none: Tensor) -> Tensor:
+def _stack_or_empty(parts: list[Tensor], none: Tensor) -> Tensor:
     """What there is for each pose (P, ...); `none` (0, ...) where there is no pose."""
     return torch.stack(parts) if parts else none
 
 
-def _nothing(*tensors: Tensor) -> Tensor:
+def _zero_of(*tensors: Tensor) -> Tensor:
     """0, a function of the tensors: their gradient is 0 rather than absent."""
     return torch.stack([t[:0].sum() for t in tensors]).sum()
 
@@ -119,6 +119,6 @@ def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> t
     # Zero in value, with the slope of the centres on the screen.
     shift = (means2d[index] - means2d[index].detach())[order]
     shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
-    alpha = reference.layers(seen, shapes, near.opacities, plan.optics)
+    alpha = reference.layer_opacities(seen, shapes, near.opacities, plan.optics)
     before, transmittance = reference.transmittances(alpha, plan.optics.cutoff.transmittance)
     return alpha * before, alpha, transmittance

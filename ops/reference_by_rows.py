@@ -14,26 +14,26 @@ from torch import Tensor
 
 from gsparc.ops import reference_backend
 from gsparc.ops.geometry import Gaussians, SphereGrid
-from gsparc.ops.results import Plan, visible_share
+from gsparc.ops.results import Plan, Weights, visible_share
 
 ELEMENTS = 2**22  # of a tensor Gaussians x pixels
 
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Return image (B, C, H, W), transmittance (P, H, W) of features (B, N, C), by any backend's plan."""
-    parts = [reference_backend.composite(part, gaussians, features, means2d) for part in _in_rows(plan)]
+    parts = [reference_backend.composite(part, gaussians, features, means2d) for part in _split_rows(plan)]
     images, transmittances = zip(*parts, strict=True)
     return torch.cat(images, -2), torch.cat(transmittances, -2)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
     """Return the mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    parts = [reference_backend.weight_sums(part, gaussians) for part in _in_rows(plan)]
+    parts = [reference_backend.weight_sums(part, gaussians) for part in _split_rows(plan)]
     seen, total = (torch.stack(sums).sum(0) for sums in zip(*parts, strict=True))
-    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+    return Weights(seen / (plan.grid.height * plan.grid.width), visible_share(seen, total))
 
 
-def _in_rows(plan: Plan) -> Iterator[Plan]:
+def _split_rows(plan: Plan) -> Iterator[Plan]:
     """The plan as the reference's, for stretches of rows that bound the memory."""
     # Of a kernel's plan the third buffer is `Buffers.order`.
     order = plan.buffers[0] if plan.backend == "reference" else plan.buffers[2].long()

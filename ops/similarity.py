@@ -33,7 +33,7 @@ def similarity_op(
 
 
 @register_kernel("similarity", "cpu")
-def _cpu(
+def _similarity_cpu(
     out: tuple[Tensor, Tensor],
     prediction: Tensor,
     target: Tensor,
@@ -44,11 +44,11 @@ def _cpu(
     value, slopes = out
     window, images = torch.tensor(taps, dtype=torch.float32), (prediction.contiguous(), target.contiguous())
     tensors = (window, *images, value, slopes if slope else None)
-    calls.run("similarity", prediction, *tensors, sizes=prediction.shape, numbers=stability)
+    calls.launch("similarity", prediction, *tensors, sizes=prediction.shape, numbers=stability)
 
 
 @register_kernel("similarity", "cuda")
-def _cuda(
+def _similarity_cuda(
     out: tuple[Tensor, Tensor],
     prediction: Tensor,
     target: Tensor,
@@ -67,5 +67,5 @@ def _cuda(
         tensors = *inputs, sums, out[1] if slope else None
         # A symmetric window is passed up to its middle.
         numbers = *stability, *taps[: known.RADIUS + 1]
-        calls.run("similarity", prediction, *tensors, sizes=prediction.shape, numbers=numbers)
+        calls.launch("similarity", prediction, *tensors, sizes=prediction.shape, numbers=numbers)
     return sums.sum(1) / (rows * columns), out[1]

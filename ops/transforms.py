@@ -78,7 +78,7 @@ def no_transforms() -> AbstractContextManager[Any]:
     return torch._C._DisableFuncTorch() if transform_is_active() else nullcontext()
 
 
-def detached(value: Tensor | None) -> Any:
+def detach(value: Tensor | None) -> Any:
     """Return the numbers behind a tensor or None, for choices without a derivative, in `no_transforms`."""
     return None if value is None else unwrap(value, 0)[0].detach()
 
@@ -86,4 +86,4 @@ def detached(value: Tensor | None) -> Any:
 def to_numpy(value: Tensor) -> np.ndarray:
     """Return the numbers of a tensor without what follows them, for choices that have no derivative."""
     with no_transforms():
-        return detached(value).cpu().numpy()
+        return detach(value).cpu().numpy()

@@ -72,7 +72,7 @@ def check_transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> No
 
 def check_finite(gaussians: Gaussians, pose: Pose) -> None:
     """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
-    if not bool((_wrongness(pose) <= 1).all()):  # NaN is not either
+    if not bool((_pose_errors(pose) <= 1).all()):  # NaN is not either
         raise_for_pose(pose)
     means, quats, scales, opacities = gaussians
     # NaN fails every comparison, so that these find it too.
@@ -85,11 +85,11 @@ def check_finite(gaussians: Gaussians, pose: Pose) -> None:
     for name, ok in valid.items():
         if not bool(ok.all()):
             # The first that is not: torch has no argmin of bool.
-            raise_for(name, int(torch.argmin(ok.to(torch.int8))))
+            raise_for_parameter(name, int(torch.argmin(ok.to(torch.int8))))
 
 
 @full_precision
-def _wrongness(pose: Pose) -> Tensor:
+def _pose_errors(pose: Pose) -> Tensor:
     """How far P poses are from sound ones, (P,) in units of what `sound_pose` of csrc/pose.h allows."""
     rotation, still = pose.rotation, torch.eye(3).to(pose.rotation)
     far = pose.position.abs().amax(1) / FARTHEST
@@ -106,10 +106,10 @@ def raise_for_status(status: int, pose: Pose) -> None:
         raise_for_pose(pose)
     if status == calls.kernels().EQUAL_IDS:
         raise_for_ids()
-    raise_for(Gaussians._fields[status % 4], status // 4)
+    raise_for_parameter(Gaussians._fields[status % 4], status // 4)
 
 
-def raise_for(name: str, index: int) -> None:
+def raise_for_parameter(name: str, index: int) -> None:
     """Raise for the invalid parameter `name` of Gaussian `index` (UnsoundGaussian)."""
     expected = {
         "means": f"finite and within {FARTHEST:.0e} m",
@@ -123,7 +123,7 @@ def raise_for(name: str, index: int) -> None:
 
 def raise_for_pose(pose: Pose) -> None:
     """Raise for that of P poses which is least a pose (ValueError)."""
-    index = int(torch.argmax(_wrongness(pose).nan_to_num(nan=math.inf)))
+    index = int(torch.argmax(_pose_errors(pose).nan_to_num(nan=math.inf)))
     raise ValueError(
         f"pose {index} is not finite, not within {FARTHEST:.0e} m, or its matrix is no rotation; "
         "look at its position and its rotation"
@@ -159,18 +159,18 @@ def check_features(values: Tensor, rows: Tensor | None = None) -> None:
         bad = (~torch.isfinite(numbers)).movedim(axis, 0).flatten(1).any(1)
         if bool(bad.any()):
             index = torch.argmax(bad.to(torch.int8))
-            raise_for("features", int(index if rows is None else rows[index]))
+            raise_for_parameter("features", int(index if rows is None else rows[index]))
 
 
-def seen_features(values: Tensor, order: Tensor, picked: bool) -> Tensor:
-    """Return features (B, N, C) of `order` (V,), or those already `picked`, side by side (V, B C).
+def seen_features(values: Tensor, order: Tensor, visible_only: bool) -> Tensor:
+    """Return features (B, N, C) of `order` (V,), or those already `visible_only`, side by side (V, B C).
 
     Raises:
         ValueError: features that are not finite or too few, on the CPU.
     """
-    if not picked and not values.is_cuda and len(order) and int(order.max()) >= values.shape[1]:
+    if not visible_only and not values.is_cuda and len(order) and int(order.max()) >= values.shape[1]:
         raise ValueError(f"this view shows Gaussian {int(order.max())}, got features of {values.shape[1]}")
-    seen = values if picked else values.index_select(1, order)
+    seen = values if visible_only else values.index_select(1, order)
     check_features(seen, order)
     return seen.transpose(0, 1).reshape(seen.shape[1], values.shape[0] * values.shape[2])
 

@@ -16,7 +16,7 @@ from gsparc.data.files import read_shipped_table
 from gsparc.data.query import Batch
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
-from gsparc.physics.row_factors import Freedom, freedom_words
+from gsparc.physics.row_factors import Freedom, describe_freedom
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
@@ -181,7 +181,7 @@ class Site:
     def need_phase(self, what: str) -> None:
         """Raise `ValueError` where rows have phases of their own, so that `what` cannot be told."""
         if self.freedom != "none":
-            raise ValueError(f"{what}: channels are known up to {freedom_words(self.freedom)} of each row")
+            raise ValueError(f"{what}: channels are known up to {describe_freedom(self.freedom)} of each row")
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

@@ -22,9 +22,9 @@ from gsparc.data.units import PowerUnit
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
 from gsparc.prediction.placing import (
-    far_outside,
+    far_outside_and_margin,
     fill_heights,
-    match_stations,
+    rows_and_stations,
     say_height_error,
     say_tiny_extent,
     to_world,
@@ -90,9 +90,9 @@ def predict_file(
     for note in _notes(queries, site):
         log.info("%s: %s", places, note)
     world = to_world(queries, site)
-    row, number = match_stations(queries, site, station)
+    row, number = rows_and_stations(queries, site, station)
     named = station is not None or queries.station is not None
-    far, margin = far_outside(world, site)
+    far, margin = far_outside_and_margin(world, site)
     # `check_fits` is asked after the first block: spectra for a csv are refused before all are predicted.
     predictions = predict_places(
         predictor, queries, world, row, number, named, partial(check_fits, path, site.kind)
@@ -111,7 +111,7 @@ def predict_file(
     write_answers(path, queries, predictions, site.kind, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
-        "predict/far_outside": int(far.sum()),
+        "predict/far_outside_and_margin": int(far.sum()),
         "predict/stations": 0 if predictions.station is None else len(np.unique(predictions.station)),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,
@@ -149,7 +149,7 @@ def predict_places(
         predictor: of the model.
         queries: for messages.
         world: (n, 3) [m] by end.
-        row, number: (N,) of each prediction, see `match_stations`.
+        row, number: (N,) of each prediction, see `rows_and_stations`.
         named: whether somebody asked for these stations; then one without a model is refused.
         accept: raises where predictions of a shape are not wanted; called after the first ones.
 

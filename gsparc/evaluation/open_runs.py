@@ -42,6 +42,7 @@ from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
 
+ANOTHER = "give data with as many, or another ckpt"
 SAME_ROW_M = 1e-3  # rows of two files this near are of the same place
 
 
@@ -332,8 +333,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
         if ours is theirs or (data.site.static_position is not None and site.static_position is not None):
             return data  # one place, a table of one or not
         if ours is None:
-            raise ValueError(f"{data.site.name} has one static end, the model has stations")
-        raise ValueError(f"{data.site.name} has {len(ours)} stations, the model has one static end")
+            raise ValueError(f"{data.site.name} has one static end, the model has stations; {ANOTHER}")
+        raise ValueError(f"{data.site.name} has {len(ours)} stations, the model one static end; {ANOTHER}")
     number = np.empty(len(ours), np.int64)
     for t, name in enumerate(ours.name):
         near = np.linalg.norm(ours.position[t] + shift - theirs.position, axis=1) <= SAME_PLACE_M

@@ -27,7 +27,7 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
         return
     trend = field.own.never.trend
     assert isinstance(trend, Sectors)
-    heard = rows_of_stations(data, rows, field.places).measured
+    heard = rows_of_stations(data, rows, field.places).measured_rows
     count = np.bincount(heard.station, minlength=len(field.places))
     # Without an azimuth there is no angle to draw over.
     count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0

@@ -29,6 +29,7 @@ from gsparc.evaluation.metric_formats import (
 )
 from gsparc.evaluation.paired import Lead
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
+from gsparc.training.cost import LINE
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
@@ -129,7 +130,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     wrong = wrong_deviations(chi2, main_figure(facts, prefix))
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
-    cost = [f"cost{folds}: {facts['time/cost']}"] if facts.get("time/cost") else []
+    cost = [LINE.format(of_what=folds, cost=facts["time/cost"])] if facts.get("time/cost") else []
     lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
     # The candidate's name, as stored summaries have it, is no word for users.
     return [line.replace("joint_powers", "powers of all stations") for line in lines]

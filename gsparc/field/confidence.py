@@ -69,7 +69,7 @@ class ErrorModel(nn.Module):
         self.far, self.power = (float(value) for value in state)
 
 
-def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+def fit_level_and_power(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
     """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
     The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
@@ -113,14 +113,14 @@ class Confidence(nn.Module):
         g = g if g.dtype == torch.float64 else g.float()
         return g.clamp(-self.settings.clamp, self.settings.clamp)
 
-    def calibrate(self, position: Tensor) -> None:
+    def store_range(self, position: Tensor) -> None:
         """Store the range of g over calibration positions (n, 3) [m]."""
         with torch.no_grad():
             g = self.exponent(position)
             self.low.copy_(g.min())
             self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
 
-    def normalised(self, position: Tensor) -> Tensor:
+    def normalised_confidence(self, position: Tensor) -> Tensor:
         """Return the confidence in [0, 1] (B,): C between its least and largest on the calibration data.
 
         It decays outside the box of what was measured, where the network's lines run on unchecked.

@@ -94,12 +94,12 @@ def process_count() -> int:
 
 def process_sum(values: Tensor) -> Tensor:
     """Sum over processes, in place; the values themselves where there is one."""
-    return _reduced(values, ReduceOp.SUM)
+    return _all_reduce(values, ReduceOp.SUM)
 
 
 def process_max(values: Tensor) -> Tensor:
     """Return the maximum over processes, in place; the values themselves where there is one."""
-    return _reduced(values, ReduceOp.MAX)
+    return _all_reduce(values, ReduceOp.MAX)
 
 
 def first_process_value(value: float, trainer: L.Trainer) -> float:
@@ -112,7 +112,7 @@ def first_process_value(value: float, trainer: L.Trainer) -> float:
     return float(shared)
 
 
-def _reduced(values: Tensor, operation: ReduceOp.RedOpType) -> Tensor:
+def _all_reduce(values: Tensor, operation: ReduceOp.RedOpType) -> Tensor:
     if distributed.is_initialized():
         with _raise_after_grace():
             distributed.all_reduce(values, operation)

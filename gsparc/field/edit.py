@@ -57,7 +57,7 @@ def apply_edit(
     for name, old in rows.items():
         added = edit.replace.get(name, old.detach()[edit.parents])
         new = nn.Parameter(torch.cat([old.detach()[edit.keep], added.to(old.dtype)]), old.requires_grad)
-        _set(root, name, new)
+        _set_parameter(root, name, new)
         group = groups.get(id(old))
         # A parameter that is not learned has no group.
         if optimizer is None or group is None:
@@ -80,10 +80,10 @@ def apply_edit(
 def resize_gaussians(root: nn.Module, gaussians: GaussianField, count: int) -> None:
     """Give every per-Gaussian tensor `count` rows of zeros, so that a state dict of that size fits."""
     for name, old in row_parameters(root, len(gaussians)).items():
-        _set(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:]), old.requires_grad))
+        _set_parameter(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:]), old.requires_grad))
     gaussians.ids = gaussians.ids.new_zeros(count)
 
 
-def _set(root: nn.Module, dotted: str, parameter: nn.Parameter) -> None:
+def _set_parameter(root: nn.Module, dotted: str, parameter: nn.Parameter) -> None:
     path, _, leaf = dotted.rpartition(".")
     setattr(root.get_submodule(path), leaf, parameter)

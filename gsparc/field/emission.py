@@ -93,7 +93,7 @@ class Emission(nn.Module):
             return logits.sigmoid_()
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
 
-    def inverse(self, emission: Tensor, distance: Tensor) -> Tensor:
+    def to_logits(self, emission: Tensor, distance: Tensor) -> Tensor:
         """Return the logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
         if self.settings.activation == "linear":
             return emission

@@ -92,7 +92,7 @@ class PositionEncoding(nn.Module):
             self.length, self.noise, self.kernel = prior.length, prior.noise, prior.kernel
             self.tells_share = prior.whitening is not None
             self.register_buffer("anchors", prior.anchors.float())
-            whitening = _whitening(prior) if prior.whitening is None else prior.whitening
+            whitening = _whitening_matrix(prior) if prior.whitening is None else prior.whitening
             # What the prior holds is stored with it.
             self.register_buffer("whitening", whitening, persistent=prior.whitening is None)
         elif settings.kind != "raw":
@@ -120,7 +120,7 @@ def unknown_share(features: Tensor) -> Tensor:
     return (1 - torch.linalg.vecdot(features, features)).clamp_(0, 1)
 
 
-def _whitening(prior: Prior) -> Tensor:
+def _whitening_matrix(prior: Prior) -> Tensor:
     anchors = prior.anchors.double()
     gram = correlation(anchors, anchors, prior.length, prior.kernel)
     gram.diagonal().add_(JITTER)  # repeated positions stay invertible

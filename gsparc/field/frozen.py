@@ -15,7 +15,7 @@ from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.response import SLOPE_ENDS, ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan, queries
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.processes.features import matern_parts
+from gsparc.processes.features import matern_mixture
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class FrozenView:
             StalePlan: the field has changed since.
         """
         _check_version(self.version, model)
-        image = self.plan.compose(self.visible.features(tx, rx)).squeeze(1)
-        return Rendered(image, None, self.visible.unknown(tx, rx))
+        image = self.plan.render_visible(self.visible.emissions(tx, rx)).squeeze(1)
+        return Rendered(image, None, self.visible.unknown_shares(tx, rx))
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class FrozenArray:
         response = model.response
         assert isinstance(response, ArrayResponse)
         if self.weights is None or self.offset is None:
-            emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
-            unknown = model.unknown(tx, rx)
+            emitted = torch.view_as_complex(model.emissions(tx, rx).contiguous())
+            unknown = model.unknown_shares(tx, rx)
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
         moving, encoding = model.site.moving(tx, rx), model.emission.encoding
         # The compiled kernel is float32; float64, for slopes, goes the long way below.
@@ -79,7 +79,7 @@ class FrozenArray:
         if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
                 moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
-                self.renderer.tables, self.renderer.square, matern_parts(encoding.length, encoding.kernel),
+                self.renderer.tables, self.renderer.square, matern_mixture(encoding.length, encoding.kernel),
             )  # fmt: skip
             return Rendered(mean, None, unknown)
         encoded = encoding(moving)
@@ -99,7 +99,7 @@ def freeze_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
     if isinstance(model.response, ArrayResponse):
         return freeze_array(model, gaussian_vectors(model, rx))
     plan = model.freeze(rx)
-    return FrozenView(version, plan, _subset(plan.order, model))
+    return FrozenView(version, plan, _copy_gaussians(plan.order, model))
 
 
 @torch.no_grad()
@@ -129,7 +129,7 @@ def _check_version(version: int, model: GaussianModel) -> None:
         raise StalePlan(f"this view was frozen at version {version}, the field is at {now}: freeze again")
 
 
-def _subset(rows: Tensor, model: GaussianModel) -> GaussianModel:
+def _copy_gaussians(rows: Tensor, model: GaussianModel) -> GaussianModel:
     """A copy with these Gaussians alone, in this order."""
     copy = deepcopy(model)
     # Kept rows stay in their order: all are appended anew in the plan's instead.
@@ -153,7 +153,7 @@ def gaussian_vectors(model: GaussianModel, rx: Pose) -> Tensor:
         by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
         means, quats, scales, opacities = (part.detach() for part in model.gaussians.geometry())
         emitted = torch.zeros(count, len(parts), requires_grad=True)
-        plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # may be made in inference mode
+        plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # perhaps made in inference mode
         image = ops.composite(plan, means, quats, scales, opacities, emitted).image
         (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))
     return torch.view_as_complex(seen.view(count, len(parts) // 2, 2))

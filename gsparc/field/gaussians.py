@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import POSITIVE, SHARE, Checked, internal, number, or_null, setting, whole
 from gsparc.data.site_objects import GaussianCloud
+from gsparc.ops.geometry import Gaussians
 
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
 
@@ -72,12 +73,12 @@ class GaussianField(nn.Module):
     def __len__(self) -> int:
         return len(self.means)
 
-    def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return means, quaternions, scales and opacities, as the rasterizer takes them."""
-        return self.means, self.quats, self.scales, self.opacities
+    def geometry(self) -> Gaussians:
+        """Return the Gaussians as the rasterizer takes them."""
+        return Gaussians(self.means, self.quats, self.scales, self.opacities)
 
     @torch.no_grad()
-    def cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
+    def to_cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
         """Return what a picture or a file needs, with what each emits (N,), in the unit of `label`."""
         means, quats, scales, opacities = (part.double().numpy() for part in self.geometry())
         quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)

@@ -63,13 +63,13 @@ class TrainerResult:
     timed_out: bool
 
 
-def requested_steps(context: FitContext, rows: int, own: int | None = None) -> int | None:
+def requested_steps(context: FitContext, rows: int, model_steps: int | None = None) -> int | None:
     """Return the number of steps that the Trainer is given, else the model's own; None where neither is.
 
     Args:
         context: of the fit; `trainer.max_steps` and `trainer.max_epochs` win over all others.
         rows: that are learned from, for epochs.
-        own: as the model is configured.
+        model_steps: as the model is configured.
 
     Raises:
         ValueError: the Trainer is given what is no number of steps.
@@ -79,9 +79,9 @@ def requested_steps(context: FitContext, rows: int, own: int | None = None) -> i
     for name, value in (("max_steps", steps), ("max_epochs", epochs)):
         if value is not None and (type(value) is not int or value < 0):
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
-    if own == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
+    if model_steps == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
         heeded.count_reads("model.steps")
-        return own
+        return model_steps
     heeded.count_reads("trainer.max_steps", "trainer.max_epochs")
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     of_epochs = None if epochs is None else epochs * -(-rows // size)
@@ -191,7 +191,7 @@ def make_trainer(
     callbacks = [
         StageBudget(budget),
         *watch,
-        *_told(context.callbacks(), len(fold.val), module.count is not None),
+        *_drop_unusable(context.callbacks(), len(fold.val), module.count is not None),
     ]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
@@ -251,7 +251,7 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
         # Lightning's answer to a KeyboardInterrupt is SystemExit.
         advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
         if isinstance(ended, ProcessException) and not stop.requested:
-            raise RuntimeError(_lost(ended, advice)) from ended
+            raise RuntimeError(_describe_lost_process(ended, advice)) from ended
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     finally:
         batches.trainer = None  # which holds the optimizer's state
@@ -260,7 +260,7 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
 def read_trainer_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult:
     """Return the steps of a Trainer that has ended, and charge what it spent elsewhere to the budget."""
     metrics = trainer.callback_metrics
-    more = Spent(*metrics[SPENT].tolist()) - budget.counted  # of other processes, and of an earlier run
+    more = Spent(*metrics[SPENT].tolist()) - budget.by_clock  # of other processes, and of an earlier run
     budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
     kept = int(metrics[KEPT]) if KEPT in metrics else None
     taken = int(metrics[TAKEN])
@@ -271,15 +271,15 @@ def read_trainer_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult
     return TrainerResult(kept, taken, timed_out)
 
 
-def _told(callbacks: Sequence[L.Callback], rows: int, edits: bool) -> Sequence[L.Callback]:
-    """Without those of figures of validation rows, or of Gaussians to edit, where there are none."""
-    blind = [] if rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
+def _drop_unusable(callbacks: Sequence[L.Callback], val_rows: int, gaussians: bool) -> Sequence[L.Callback]:
+    """Leave out callbacks that need validation rows, or Gaussians to edit, where there are none."""
+    blind = [] if val_rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
     if blind:
         log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
-    return [c for c in callbacks if c not in blind and (edits or not hasattr(c, "edits_gaussians"))]
+    return [c for c in callbacks if c not in blind and (gaussians or not hasattr(c, "edits_gaussians"))]
 
 
-def _lost(error: ProcessException, advice: str) -> str:
+def _describe_lost_process(error: ProcessException, advice: str) -> str:
     """What was said by the process that failed, without its traceback; or which one was killed."""
     if isinstance(error, ProcessExitedException):
         how = error.signal_name or f"exit status {error.exit_code}"

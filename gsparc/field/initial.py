@@ -79,12 +79,12 @@ class InitTask:
     run_dir: Path
 
     @property
-    def anchors(self) -> int:
+    def most_anchors(self) -> int:
         """Largest number of places that kernel features are anchored at."""
         return self.settings.emission.encoding.anchors
 
 
-def keep_weights(model: GaussianModel) -> None:
+def keep_random_weights(model: GaussianModel) -> None:
     """Leave random weights as they are."""
 
 
@@ -101,7 +101,7 @@ class Start:
     """
 
     prior: Prior | None
-    solve: Callable[[GaussianModel], Any] = keep_weights
+    solve: Callable[[GaussianModel], Any] = keep_random_weights
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
     left_out: Any = None

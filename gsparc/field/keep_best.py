@@ -50,7 +50,7 @@ class KeepBest(L.Callback):
         error = first_process_value(float(module.held_out.mean()), trainer)
         if trainer.sanity_checking:
             self.start = module.held_out
-        surely = first_process_value(float(_surely_less(module.held_out, self.start)), trainer)
+        surely = first_process_value(float(_is_surely_less(module.held_out, self.start)), trainer)
         if trainer.sanity_checking or (error < self.error and surely):
             self.error, self.step = error, trainer.global_step
             self._kept = copy.deepcopy(module.model.state_dict())
@@ -86,7 +86,7 @@ class KeepBest(L.Callback):
         self.start, self._kept = state["start"], state["kept"]
 
 
-def _surely_less(errors: Tensor, start: Tensor) -> bool:
+def _is_surely_less(errors: Tensor, start: Tensor) -> bool:
     """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of the differences."""
     if len(errors) != len(start) or len(errors) < 2:
         return len(errors) != len(start)  # a training without a look before its first step keeps the least

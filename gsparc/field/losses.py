@@ -44,10 +44,10 @@ def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
     # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
     shift = target.mean(dim=(-2, -1), keepdim=True)
     p, t = prediction - shift, target - shift
-    mean_p, mean_t = _window(p), _window(t)
+    mean_p, mean_t = _blur(p), _blur(t)
     # Only rounding makes a variance negative.
-    variances = (_window(p * p) - mean_p**2).clamp_min(0) + (_window(t * t) - mean_t**2).clamp_min(0)
-    covariance = 2 * (_window(p * t) - mean_p * mean_t) + STABILITY[1]
+    variances = (_blur(p * p) - mean_p**2).clamp_min(0) + (_blur(t * t) - mean_t**2).clamp_min(0)
+    covariance = 2 * (_blur(p * t) - mean_p * mean_t) + STABILITY[1]
     light_p, light_t = mean_p + shift, mean_t + shift
     power = light_p**2 + light_t**2 + STABILITY[0]
     product = 2 * light_p * light_t + STABILITY[0]
@@ -60,7 +60,7 @@ class _Kernel(torch.autograd.Function):
     @staticmethod
     def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
         wanted = ctx.needs_input_grad[0]
-        value, slope = similarity_op(prediction.detach(), target.detach(), _taps(), STABILITY, wanted)
+        value, slope = similarity_op(prediction.detach(), target.detach(), _window_taps(), STABILITY, wanted)
         if wanted:
             ctx.save_for_backward(slope)
         return value
@@ -74,17 +74,17 @@ class _Kernel(torch.autograd.Function):
 
 
 @functools.lru_cache(maxsize=1)
-def _taps() -> tuple[float, ...]:
+def _window_taps() -> tuple[float, ...]:
     offsets = range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)
     weights = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in offsets]
     return tuple(w / sum(weights) for w in weights)
 
 
-def _window(images: Tensor) -> Tensor:
+def _blur(images: Tensor) -> Tensor:
     """Gaussian window over (B, H, W), valid part: (B, H - 10, W - 10). Shifted sums beat a convolution."""
     for axis in (1, 2):
         length = images.shape[axis] - 2 * WINDOW_RADIUS
-        taps = _taps()
+        taps = _window_taps()
         total = images.narrow(axis, 0, length) * taps[0]
         for k in range(1, len(taps)):
             total.add_(images.narrow(axis, k, length), alpha=taps[k])
@@ -162,14 +162,14 @@ def channel_loss(
     if prediction.shape != target.shape:
         raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
     if snapshot != "none":
-        return _up_to_offsets(prediction, target, mask, snapshot == "phase_timing")
+        return _error_up_to_phase(prediction, target, mask, snapshot == "phase_timing")
     error = (prediction - target).abs().square()
     if mask is None:
         return error.flatten(1).mean(1)
     return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
 
 
-def _up_to_offsets(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
+def _error_up_to_phase(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
     """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p, h>|."""
     known = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
     product = (prediction.conj() * target * known).sum(1)  # (B, K)

@@ -174,21 +174,21 @@ class GaussianModel(nn.Module):
         return self.site.kind == "spectrum" and self.emission.encoding.tells_share
 
     @torch.autocast("cpu", enabled=False)
-    def unknown(self, tx: Tensor, rx: Pose) -> Tensor | None:
+    def unknown_shares(self, tx: Tensor, rx: Pose) -> Tensor | None:
         """Return unknown shares f^2 (B,) of the field's variance; None where features do not tell."""
         if not self.tells_unknown:
             return None
         return unknown_share(self.emission.encoding(self.site.moving(tx, rx)))
 
     @torch.autocast("cpu", enabled=False)  # a kernel expansion cancels: half precision costs 8 dB
-    def features(self, tx: Tensor, rx: Pose) -> Tensor:
+    def emissions(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
-        distance = self.distances(tx)
+        distance = self.relative_distances(tx)
         emitted = self.emission(self.site.moving(tx, rx), distance)
         attenuation = self.attenuation(distance)
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
 
-    def distances(self, tx: Tensor) -> Tensor:
+    def relative_distances(self, tx: Tensor) -> Tensor:
         """Return d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
         x, y, z = (tx[:, None, k] - self.gaussians.means[:, k] for k in range(3))  # a sum over 3 is slow
         # In place: fresh memory of megabytes costs more than the arithmetic.
@@ -201,10 +201,10 @@ class GaussianModel(nn.Module):
 
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
-        features = self.features(tx, rx)
+        features = self.emissions(tx, rx)
         if self.site.kind == "spectrum":
             raster = self.rasterize(features, rx)
-            image, unknown = raster.image, self.unknown(tx, rx)
+            image, unknown = raster.image, self.unknown_shares(tx, rx)
             mean = self.response(image, unknown) if self.response else image.squeeze(1)
             return Rendered(mean, raster, unknown)
         weights = ops.mean_weights(self.plan(rx), *self.gaussians.geometry()).share
@@ -215,13 +215,13 @@ class GaussianModel(nn.Module):
 
     def rasterize(self, features: Tensor, rx: Pose) -> Raster:
         """Return images of features (B, N, C) from one pose, or each from its own of B."""
-        return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._optics())
+        return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._raster_options())
 
     def plan(self, rx: Pose) -> Plan:
         """Return footprints and depth order from one pose, or from each of B."""
-        return ops.make_plan(*self.gaussians.geometry(), rx, **self._optics())
+        return ops.make_plan(*self.gaussians.geometry(), rx, **self._raster_options())
 
-    def _optics(self) -> dict[str, Any]:
+    def _raster_options(self) -> dict[str, Any]:
         settings, image = self.settings.raster, self.site.kind == "spectrum"
         least = settings.alpha_cutoff if image else settings.relative_cutoff
         return {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import lightning.pytorch as L
 import numpy as np
@@ -24,6 +24,13 @@ from gsparc.ops import UnsoundGaussian
 
 class NonFiniteLoss(RuntimeError):
     """Training met a NaN or an infinity; batch and parameters are on disk."""
+
+
+class StepLosses(NamedTuple):
+    """The loss () of a step on a batch, and the task's of each sample (B,) where told apart."""
+
+    step: Tensor
+    by_sample: Tensor
 
 
 class NetworkModule(L.LightningModule):
@@ -62,12 +69,12 @@ class NetworkModule(L.LightningModule):
         """Return targets (B, ...) as predicted."""
         return self.model(batch.tx, batch.rx)
 
-    def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return the loss () of a step on a batch, and the task's of each sample (B,) where told apart."""
+    def losses(self, batch: Batch) -> StepLosses:
+        """Return the losses of a step."""
         # Draws are a pure function of (seed, step): a resumed run goes on with the same.
         draw = torch.Generator().manual_seed(torch.initial_seed() + self.global_step)
         loss = self.model.loss(batch, draw)
-        return loss, loss.expand(len(batch))
+        return StepLosses(loss, loss.expand(len(batch)))
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Return the loss of a batch; one that is not finite ends training."""
@@ -75,7 +82,7 @@ class NetworkModule(L.LightningModule):
         loss, task = self.losses(batch)
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)
-            raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
+            raise self._write_evidence(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
         if (self.global_step + 1) % self.log_every == 0:
             part = batch.share * process_count()  # the mean over processes is that over the batch
             self.log("train/task_loss", task.detach().mean() * part, sync_dist=True)
@@ -148,19 +155,19 @@ class NetworkModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a poisoned state, which must never replace a good checkpoint."""
-        if self._offender() is not None and self.batch is not None:
-            raise self._stop(self.batch, int(self.batch.index[0]))
+        if self._find_nonfinite() is not None and self.batch is not None:
+            raise self._write_evidence(self.batch, int(self.batch.index[0]))
 
-    def _offender(self) -> str | None:
+    def _find_nonfinite(self) -> str | None:
         """The first parameter that is not finite; None when all are."""
         bad = (name for name, p in self.model.named_parameters() if not torch.isfinite(p).all())
         return next(bad, None)
 
-    def _stop(self, batch: Batch, sample: int, refused: str | None = None) -> NonFiniteLoss:
+    def _write_evidence(self, batch: Batch, sample: int, refused: str | None = None) -> NonFiniteLoss:
         """Leave batch, parameters and the first offender on disk; the error that says so."""
         path = self.run_dir / "nonfinite.pt"
         path.parent.mkdir(parents=True, exist_ok=True)
-        offender = self._offender() or refused
+        offender = self._find_nonfinite() or refused
         evidence = {
             **{"step": self.global_step, "sample": sample, "offender": offender},
             **{"index": batch.index, "tx": batch.tx, "target": batch.target, "mask": batch.mask},
@@ -202,15 +209,15 @@ class GaussianModule(NetworkModule):
         """See `NetworkModule`."""
         return self._render(batch).mean
 
-    def losses(self, batch: Batch) -> tuple[Tensor, Tensor]:
+    def losses(self, batch: Batch) -> StepLosses:
         """See `NetworkModule`; weighted by the confidence, where there is one."""
         self.rendered = self._render(batch)
         task = self.task_loss(self.rendered.mean, batch)
         confidence = self.model.confidence
         if confidence is None:
-            return task.mean(), task
+            return StepLosses(task.mean(), task)
         exponent = confidence.exponent(self.site.moving(batch.tx, batch.rx))
-        return weighted_loss(task, exponent, confidence.settings.alpha).mean(), task
+        return StepLosses(weighted_loss(task, exponent, confidence.settings.alpha).mean(), task)
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Return the loss per sample (B,) before confidence; what was not measured counts as met."""
@@ -221,16 +228,18 @@ class GaussianModule(NetworkModule):
             return self.model(batch.tx, batch.rx)
         except UnsoundGaussian as refused:  # a NaN, an infinity, or what would overflow to one
             row = int(self.model.gaussians.ids[refused.index])
-            raise self._stop(batch, int(batch.index[0]), f"Gaussian id {row}: {refused}") from refused
+            raise self._write_evidence(
+                batch, int(batch.index[0]), f"Gaussian id {row}: {refused}"
+            ) from refused
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
         """Make room for the number of Gaussians before their tensors arrive."""
         edit.resize_gaussians(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
-        return super().load_state_dict(state_dict, *rest, **named)
+        return super().load_state_dict(state_dict, *args, **kwargs)
 
-    def _offender(self) -> str | None:
+    def _find_nonfinite(self) -> str | None:
         """See `NetworkModule`; with the id of the Gaussian."""
-        name = super()._offender()
+        name = super()._find_nonfinite()
         if name not in edit.row_parameters(self.model, self.count):
             return name
         bad = ~torch.isfinite(self.model.get_parameter(name))

@@ -50,14 +50,14 @@ def solve_readout(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solv
     emission = model.emission.settings
     if emission.hidden or emission.activation != "linear":
         return None
-    rendered = _lines(model) @ _view(model, batch.rx)
+    rendered = _feature_weights(model) @ _unit_views(model, batch.rx)
     trial = copy.deepcopy(model)
     edit.apply_edit(change, trial, trial.gaussians)
-    view = _view(trial, batch.rx)
+    view = _unit_views(trial, batch.rx)
     # float64: eigenvalues of footprints that overlap are lost in float32's rounding.
     gram = (view @ view.mH).to(torch.complex128 if view.is_complex() else torch.float64)
     ridge = RIDGE * gram.diagonal().real.mean() * torch.eye(len(gram), device=gram.device)
-    missing = (rendered - _lines(trial) @ view) @ view.mH
+    missing = (rendered - _feature_weights(trial) @ view) @ view.mH
     lines = Factor.from_gram(gram + ridge).solve(missing.to(gram.dtype).mH).mH.to(view.dtype)
     correction = torch.view_as_real(lines) if lines.is_complex() else lines.unsqueeze(-1)
     trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
@@ -66,13 +66,13 @@ def solve_readout(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solv
     return SolvedReadout(trial.emission.weight2, trial.emission.bias2, batch.share * error.square().mean())
 
 
-def _lines(model: GaussianModel) -> Tensor:
+def _feature_weights(model: GaussianModel) -> Tensor:
     """Weights of all features and the constant (E + 1, N), complex where an array measures."""
     parts = torch.cat([model.emission.weight2.transpose(0, 1), model.emission.bias2[None]])
     return torch.view_as_complex(parts.contiguous()) if parts.shape[-1] == 2 else parts.squeeze(-1)
 
 
-def _view(model: GaussianModel, rx: Pose) -> Tensor:
+def _unit_views(model: GaussianModel, rx: Pose) -> Tensor:
     """What unit emissions of all Gaussians look like (N, P), or (N, M) complex to the array.
 
     Attenuation is that of the middle of the moving end's box: it hardly differs between a Gaussian and what
@@ -84,5 +84,5 @@ def _view(model: GaussianModel, rx: Pose) -> Tensor:
         each = torch.eye(len(model.gaussians), device=model.gaussians.means.device)
         view = model.freeze(rx).render(each, int(model.gaussians.version)).flatten(1)
     middle = torch.as_tensor(model.site.box).float().mean(0, keepdim=True).to(model.gaussians.means.device)
-    attenuation = model.attenuation(model.distances(middle))
+    attenuation = model.attenuation(model.relative_distances(middle))
     return view if attenuation is None else view * attenuation[0, :, None]

@@ -16,7 +16,7 @@ from gsparc.data.limits import Checked, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
 from gsparc.ops.channels import channels
-from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering
+from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering_matrix
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.waves import LIGHT
 
@@ -104,7 +104,7 @@ class ArrayResponse(nn.Module):
             raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
         self.array, self.grid, self.wavelength = site.array_geometry()
         self.normalisation = site.normalisation
-        matrix = steering(self.array, self.grid, self.wavelength).to(torch.complex64)
+        matrix = steering_matrix(self.array, self.grid, self.wavelength).to(torch.complex64)
         self.register_buffer("matrix", matrix, persistent=False)
         elements = element_pattern(self.grid, pattern) if pattern else None
         self.register_buffer("pattern", elements, persistent=False)
@@ -125,7 +125,7 @@ class ArrayResponse(nn.Module):
     def background(self, image: Tensor) -> None:
         self.renderer.square.copy_(image.square())
 
-    def coarsen(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
+    def coarse_renderer(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
         """Return the renderer on `grid`, every `stride`-th row and column of its own."""
         return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
 

@@ -23,12 +23,12 @@ class StageBudget(L.Callback):
     """
 
     def __init__(self, budget: TimeBudget) -> None:
-        self.budget, self._begin, self._process = budget, budget.counted, os.getpid()
+        self.budget, self._begin, self._process = budget, budget.by_clock, os.getpid()
         self._resumed = NOTHING
 
     @property
-    def _learned(self) -> Spent:
-        return self.budget.counted - self._begin
+    def _spent_learning(self) -> Spent:
+        return self.budget.by_clock - self._begin
 
     def _stop_if_spent(self, trainer: L.Trainer) -> None:
         if first_process_value(float(self.budget.is_spent()), trainer):
@@ -41,7 +41,7 @@ class StageBudget(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Leave out what making the Trainer took, which is no part of the stage; look at the clock."""
-        self._begin = self._begin + (self._learned - self._resumed)
+        self._begin = self._begin + (self._spent_learning - self._resumed)
         self._stop_if_spent(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
@@ -50,11 +50,11 @@ class StageBudget(L.Callback):
 
     def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
         """Bring home what was spent; only metrics leave the process where there are several devices."""
-        trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.counted), dtype=torch.float64)
+        trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.by_clock), dtype=torch.float64)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the seconds spent, so that a resumed run has only the rest."""
-        return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
+        return {"seconds": self._spent_learning.wall, "processor_s": self._spent_learning.processor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""

@@ -26,11 +26,11 @@ from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.target_rows import TINY_POWER
-from gsparc.physics.row_factors import Freedom, align_factors, freedom_words
+from gsparc.physics.row_factors import Freedom, align_factors, describe_freedom
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import neighbour_weights
-from gsparc.processes.neighbourhood import covering_rows, spacing
+from gsparc.processes.neighbourhood import covering_rows, median_spacing
 from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 
 log = logging.getLogger(__name__)
@@ -93,7 +93,7 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     )
     log.info(
         "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
-        len(known), freedom_words(site.freedom), float(np.mean([one.error for one in found])),
+        len(known), describe_freedom(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
     turned = replace(
@@ -152,7 +152,7 @@ def align_rows(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if freedom == "phase+delay+gain":
         values = values / _rms_of_rows(values)[:, None, None]
-    length = site.wavelength or SPACINGS * spacing(rows.places)
+    length = site.wavelength or SPACINGS * median_spacing(rows.places)
     one = _Rows(rows.places, values, rows.tones, freedom, length)
     found = [one.refine_by_neighbours(one.align_along_tree(None))]
     direct = _direct_wave(rows, site)
@@ -196,7 +196,7 @@ class _Rows:
 
     def refine_by_neighbours(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by a process of two lengths; return the round that tells rows best."""
-        kernel, found = initial_kernel(self.length, spacing(self.places)), []
+        kernel, found = initial_kernel(self.length, median_spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._sweep_factors(factors, self._neighbour_weights(kernel), SWEEPS)
             found.append(

@@ -37,7 +37,7 @@ from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import Spent, less_repeatable
+from gsparc.training.time_budget import Spent, worst_clock
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +151,7 @@ class PerStation(Method):
             rows, part = self._rows_and_measurements(data, number)
             # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            before = budget.counted.wall
+            before = budget.by_clock.wall
             try:
                 copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
             except KeyboardInterrupt:
@@ -163,7 +163,7 @@ class PerStation(Method):
             if resumable and len(numbers) > 1:
                 extra = fitting.run_extra(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
-            earlier = max(report.seconds - (budget.counted.wall - before), 0.0)  # by the interrupted run
+            earlier = max(report.seconds - (budget.by_clock.wall - before), 0.0)  # by the interrupted run
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
@@ -176,9 +176,9 @@ class PerStation(Method):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
-        limited = less_repeatable(*(one.limited_by for one in reports))
+        limited = worst_clock(*(one.limited_by for one in reports))
         return FitReport(
-            budget.counted.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())
+            budget.by_clock.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())
         )
 
     def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:

@@ -20,11 +20,11 @@ from gsparc.ops import SphereGrid
 SAME_LAG = 1e-4  # two element differences closer than this many wavelengths are one lag
 
 
-def steering(array: np.ndarray, grid: SphereGrid, wavelength: float) -> Tensor:
+def steering_matrix(array: np.ndarray, grid: SphereGrid, wavelength: float) -> Tensor:
     """Return the steering matrix A (M, H * W) complex128: `exp(+j k u.a_m)`.
 
     >>> array = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]])  # half a wavelength of 10 cm apart
-    >>> steering(array, SphereGrid.hemisphere(1, 4), 0.1)[1].real.round(decimals=3)
+    >>> steering_matrix(array, SphereGrid.hemisphere(1, 4), 0.1)[1].real.round(decimals=3)
     tensor([-1.,  1., -1.,  1.], dtype=torch.float64)
 
     Args:
@@ -46,7 +46,7 @@ def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tenso
 
     Args:
         waves: arriving field per direction, complex.
-        matrix: A of `steering`, same precision as `waves`.
+        matrix: A of `steering_matrix`, same precision as `waves`.
         grid: its solid angles are the weights of the sum.
         pattern: (H, W) element amplitude; None for isotropic elements.
     """
@@ -54,12 +54,12 @@ def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tenso
     return (waves * weight.to(waves.real.dtype)).flatten(1) @ matrix.T
 
 
-def bartlett(vectors: Tensor, matrix: Tensor) -> Tensor:
+def bartlett_spectrum(vectors: Tensor, matrix: Tensor) -> Tensor:
     """Return `|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is taken as 0.
 
     >>> array, grid = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), SphereGrid.hemisphere(1, 4)
-    >>> matrix = steering(array, grid, 0.1)
-    >>> bartlett(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y: x is where it interferes
+    >>> matrix = steering_matrix(array, grid, 0.1)
+    >>> bartlett_spectrum(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y interferes at x
     tensor([[0., 2., 0., 2.]], dtype=torch.float64)
     """
     return _SafeAbsolute.apply(vectors @ matrix.conj())
@@ -117,13 +117,13 @@ class CoArray:
     imag_pairs: Tensor
     elements: int
 
-    def basis(self, grid: SphereGrid, wavelength: float) -> Tensor:
+    def spectrum_basis(self, grid: SphereGrid, wavelength: float) -> Tensor:
         """Return B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`, r the zero lag, real and imaginary parts."""
         phase = grid.directions().reshape(-1, 3) @ torch.from_numpy(self.difference[1:].T)
         phase = 2 * math.pi / wavelength * phase
         return torch.cat([torch.ones(len(phase), 1, dtype=torch.float64), phase.cos(), phase.sin()], 1)
 
-    def forms(self) -> Tensor:
+    def quadratic_forms(self) -> Tensor:
         """Return symmetric S (2 L - 1, 2 M, 2 M) float64 with `r_i = v^T S_i v`, v = (Re h, Im h)."""
         m = self.elements
         real = self.real_pairs.T.reshape(-1, m, m)
@@ -133,11 +133,11 @@ class CoArray:
         return (whole + whole.transpose(1, 2)) / 2
 
 
-def co_array(array: np.ndarray, wavelength: float) -> CoArray:
+def make_co_array(array: np.ndarray, wavelength: float) -> CoArray:
     """Return the co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one.
 
     >>> square = np.stack([*np.meshgrid(np.arange(4), np.arange(4)), np.zeros((4, 4))], -1).reshape(-1, 3)
-    >>> co_array(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
+    >>> make_co_array(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
     (25, 3)
     """
     array = np.asarray(array, dtype=np.float64)

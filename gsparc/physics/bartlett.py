@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.ops import SphereGrid
-from gsparc.physics.array_response import co_array
+from gsparc.physics.array_response import make_co_array
 
 TINY = 1e-9  # of a squared spectrum: keeps the slope of the square root finite
 NEGLIGIBLE = 1e-9  # harmonics this much weaker than the strongest are below float32's resolution
@@ -34,14 +34,14 @@ class SpectrumRenderer(nn.Module):
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float, background: Tensor) -> None:
         super().__init__()
-        known = co_array(array, wavelength)
+        known = make_co_array(array, wavelength)
         # Half a turn of azimuth takes d.u to -d.u for elements in a plane: cosines stay, sines change sign.
         planar = float(np.ptp(array[:, 2])) < 1e-6 * wavelength
         self.half_turn = planar and grid.periodic and grid.width % 2 == 0
         pairs = torch.stack([known.real_pairs, known.imag_pairs], 1).flatten(0, 1)
         self.register_buffer("pairs", pairs.float())
         self.register_buffer("square", background.float().square())
-        basis = known.basis(grid, wavelength).view(grid.height, grid.width, -1)
+        basis = known.spectrum_basis(grid, wavelength).view(grid.height, grid.width, -1)
         count = len(known.difference)
         self.spans = [slice(0, count), slice(count, None)] if self.half_turn else [slice(None)]
         columns = grid.width // 2 if self.half_turn else grid.width
@@ -52,7 +52,7 @@ class SpectrumRenderer(nn.Module):
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Render spectra (B, H, W) of (B, M + 1) complex64: array vectors and last the share f."""
-        parts = self._parts(vectors)
+        parts = self._square_parts(vectors)
         square = torch.cat([parts[0] + parts[1], parts[0] - parts[1]], 2) if self.half_turn else parts[0]
         share = vectors[:, -1].real.square()[:, None, None]
         return (square + share * self.square).clamp_min(TINY).sqrt()
@@ -63,7 +63,7 @@ class SpectrumRenderer(nn.Module):
         names = [f"{name}{number}" for number in range(len(self.spans)) for name in ("table", "waves")]
         return [self.pairs, *(getattr(self, name) for name in names)]
 
-    def _parts(self, vectors: Tensor) -> list[Tensor]:
+    def _square_parts(self, vectors: Tensor) -> list[Tensor]:
         """The coherent square (B, H, W), or what of it stays and what flips half a turn on (B, H, W / 2)."""
         h = vectors[:, :-1]
         products = torch.view_as_real(h[:, :, None] * h[:, None, :].conj())

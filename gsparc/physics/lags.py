@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import SphereGrid
-from gsparc.physics.array_response import co_array
+from gsparc.physics.array_response import make_co_array
 from gsparc.physics.separable import Separable, fit_separable
 
 BLOCK = 128  # images at once
@@ -33,7 +33,7 @@ class SpectrumLags:
     """
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
-        known = co_array(array, wavelength)
+        known = make_co_array(array, wavelength)
         differences = 2 * np.pi * np.round(known.difference / wavelength, 6)  # radians per unit of direction
         self._differences = torch.from_numpy(differences.T).float()
         # Of the pairs that are d apart, half are so the other way round.
@@ -53,11 +53,11 @@ class SpectrumLags:
         self._inverse = torch.linalg.solve(gram, exact).T
 
     @property
-    def image(self) -> tuple[int, int]:
+    def image_shape(self) -> tuple[int, int]:
         """Height and width [pixels]."""
-        return self.pixels.image
+        return self.pixels.image_shape
 
-    def atoms(self, directions: Tensor) -> Tensor:
+    def plane_wave_lags(self, directions: Tensor) -> Tensor:
         """Return lags (..., count) float32 of plane waves of unit power from unit vectors (..., 3)."""
         angle = directions @ self._differences
         return torch.cat([self._share * angle.cos(), self._share[1:] * angle[..., 1:].sin()], dim=-1)

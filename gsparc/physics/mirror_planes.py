@@ -17,10 +17,10 @@ NO_PLANES = torch.zeros(0, 4, dtype=torch.float64)
 Reflections = tuple[int, ...]  # indices of planes, in the order in which they mirror
 
 
-def normal_form(planes: Tensor) -> tuple[Tensor, Tensor]:
+def hesse_form(planes: Tensor) -> tuple[Tensor, Tensor]:
     """Return unit normals (..., 3) and offsets (..., 1) [m] of planes (..., 4), Hesse's normal form.
 
-    >>> normal_form(torch.tensor([0.0, 0.0, 2.0, 3.0]))
+    >>> hesse_form(torch.tensor([0.0, 0.0, 2.0, 3.0]))
     (tensor([0., 0., 1.]), tensor([3.]))
     """
     normal, offset = planes.split((3, 1), -1)
@@ -33,7 +33,7 @@ def reflect(points: Tensor, planes: Tensor) -> Tensor:
     >>> reflect(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0, 0.0]))  # in the floor z = 0
     tensor([ 1.,  2., -3.])
     """
-    normal, offset = normal_form(planes)
+    normal, offset = hesse_form(planes)
     height = (points * normal).sum(-1, keepdim=True) - offset
     return points - 2 * height * normal
 

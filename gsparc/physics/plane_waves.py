@@ -85,7 +85,7 @@ class Columns:
             over_tones = torch.cat([by_tones, by_tones, over_tones], side)
         return over_antennas * over_tones
 
-    def inner(self, snapshot: Tensor) -> Tensor:
+    def inner_products(self, snapshot: Tensor) -> Tensor:
         """Return inner products (B, 4 N) of all columns with snapshots (B, A, K)."""
         n, (antennas, tones) = self.antennas.shape[2], self._flat()
         correlation = antennas.conj() @ snapshot
@@ -96,7 +96,7 @@ class Columns:
     def _flat(self) -> tuple[Tensor, Tensor]:
         return self.antennas.flatten(1, 2), self.tones.flatten(1, 2)
 
-    def response(self, gain: Tensor) -> Tensor:
+    def channels(self, gain: Tensor) -> Tensor:
         """Return channels (B, A, K) of the atoms with gains (B, N)."""
         return (self.antennas[:, 0] * gain[..., None]).transpose(1, 2) @ self.tones[:, 0]
 

@@ -7,13 +7,13 @@ import numpy as np
 MIN_ANGLE = 0.02  # [rad]: more parallel rays have no well-defined crossing
 
 
-def closest_approach(
+def closest_ranges_and_gap(
     first: np.ndarray, first_rays: np.ndarray, second: np.ndarray, second_rays: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the closest points of every pair of rays from two places.
 
     >>> x, y = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
-    >>> ranges = closest_approach(np.zeros(3), x, np.array([2.0, -1.0, 0.0]), y)
+    >>> ranges = closest_ranges_and_gap(np.zeros(3), x, np.array([2.0, -1.0, 0.0]), y)
     >>> [float(one[0, 0]) for one in ranges]  # 2 m along the one, 1 m along the other, where they meet
     [2.0, 1.0, 0.0]
 

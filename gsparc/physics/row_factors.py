@@ -18,10 +18,10 @@ MOST_DELAYS = 1024
 AT_ONCE = 4_096  # rows whose delays are tried together: memory
 
 
-def freedom_words(freedom: Freedom) -> str:
+def describe_freedom(freedom: Freedom) -> str:
     """Say in words what is free, for messages: `a phase and a delay`.
 
-    >>> freedom_words("phase+delay+gain")
+    >>> describe_freedom("phase+delay+gain")
     'a phase, a delay and a gain'
     """
     parts = [f"a {part}" for part in freedom.split("+")]

@@ -27,7 +27,7 @@ class Separable:
     columns: Tensor
 
     @property
-    def image(self) -> tuple[int, int]:
+    def image_shape(self) -> tuple[int, int]:
         """Height and width [pixels]."""
         return len(self.rows), self.columns.shape[1]
 
@@ -65,10 +65,10 @@ def fit_separable(blocks: Iterable[Tensor], lost: float) -> Separable:
         row_gram, column_gram = row_gram + (sides.T @ sides).double(), column_gram + (flat.T @ flat).double()
     if row_gram.ndim == 0:
         raise ValueError("a basis of images needs images")
-    return Separable(_principal(row_gram, lost).contiguous(), _principal(column_gram, lost).T.contiguous())
+    return Separable(_main_axes(row_gram, lost).contiguous(), _main_axes(column_gram, lost).T.contiguous())
 
 
-def _principal(gram: Tensor, lost: float) -> Tensor:
+def _main_axes(gram: Tensor, lost: float) -> Tensor:
     """Eigenvectors (P, K) float32 of the largest eigenvalues; the others hold at most the share `lost`."""
     values, vectors = torch.linalg.eigh(gram)
     # `eigh` sorts upwards: the first whose sum stays below the share are the ones that go.

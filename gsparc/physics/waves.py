@@ -44,15 +44,15 @@ def reduced_phase(
     Returns:
         (...) [rad].
     """
-    cycles = distance.double() * (_double(frequency_hz, distance) / LIGHT)
+    cycles = distance.double() * (_to_float64(frequency_hz, distance) / LIGHT)
     # Whole turns have no slope, so that the gradient is that of the phase before they went.
     return ((cycles.detach().round() - cycles) * (2 * math.pi)).to(dtype)
 
 
-def wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32) -> Tensor:
+def point_wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32) -> Tensor:
     """Return `exp(-j 2 pi f r / c) / r` of parts `dtype`; distances [m] and frequencies [Hz] broadcast.
 
-    >>> wave(torch.tensor([2.0, 4.0]), LIGHT).real  # whole wavelengths of 1 m
+    >>> point_wave(torch.tensor([2.0, 4.0]), LIGHT).real  # whole wavelengths of 1 m
     tensor([0.5000, 0.2500])
     """
     return torch.polar((1 / distance).to(dtype), reduced_phase(distance, frequency_hz, dtype))
@@ -67,23 +67,23 @@ def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = 
     >>> wave_over_band(torch.tensor([3.0, 5.0]), torch.linspace(2.40e9, 2.42e9, 64)).shape
     torch.Size([2, 64])
     """
-    frequency = _double(frequency_hz, distance)
+    frequency = _to_float64(frequency_hz, distance)
     tones = len(frequency)
-    if tones < 6 or not evenly_spaced(frequency):
-        return wave(distance[..., None], frequency, dtype)
+    if tones < 6 or not is_comb(frequency):
+        return point_wave(distance[..., None], frequency, dtype)
     # The root of the number of tones, rounded up: both combs together are then as short as can be.
     fine = math.isqrt(tones - 1) + 1
-    coarse = wave(distance[..., None], frequency[::fine], dtype)
+    coarse = point_wave(distance[..., None], frequency[::fine], dtype)
     steps = frequency[:fine] - frequency[0]
     turn = reduced_phase(distance[..., None], steps, dtype)
     comb = torch.polar(torch.ones_like(turn), turn)
     return (coarse[..., :, None] * comb[..., None, :]).flatten(-2)[..., :tones]
 
 
-def evenly_spaced(frequency: Tensor) -> bool:
+def is_comb(frequency: Tensor) -> bool:
     """Tell whether tones (F,) [Hz] are a comb.
 
-    >>> evenly_spaced(torch.tensor([0.0, 1e6, 2e6])), evenly_spaced(torch.tensor([0.0, 1e6, 3e6]))
+    >>> is_comb(torch.tensor([0.0, 1e6, 2e6])), is_comb(torch.tensor([0.0, 1e6, 3e6]))
     (True, False)
     """
     step = frequency.diff()
@@ -91,5 +91,5 @@ def evenly_spaced(frequency: Tensor) -> bool:
     return bool(((step - step.mean()).abs().cumsum(0) < 50.0).all())
 
 
-def _double(value: Tensor | float, like: Tensor) -> Tensor:
+def _to_float64(value: Tensor | float, like: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=torch.float64, device=like.device)

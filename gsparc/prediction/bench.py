@@ -75,7 +75,7 @@ def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
     features = torch.rand(1, count, 2, generator=draw)
     size = f"{count} {projection}"
 
-    def case(name: str, call: Callable[[str | None], object]) -> Case:
+    def make_case(name: str, call: Callable[[str | None], object]) -> Case:
         return Case(
             *(name, size, lambda: call(None)), (lambda: call("reference")) if count <= MOST_DENSE else None
         )
@@ -99,8 +99,8 @@ def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
     def plan(backend: str | None) -> Plan:
         return make_plan(*geometry, pose, GRID, projection=projection, backend=backend)
 
-    yield case("plan", plan)
-    yield case("plan and blend, moving receiver", forward)
+    yield make_case("plan", plan)
+    yield make_case("plan and blend, moving receiver", forward)
     frozen = freeze(plan(None), *geometry, version=0)
     # Plain PyTorch has no frozen views: its own plan, made once, is composited.
     dense = plan("reference") if count <= MOST_DENSE else None
@@ -111,12 +111,12 @@ def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
 
     reference = None if dense is None else again
     yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), reference)
-    yield case("forward and gradients", backward)
-    yield case("weights of channels", weights)
-    yield from _around(count, draw)
+    yield make_case("forward and gradients", backward)
+    yield make_case("weights of channels", weights)
+    yield from _network_cases(count, draw)
 
 
-def _around(count: int, generator: torch.Generator) -> Iterator[Case]:
+def _network_cases(count: int, generator: torch.Generator) -> Iterator[Case]:
     """What stands beside the rasterizer: networks of emission and the sum of a channel."""
     emission = random_model(count, "tangent").emission
     layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
@@ -154,18 +154,18 @@ def loss_case() -> Case:
 
 def training_step_case(projection: Projection, count: int = STEPPED) -> Case:
     """Return a training step: emission, plan, blending, loss, gradients and Adam."""
-    ours, plain = (_learning(random_model(count, projection, backend)) for backend in (None, "reference"))
+    ours, plain = (_make_step(random_model(count, projection, backend)) for backend in (None, "reference"))
     return Case("training step", f"{count} {projection} x {BATCH}", ours, plain)
 
 
-def _learning(model: GaussianModel) -> Callable[[], Tensor]:
+def _make_step(model: GaussianModel) -> Callable[[], Tensor]:
     optimizer, draw = optimizer_for(model, OptimizerSettings()), torch.Generator().manual_seed(0)
     target = torch.rand((BATCH, GRID.height, GRID.width), generator=draw)
     tx = torch.randn(BATCH, 3, generator=draw)
 
     def call() -> Tensor:
         optimizer.zero_grad(set_to_none=True)
-        image = model.rasterize(model.features(tx, Pose.identity(tx)), Pose.identity(torch.zeros(3))).image
+        image = model.rasterize(model.emissions(tx, Pose.identity(tx)), Pose.identity(torch.zeros(3))).image
         result = spectrum_loss(image.squeeze(1), target).mean()
         result.backward()
         optimizer.step()

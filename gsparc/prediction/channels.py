@@ -54,7 +54,7 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     # Tones a step apart tell delays within 1 / step alone from each other.
     window = min(WINDOW_S, 0.8 / step)
     # The mean delay is taken off and put back: the window lies about it.
-    turn = _mean_turn(channel) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
+    turn = _mean_phase_step(channel) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
     middle = float(tones_hz.mean())
     straight = channel * torch.polar(
         torch.ones(()), -turn[..., None] * torch.from_numpy((tones_hz - middle) / step).float()
@@ -69,7 +69,7 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     return (straight @ matrix) * back
 
 
-def _mean_turn(channel: Tensor) -> Tensor:
+def _mean_phase_step(channel: Tensor) -> Tensor:
     """Phase per tone of the mean delay (...)."""
     return torch.angle((channel[..., 1:] * channel[..., :-1].conj()).sum(-1))
 
@@ -137,14 +137,14 @@ def uplink_channels(method: Method, site: Site, uplink: Any, frequency_hz: Any =
         return method.predict(query).mean * site.target_scale
     wanted = torch.from_numpy(np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64)))
     assert query.uplink is not None
-    return _separator(method).predict_from_uplink(query.uplink, wanted).mean * site.target_scale
+    return _require_paths(method).predict_from_uplink(query.uplink, wanted).mean * site.target_scale
 
 
 def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """Return the sources of uplinks (B, U, L), physical units; see `uplink_query`."""
     query = uplink_query(method, site, uplink)
     assert query.uplink is not None and site.uplink_hz is not None
-    sources = _separator(method).find_sources(query.uplink)
+    sources = _require_paths(method).find_sources(query.uplink)
     # Delays of sources are in turns per tone: over the spacing they are seconds.
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
     gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()
@@ -188,7 +188,7 @@ def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: in
     return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
 
 
-def _separator(method: Method) -> SeparatesPaths:
+def _require_paths(method: Method) -> SeparatesPaths:
     if not isinstance(method, SeparatesPaths):
         raise ValueError(f"uplink=: {method.name} knows only the measured tones, no paths (model=uplink)")
     return method

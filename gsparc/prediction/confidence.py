@@ -23,23 +23,23 @@ from gsparc.prediction.query import Queries, match_input
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, join_evidence
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.stored import Stored, restored, stored
+from gsparc.processes.stored import Stored, from_plain, to_plain
 
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
 def gather_evidence(
-    method: Method, data: Measurements, fold: Fold, rows: np.ndarray, own: Measurements | None = None
+    method: Method, data: Measurements, fold: Fold, rows: np.ndarray, seen: Measurements | None = None
 ) -> Evidence:
-    """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `own` or `data`."""
+    """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `seen` or `data`."""
     evidence = join_evidence(
         [
             Evidence(rows[chosen], data.moving[rows[chosen]], *errors_and_scores(said, batch.target))
             for chosen, batch, said in predict_in_batches(method, data, rows)
         ]
     )
-    return replace(evidence, scores=evidence.scores | position_scores(own or data, fold, evidence.position))
+    return replace(evidence, scores=evidence.scores | position_scores(seen or data, fold, evidence.position))
 
 
 def errors_and_scores(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -111,7 +111,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
     rows = torch.from_numpy(known)
-    white = Factor.from_gram(kernel.gram(rows)).whiten(kernel.between(rows, torch.from_numpy(places)))
+    white = Factor.from_gram(kernel.gram(rows)).whiten(kernel.correlations(rows, torch.from_numpy(places)))
     # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
     return (1 + kernel.noise - white.square().sum(0)).numpy()
 
@@ -157,7 +157,7 @@ class Trusted(Stored):
         kind = kind or self.kind or "learned"
         return as_confidence(kind, self._score(kind, prediction, places)).astype(np.float32)
 
-    def check(self, kind: str) -> None:
+    def check_kind(self, kind: str) -> None:
         """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""
         if kind not in KINDS:
             raise ValueError(f"confidence={kind}: expected one of {', '.join(KINDS)}")
@@ -168,7 +168,7 @@ class Trusted(Stored):
             )
 
     def _score(self, kind: str, prediction: Prediction, places: np.ndarray | None) -> np.ndarray:
-        self.check(kind)
+        self.check_kind(kind)
         if kind in RIVALS:
             assert self.kernel is not None
             if places is None:
@@ -195,12 +195,12 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def store_trusted(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    checkpoint.update_extra(path, {KEY: stored(trusted)})
+    checkpoint.update_extra(path, {KEY: to_plain(trusted)})
 
 
 def read_trusted(extra: Mapping[str, Any]) -> Trusted:
     """Return what a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
-    return restored(extra[KEY]) if KEY in extra else Trusted()
+    return from_plain(extra[KEY]) if KEY in extra else Trusted()
 
 
 def confidence_threshold(kind: str, threshold: Threshold) -> float:
@@ -233,7 +233,7 @@ class ConfidenceMixin:
         Raises:
             ValueError: the method has no confidence of that kind.
         """
-        return match_input(*self._sure(tx, rx, uplink))
+        return match_input(*self._query_confidence(tx, rx, uplink))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
@@ -257,7 +257,7 @@ class ConfidenceMixin:
             raise ValueError(
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
             )
-        sure, single, as_torch = self._sure(tx, rx, uplink)
+        sure, single, as_torch = self._query_confidence(tx, rx, uplink)
         good = sure >= self.trusted.threshold
         if uplink is None:  # an uplink has no place
             places = self.queries.query(tx, rx).query.places(self.site).numpy()
@@ -265,25 +265,25 @@ class ConfidenceMixin:
         good = match_input(good, single, as_torch)
         return bool(good) if single and not as_torch else good
 
-    def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
+    def _query_confidence(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
         """Confidences (B,), whether one was wanted, and whether torch was given."""
         if uplink is not None:
             from gsparc.prediction import channels
 
-            sure = self._confidence(
+            sure = self._method_confidence(
                 self.method.predict(channels.uplink_query(self.method, self.site, uplink)), None
             )
             single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
         else:
             query, single, as_torch = self.queries.query(tx, rx)
-            sure = self._confidence(predict_with_threads(self._whole, query), query)
+            sure = self._method_confidence(predict_with_threads(self._whole, query), query)
         if sure is None:
             raise ValueError(f"{self.method.name} has no confidence")
         return sure, single, as_torch
 
-    def _confidence(self, own: Prediction, query: Query | None) -> Tensor | None:
+    def _method_confidence(self, prediction: Prediction, query: Query | None) -> Tensor | None:
         """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
-        if own.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
+        if prediction.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             return None
         places = None if query is None else query.places(self.site).numpy()
-        return torch.from_numpy(self.trusted.confidence(own, places, self.kind))
+        return torch.from_numpy(self.trusted.confidence(prediction, places, self.kind))

@@ -66,7 +66,7 @@ def fit(
     """
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
     given = {name: np.asarray(value) for name, value in inputs.items() if value is not None}
-    raw = Raw(given, {}) if rssi is None else _of_powers(given, np.asarray(rssi), unit)
+    raw = Raw(given, {}) if rssi is None else _raw_powers(given, np.asarray(rssi), unit)
     raw.attributes["name"] = "arrays"  # the source is of messages
     try:
         reading = interpret(raw, "gsparc.fit")
@@ -82,7 +82,7 @@ def fit(
             f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
         )
     factory = wrap_per_station(kind(**own), data)
-    fold = _learned_from(data, VALIDATED if factory.takes_budget else 0.0, seed)
+    fold = _split_validation(data, VALIDATED if factory.takes_budget else 0.0, seed)
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
     method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
@@ -92,7 +92,7 @@ def fit(
     return Predictor(method, data.site)
 
 
-def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
+def _raw_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
     """Arrays of the schema with powers in a unit: watts, or decibels as they are."""
     stations = powers.shape[1] if powers.ndim == 2 else 1
     for end in ("rx", "tx"):
@@ -113,7 +113,7 @@ def _of_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> 
     return Raw({**arrays, "rssi": powers}, about)
 
 
-def _learned_from(data: Measurements, share: float, seed: int) -> Fold:
+def _split_validation(data: Measurements, share: float, seed: int) -> Fold:
     """All rows; those at a share of the places validate. Nothing is left to test on."""
     rows = np.arange(len(data))
     places, which = np.unique(rows if data.place is None else data.place, return_inverse=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,10 +15,18 @@ from gsparc.ops.transforms import carries_tangent, has_vmap_axis, transform_is_a
 from gsparc.prediction.query import Queries
 
 
+class FollowedPrediction(NamedTuple):
+    """Moments in stored units, in float64, the precision of the positions, and whether one was given."""
+
+    moments: Prediction
+    dtype: torch.dtype
+    single: bool
+
+
 def predict_with_gradients(
     method: Method, queries: Queries, tx: Any, rx: Any, prepared: list[Method]
-) -> tuple[Prediction, torch.dtype, bool]:
-    """Return moments in stored units, in float64, the precision of the positions, and whether one was given.
+) -> FollowedPrediction:
+    """Return a prediction with gradients by position.
 
     Args:
         method: that answers.
@@ -60,4 +68,4 @@ def predict_with_gradients(
     for value in ends.values():
         # Computed in float64, answered as precisely as the positions were given.
         dtype = torch.promote_types(dtype, value.dtype)
-    return moments, dtype, single
+    return FollowedPrediction(moments, dtype, single)

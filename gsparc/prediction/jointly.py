@@ -30,8 +30,8 @@ class JointMixin:
             places: (G, 3) of the moving end, world [m]; (G, k, 3): one for each of `stations`.
             stations: (k,) numbers.
         """
-        known = self._known()
-        return None if known is None else self._together(known, places, torch.as_tensor(stations))
+        known = self._joint_method()
+        return None if known is None else self._predict_levels(known, places, torch.as_tensor(stations))
 
     def predict_new(self, places: Any, station: Any, sectors: Any) -> tuple[np.ndarray, np.ndarray] | None:
         """Return levels (G, k) and deviations [dB] of k sectors that are not there yet, see `predict_joint`.
@@ -42,19 +42,19 @@ class JointMixin:
             sectors: (k, 5) azimuth from north, -1 without a pattern, tilt, widths across and in height
                 [deg], and power over the mean of those that stand [dB].
         """
-        if (known := self._known()) is None:
+        if (known := self._joint_method()) is None:
             return None
         still = np.asarray(station, np.float64) - self.site.origin
         more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64))
         count = 0 if self.site.stations is None else len(self.site.stations)
-        level, covariance, _ = self._together(more, places, count + torch.arange(len(sectors)))
+        level, covariance, _ = self._predict_levels(more, places, count + torch.arange(len(sectors)))
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
-    def _known(self) -> HasJoint | None:
+    def _joint_method(self) -> HasJoint | None:
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None
         return None if every is None else every.joint_method()
 
-    def _together(self, known: HasJoint, places: Any, stations: torch.Tensor) -> JointLevels:
+    def _predict_levels(self, known: HasJoint, places: Any, stations: torch.Tensor) -> JointLevels:
         moving = torch.from_numpy(np.asarray(places, np.float64) - self.site.origin)
         if moving.dim() == 2:
             moving = moving[:, None].expand(-1, len(stations), 3)

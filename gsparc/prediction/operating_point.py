@@ -20,7 +20,7 @@ from gsparc.prediction.confidence import read_trusted
 from gsparc.prediction.pareto import Point, Settings
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, time_interleaved
-from gsparc.processes.stored import Stored, restored, stored
+from gsparc.processes.stored import Stored, from_plain, to_plain
 
 KEY = "operating"
 
@@ -52,13 +52,13 @@ def store_points(path: Path, points: Sequence[Point], figure: str, measured: Mea
         Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
         for p in points
     ]
-    checkpoint.update_extra(path, {KEY: {"points": stored(found), "measured": measured}})
+    checkpoint.update_extra(path, {KEY: {"points": to_plain(found), "measured": measured}})
 
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
     """Return the points in a checkpoint's `extra`, none when it was never swept."""
     sweep = extra.get(KEY) or {"points": [], "measured": {}}
-    return [*restored(sweep["points"])], dict(sweep["measured"])
+    return [*from_plain(sweep["points"])], dict(sweep["measured"])
 
 
 log = logging.getLogger(__name__)
@@ -136,6 +136,6 @@ def load(
     method, stored = loading.load(path)
     trusted = read_trusted(stored.extra)
     if confidence is not None:
-        trusted.check(confidence)
+        trusted.check_kind(confidence)
     chosen, point = (method, None) if budget_ms is None else choose_within_budget(method, stored, budget_ms)
     return Predictor(chosen, stored.site, method, point, trusted, confidence, stored.extra, unit)

@@ -64,10 +64,11 @@ def to_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     return world
 
 
-def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, float]:
+def far_outside_and_margin(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, float]:
     """Tell which places (n,) bool lie farther outside the training places' box than a margin, and that [m].
 
-    >>> far, margin = far_outside({"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}, predictor.site)
+    >>> places = {"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}
+    >>> far, margin = far_outside_and_margin(places, predictor.site)
     >>> far, 0 < margin < 1  # a tenth of the longer side
     (array([False,  True]), True)
     """
@@ -87,7 +88,7 @@ def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) 
     # With heights as measured: if these places are inside, height alone is what was wrong.
     inside = np.clip(heights, low, high)
     flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(ends)}
-    if far_outside(flat, site)[0].any():
+    if far_outside_and_margin(flat, site)[0].any():
         return ""
     beyond = (heights - inside)[far].ravel()
     most = float(beyond[np.abs(beyond).argmax()])
@@ -108,7 +109,7 @@ def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Si
     return f"{here}: degrees or km as x and y?"
 
 
-def match_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
+def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Return row of the places and station (N,) int64 of each prediction; -1 without stations.
 
     Args:

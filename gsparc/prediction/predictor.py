@@ -19,7 +19,7 @@ from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
 from gsparc.models.method import HasGaussians, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
-from gsparc.physics.row_factors import freedom_words
+from gsparc.physics.row_factors import describe_freedom
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
 from gsparc.prediction.gradients import predict_with_gradients
 from gsparc.prediction.jointly import JointMixin
@@ -78,7 +78,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         self._whole = whole or method
         self.queries = Queries(site)
         self._unit = unit
-        self.unit = self._in(None).name  # "1" of channels and spectra
+        self.unit = self._answer_unit(None).name  # "1" of channels and spectra
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
 
     def __repr__(self) -> str:
@@ -93,7 +93,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
     def known(self) -> str:
         """What answers are known up to: rows of channels may have had factors of their own."""
         free = self.site.freedom
-        return "all" if free == "none" else f"up to {freedom_words(free)} of each row"
+        return "all" if free == "none" else f"up to {describe_freedom(free)} of each row"
 
     def select_station(self, station: str | int) -> Predictor:
         """Return the same model asked about one station alone, by name or number.
@@ -115,16 +115,16 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             one.station_method(number) if isinstance(one, PerStation) else one
             for one in (self.method, self._whole)
         )
-        return self._with(method, whole, station_site(self.site, number), self._unit)
+        return self._copy_with(method, whole, station_site(self.site, number), self._unit)
 
-    def _with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
+    def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
         return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
 
     def in_levels(self, unit: str | None) -> Predictor:
         """Return the same model whose powers are levels in a unit, dBm or dBW; None: as measured."""
-        return self._with(self.method, self._whole, self.site.in_levels(unit), None)
+        return self._copy_with(self.method, self._whole, self.site.in_levels(unit), None)
 
-    def _in(self, unit: str | None) -> PowerUnit:
+    def _answer_unit(self, unit: str | None) -> PowerUnit:
         """The unit that answers are wanted in."""
         if self.site.kind == "rssi":
             return self.site.power_unit(unit or self._unit)
@@ -148,13 +148,13 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         Raises:
             ValueError: `grad` of a model without gradients, or of positions that are no tensors.
         """
-        wanted = self._in(unit)
+        wanted = self._answer_unit(unit)
         if grad:
-            return self._slopes(self._whole, tx, rx, wanted)[0]
+            return self._predict_grad(self._whole, tx, rx, wanted)[0]
         query = self.queries.query(tx, rx).query
         own = predict_with_threads(self._whole, query)
-        sure = self._confidence(own, query)
-        return replace(_in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
+        sure = self._method_confidence(own, query)
+        return replace(_to_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def predict_query(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local, in stored units."""
@@ -183,7 +183,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
         def ask(asked: Predictor) -> Any:
             query, single, as_torch = asked.queries.query(tx, rx)
-            said = _in_unit(predict_with_threads(asked._whole, query), asked._in(unit))
+            said = _to_unit(predict_with_threads(asked._whole, query), asked._answer_unit(unit))
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = said.variance.sqrt().float()
@@ -191,9 +191,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             spread = spread.reshape(len(spread), -1, *[1] * (said.mean.ndim - 2))
             return match_input(spread, single, as_torch)
 
-        return self._of_stations(ask, tx, rx)
+        return self._ask_stations(ask, tx, rx)
 
-    def _of_stations(self, ask: Callable[[Predictor], Any], tx: Any, rx: Any) -> Any:
+    def _ask_stations(self, ask: Callable[[Predictor], Any], tx: Any, rx: Any) -> Any:
         """What one is asked, (B, 1); of several stations, if neither end says which, of all (B, T).
 
         Stations that the model has no answer for, as they had too few training rows, are NaN.
@@ -205,15 +205,15 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         # One call for all stations where the method has one, else a call for each.
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None
         if every is not None:
-            return ask(self._with(every, None, station_site(self.site, 0), self._unit))
-        stations = self._stations()
+            return ask(self._copy_with(every, None, station_site(self.site, 0), self._unit))
+        stations = self._each_station()
         answers = [None if asked is None else ask(asked) for asked in stations]
         known = next(one for one in answers if one is not None)
         # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
         columns = [known * np.nan if one is None else one for one in answers]
         return torch.cat(columns, dim=-1) if isinstance(known, Tensor) else np.concatenate(columns, axis=-1)
 
-    def _stations(self) -> list[Predictor | None]:
+    def _each_station(self) -> list[Predictor | None]:
         """The same model asked about each station; None where that had too few training rows."""
         stations: list[Predictor | None] = []
         for name in () if self.site.stations is None else self.site.stations.name:
@@ -227,7 +227,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
         Of several stations the first that the model answers for is asked.
         """
-        predictor = next(filter(None, self._stations()), self)
+        predictor = next(filter(None, self._each_station()), self)
         ask = getattr(predictor, self.site.kind)
         ends = ("tx", "rx") if places.shape[1] == 6 else (self.site.moving_end,)
         world = places.reshape(len(places), -1, 3) + self.site.origin
@@ -245,7 +245,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             ValueError: the model predicts something else, a position is missing or not finite, or `grad` as
                 in `predict`.
         """
-        return self._ask("spectrum", tx, rx, grad)
+        return self._predict_mean("spectrum", tx, rx, grad)
 
     def csi(
         self, tx: Any = None, rx: Any = None, *, uplink: Any = None, frequency_hz: Any = None,
@@ -269,7 +269,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
-            return self._ask("csi", tx, rx, grad)
+            return self._predict_mean("csi", tx, rx, grad)
         if grad:
             raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
         from gsparc.prediction import channels
@@ -278,7 +278,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             channel = channels.uplink_channels(self.method, self.site, uplink, frequency_hz)
             answer = channels.to_resource_grid(channel, self.site, None, symbols)
             return answer if isinstance(uplink, Tensor) else answer.numpy()
-        channel = torch.as_tensor(self._ask("csi", tx, rx))
+        channel = torch.as_tensor(self._predict_mean("csi", tx, rx))
         # A single position comes back without its leading axis.
         channel = channel[None] if channel.ndim == 2 else channel
         answer = channels.to_resource_grid(channel, self.site, frequency_hz, symbols)
@@ -325,25 +325,25 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         Raises:
             ValueError: no unit that these powers can be turned into, or as in `spectrum`.
         """
-        return self._of_stations(lambda one: one._ask("rssi", tx, rx, grad, unit), tx, rx)
+        return self._ask_stations(lambda one: one._predict_mean("rssi", tx, rx, grad, unit), tx, rx)
 
-    def _ask(self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None) -> Any:
+    def _predict_mean(self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None) -> Any:
         if self.site.kind != kind:
             raise ValueError(
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
                 f"call .{self.site.kind}(...)"
             )
-        wanted = self._in(unit)
+        wanted = self._answer_unit(unit)
         if grad:
-            moments, single = self._slopes(self.method, tx, rx, wanted)
+            moments, single = self._predict_grad(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query, single, as_torch = self.queries.query(tx, rx)
-        return match_input(_in_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch)
+        return match_input(_to_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch)
 
-    def _slopes(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
+    def _predict_grad(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
         moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx, self._prepared)
-        said, own = _in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
+        said, own = _to_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
         unknown = None if said.unknown is None or not own else said.unknown.to(dtype)
         return Prediction(mean, said.variance, unknown), single
@@ -354,9 +354,9 @@ def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     checkpoint.update_extra(path, extra)
 
 
-def _in_unit(own: Prediction, unit: PowerUnit) -> Prediction:
+def _to_unit(stored: Prediction, unit: PowerUnit) -> Prediction:
     """Of stored targets, in a unit."""
     # In decibels a variance depends on the mean too.
-    variance = None if own.variance is None else unit.variance(own.mean, own.variance)
-    explained = None if own.explained is None else unit.values(own.explained).to(own.mean.dtype)
-    return Prediction(unit.values(own.mean).to(own.mean.dtype), variance, own.unknown, explained)
+    variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
+    explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
+    return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)

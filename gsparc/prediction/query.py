@@ -35,7 +35,7 @@ class Queries:
     def __init__(self, site: Site) -> None:
         self.site, still = site, site.static_position if site.static_end == "rx" else None
         # The pose of a receiver that never moved, made once.
-        self._still = None if still is None else Pose(_float(still), _float(self._rotation(None, 1)))
+        self._still = None if still is None else Pose(_float(still), _float(self._rx_rotation(None, 1)))
 
     def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Asked:
         """Check both ends as they were given, and return what is asked."""
@@ -58,8 +58,8 @@ class Queries:
         for end, place in local.items():
             if len(place) not in (1, count):
                 raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
-        ends = {moving: local[moving], static: self._static(local.get(static))}
-        rotation = self._rotation(rx, count)
+        ends = {moving: local[moving], static: self._static_place(local.get(static))}
+        rotation = self._rx_rotation(rx, count)
         if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
             pose = Pose(_float(ends["rx"], dtype), _float(rotation, dtype))
         else:
@@ -69,7 +69,7 @@ class Queries:
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
         return Asked(Query(sender, pose), single, any(isinstance(v, Tensor) for v in (tx, receiver)))
 
-    def _static(self, place: np.ndarray | None) -> np.ndarray:
+    def _static_place(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
         known, end = self.site.static_position, self.site.static_end
         if known is None:
@@ -85,7 +85,7 @@ class Queries:
             raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
         return known
 
-    def _rotation(self, rx: Any, count: int) -> np.ndarray:
+    def _rx_rotation(self, rx: Any, count: int) -> np.ndarray:
         if isinstance(rx, Pose):
             rotation = to_numpy(rx.rotation).astype(np.float64)
             if rotation.ndim == 3 and len(rotation) not in (1, count):

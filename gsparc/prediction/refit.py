@@ -47,7 +47,7 @@ class Learned:
         """Return the method fitted anew on a fold."""
         return fitting.fit_or_resume(wrap_per_station(self.factory, self.data), self.data, fold, context)[0]
 
-    def forget(self, fold: Fold, split: SplitSettings | None = None) -> Method:
+    def unlearn(self, fold: Fold, split: SplitSettings | None = None) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
 
         One that can forget rows does so, with its settings as they are; another one is fitted anew.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.special import betainc, log_expit
@@ -147,7 +147,7 @@ def threshold_levels(score: np.ndarray, bad: np.ndarray, guarantee: Guarantee, c
     share = np.cumsum(np.exp(log_expit(odds)), -1)[..., accepted - 1] / accepted
     expected = np.round(accepted / len(score) * count)
     most = binom.ppf(guarantee.delta, expected, guarantee.alpha) - 1  # bad ones with which a level passes
-    chance = np.where(most < 0, 0, _tail(np.maximum(most, 0), expected, share))
+    chance = np.where(most < 0, 0, _error_tail(np.maximum(most, 0), expected, share))
     chance = np.tensordot(np.exp(fit - fit.max()), chance, 2)
     return levels[np.flatnonzero(chance >= NEARLY_BEST * chance.max())[-1] :]
 
@@ -177,7 +177,7 @@ def choose_threshold(
             continue
         effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
         # A fixed sequence: as the first test that fails ends it, delta need not be divided among the tests.
-        if _tail(wrong / effect, accepted / effect, guarantee.alpha) > guarantee.delta:
+        if _error_tail(wrong / effect, accepted / effect, guarantee.alpha) > guarantee.delta:
             break
         threshold = Threshold(float(level), accepted, wrong)
     return threshold
@@ -205,7 +205,7 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     return max(1.0, float(bound * between / (share * (1 - share))))
 
 
-def _tail(wrong: Any, accepted: Any, alpha: Any) -> Any:
+def _error_tail(wrong: Any, accepted: Any, alpha: Any) -> Any:
     """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
     # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
     return betainc(np.maximum(accepted - wrong, 1e-9), wrong + 1, 1 - alpha)
@@ -284,7 +284,16 @@ class Trial:
         }  # fmt: skip
 
 
-def split_evidence(
+class CalibratedThreshold(NamedTuple):
+    """Kind of confidence, its threshold, rows that neither saw, and rows that the kind is chosen on."""
+
+    kind: str
+    threshold: Threshold
+    test: np.ndarray
+    choose_on: np.ndarray
+
+
+def split_choose_calibrate_test(
     evidence: Evidence, how: How, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return disjoint rows of the evidence: to choose on, to calibrate on, to test on.
@@ -321,7 +330,7 @@ def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0, effect: 
     # A share of alpha or more passes with no number: what none bad would need is the least.
     bad = bad if bad < guarantee.alpha else 0.0
     least = np.arange(guarantee.least, MOST_CALIBRATED)
-    passed = least[_tail(bad * least / effect, least / effect, guarantee.alpha) <= guarantee.delta]
+    passed = least[_error_tail(bad * least / effect, least / effect, guarantee.alpha) <= guarantee.delta]
     if not len(passed) or count >= (needed := int(np.ceil(passed[0] / (1 - SHARES[0])))):
         return None
     alike = "" if effect == 1 else f", as neighbours err alike ({effect:.1f} are as one)"
@@ -337,7 +346,7 @@ def relax_guarantee(
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(guarantee, limit_db=float(limit))
-        if calibrate_threshold(evidence, other, kind, spatial, seed, apart_m, False)[1].accepted:
+        if calibrate_threshold(evidence, other, kind, spatial, seed, apart_m, False).threshold.accepted:
             return other
     return None
 
@@ -383,8 +392,8 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 def calibrate_threshold(
     evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int | list[int],
     apart_m: float = 0, tested: bool = True,
-) -> tuple[str, Threshold, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
+) -> CalibratedThreshold:  # fmt: skip
+    """Choose a confidence and its threshold.
 
     Unless `tested`, the unseen positions calibrate, too: a threshold that nobody tries needs none.
 
@@ -392,7 +401,9 @@ def calibrate_threshold(
         ValueError: `kind` is no confidence of this evidence.
     """
     rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = split_evidence(evidence, "spatial" if spatial else "random", rng)
+    choose_on, calibrate, test = split_choose_calibrate_test(
+        evidence, "spatial" if spatial else "random", rng
+    )
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
@@ -405,7 +416,7 @@ def calibrate_threshold(
     patch = number_patches(evidence.position)[calibrate] if spatial else None
     levels = threshold_levels(score[choose_on], bad[choose_on], guarantee, len(calibrate))
     threshold = choose_threshold(score[calibrate], bad[calibrate], levels, guarantee, patch)
-    return used, threshold, test, choose_on
+    return CalibratedThreshold(used, threshold, test, choose_on)
 
 
 def run_trials(

@@ -82,13 +82,13 @@ def time_interleaved(
             for name in order:
                 if torch.get_num_threads() != threads[name]:
                     torch.set_num_threads(threads[name])
-                times[name] += _visit(contenders[name], turn, settings)
+                times[name] += _time_round(contenders[name], turn, settings)
     finally:
         torch.set_num_threads(before)
     return {name: np.array(values) for name, values in times.items()}
 
 
-def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
+def _time_round(call: Call, turn: int, settings: ClockSettings) -> list[float]:
     """Wall times [ms] of a contender's calls in one round."""
     for _ in range(settings.untimed):
         call(turn)
@@ -142,7 +142,7 @@ def machine_facts() -> dict[str, float | int | str | None]:
         "machine/threads": torch.get_num_threads(),
         "machine/cores": cores,
         "machine/load": os.getloadavg()[0] / cores,
-        "machine/cpu": _processor(),
+        "machine/cpu": _processor_name(),
         "machine/gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
 
@@ -162,7 +162,7 @@ def synchronise() -> None:
         torch.cuda.synchronize()
 
 
-def _processor() -> str:
+def _processor_name() -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

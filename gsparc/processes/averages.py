@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -10,9 +11,22 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 
-def mean_at_places(
-    places: np.ndarray, values: np.ndarray, measured: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class PlaceMeans(NamedTuple):
+    """Means at places: the first row (m,) of each, means (m, ...) and numbers of rows (m,)."""
+
+    first: np.ndarray
+    mean: np.ndarray
+    rows: np.ndarray
+
+
+class MeanVariance(NamedTuple):
+    """Mean (n, ...) and variance (n,)."""
+
+    mean: Tensor
+    variance: Tensor
+
+
+def mean_at_places(places: np.ndarray, values: np.ndarray, measured: np.ndarray | None = None) -> PlaceMeans:
     """Average rows over each of their places; rows of places that are all different stay as they are.
 
     >>> first, mean, count = mean_at_places(np.array([[5.0], [2.0], [5.0]]), np.array([1.0, 8.0, 3.0]))
@@ -25,30 +39,31 @@ def mean_at_places(
         measured: (n, ...) bool, entries that count; None: all.
 
     Returns:
-        The first row (m,) of each place, means (m, ...), 0 where nothing was measured, and rows (m,) of each.
+        See `PlaceMeans`; means are 0 where nothing was measured.
     """
     _, first, place, count = np.unique(places, True, True, True, axis=0)
     if len(first) == len(places):  # nothing to copy
-        return np.arange(len(places)), values, count
+        return PlaceMeans(np.arange(len(places)), values, count)
     flat, kind = values.reshape(len(values), -1), values.real.dtype
     members = csr_array((np.ones(len(places), kind), (place.reshape(-1), np.arange(len(places)))))
     heard = count[:, None] if measured is None else members @ measured.reshape(flat.shape)
     total = members @ (flat if measured is None else np.where(measured.reshape(flat.shape), flat, 0))
-    return first, (total / np.maximum(heard, 1).astype(kind)).reshape(-1, *values.shape[1:]), count
+    mean = total / np.maximum(heard, 1).astype(kind)
+    return PlaceMeans(first, mean.reshape(-1, *values.shape[1:]), count)
 
 
-def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVariance:
     """Return mean (n, ...) and variance (n,) of a mixture of shares, means (n, ...) and variances (n,).
 
     What the members disagree about is part of the variance, mean over entries (law of total variance).
 
     >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
     >>> mixture_moments([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
-    (tensor([-75.]), tensor([29.]))
+    MeanVariance(mean=tensor([-75.]), variance=tensor([29.]))
     """
     if len(parts) == 1:
-        return parts[0][1:]
+        return MeanVariance(*parts[0][1:])
     mean = torch.stack([share * one for share, one, _ in parts]).sum(0)
     apart = ((one - mean).abs().square().reshape(len(mean), -1).mean(1) for _, one, _ in parts)
     spread = [share * (own + off) for (share, _, own), off in zip(parts, apart, strict=True)]
-    return mean, torch.stack(spread).sum(0)
+    return MeanVariance(mean, torch.stack(spread).sum(0))

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gsparc.processes.averages import MeanVariance
 from gsparc.processes.factor import Factor
 
 FAR = -30.0  # standard deviations below which the ratio of density and distribution is a series
@@ -42,11 +44,18 @@ class PseudoValues:
     settled: bool
 
 
-def truncated_moments(z: Tensor) -> tuple[Tensor, Tensor]:
-    """Return, of a standard normal cut off above z (n,), minus its mean, and the share of its variance lost.
+class TruncatedMoments(NamedTuple):
+    """Of a standard normal cut off above a level: minus its mean, and the share of its variance lost."""
+
+    minus_mean: Tensor
+    lost_variance: Tensor
+
+
+def truncated_moments(z: Tensor) -> TruncatedMoments:
+    """Return moments (n,) of a standard normal cut off above z (n,).
 
     >>> truncated_moments(torch.tensor([0.0]))  # sqrt(2 / pi), and 2 / pi
-    (tensor([0.7979]), tensor([0.6366]))
+    TruncatedMoments(minus_mean=tensor([0.7979]), lost_variance=tensor([0.6366]))
     """
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
     # In logarithms: density and distribution underflow long before their ratio does.
@@ -54,24 +63,24 @@ def truncated_moments(z: Tensor) -> tuple[Tensor, Tensor]:
     series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
     remaining = t**2 * (1 - 6 * t**2 + 50 * t**4)
     lost = torch.where(z < FAR, 1 - remaining, ratio * (inside + ratio))
-    return torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12)
+    return TruncatedMoments(torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12))
 
 
 def fit_by_ep(
-    known: ConditionalGaussian,
+    prior: ConditionalGaussian,
     level: Tensor,
     side: Tensor | float = 1.0,
     start: PseudoValues | None = None,
-    within: float = SETTLED,
+    tolerance: float = SETTLED,
 ) -> PseudoValues:
     """Find stand-ins for "below `level`" (m,), "above" where `side` is -1, of unknown entries.
 
     Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same. They end
-    when no mean moves by more than `within` deviations.
+    when no mean moves by more than `tolerance` deviations.
     """
-    mean, covariance = known.mean, known.covariance
+    mean, covariance = prior.mean, prior.covariance
     total = covariance.diagonal()
-    value, variance = (start.value, start.variance) if start else _sites(mean, total, level, side)
+    value, variance = (start.value, start.variance) if start else _match_sites(mean, total, level, side)
     settled, before = False, mean
     for _ in range(MOST_SWEEPS):
         factor = Factor.from_gram(covariance + torch.diag(variance), "raise")
@@ -80,8 +89,8 @@ def fit_by_ep(
         # The cavity: what all others say of an entry, its own stand-in taken out.
         cavity_variance = (1 / precision - variance).clamp(LEAST * total, total)
         cavity = value - weights / precision
-        result, wide = _sites(cavity, cavity_variance, level, side)
-        settled = bool(((cavity - before).abs() / total.sqrt()).max() < within)
+        result, wide = _match_sites(cavity, cavity_variance, level, side)
+        settled = bool(((cavity - before).abs() / total.sqrt()).max() < tolerance)
         if settled:
             break
         before = cavity
@@ -97,11 +106,11 @@ def fit_by_ep(
     return PseudoValues(value, variance, float(evidence), settled)
 
 
-def _sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> tuple[Tensor, Tensor]:
+def _match_sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> MeanVariance:
     """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
     deviation = variance.sqrt()
     ratio, lost = truncated_moments(side * (level - mean) / deviation)
-    return mean - side * deviation * ratio / lost, variance * (1 - lost) / lost
+    return MeanVariance(mean - side * deviation * ratio / lost, variance * (1 - lost) / lost)
 
 
 @dataclass(frozen=True)

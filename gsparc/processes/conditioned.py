@@ -14,7 +14,7 @@ from typing import Literal
 from torch import Tensor
 
 from gsparc.processes.factor import Factor, solve_as_pairs
-from gsparc.processes.left_out import left_out_residuals, left_out_signal
+from gsparc.processes.left_out import LeftOutErrors, left_out_residuals, left_out_signal
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,12 @@ class Conditioned:
         return both if self.values.is_complex() else 0.5 * both
 
     @cached_property
-    def scale(self) -> float:
+    def power(self) -> float:
         """Mean square of the whitened values: the power that fits a covariance known up to a factor."""
         return float((self.values.conj() * self.weights).real.mean())
 
     @cached_property
-    def slope(self) -> Tensor:
+    def nll_gradient(self) -> Tensor:
         """`G = R K^-1 - K^-1 Y Y^H K^-1` (n, n): d nll = trace(G dK), half of it where values are real."""
         inverse, weights = self.factor.inverse, self.weights
         return inverse.addmm(weights, weights.mH, beta=weights.shape[1], alpha=-1)
@@ -72,7 +72,7 @@ class Conditioned:
         """Return what the rows take from the variance (m,) of places of covariances (m, n) with them."""
         return self.factor.whiten(cross.mH).abs().square().sum(0)
 
-    def left_out(self, groups: Iterable[Tensor] | None = None) -> tuple[Tensor, Tensor]:
+    def left_out(self, groups: Iterable[Tensor] | None = None) -> LeftOutErrors:
         """Return residuals (n, R) of rows left out, alone or in groups, and their variances (n,)."""
         inverse = self.factor.precision if groups is None else self.factor.inverse
         return left_out_residuals(inverse, self.weights, groups)

@@ -79,7 +79,7 @@ class LeftOutDensity(torch.autograd.Function):
         return slopes[0] * (lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T)), None, None, None
 
 
-class Evidence(torch.autograd.Function):
+class LogEvidence(torch.autograd.Function):
     """Negative logarithm of the probability of values, some of them only beyond a level."""
 
     @staticmethod
@@ -96,7 +96,7 @@ class Evidence(torch.autograd.Function):
         return -slopes[0] * slope, slopes[0] * weights, None, None
 
 
-class Profiled(torch.autograd.Function):
+class ProfiledDensity(torch.autograd.Function):
     """Negative evidence of values of mean 0 at the amplitude that fits them best, and that amplitude."""
 
     @staticmethod
@@ -154,7 +154,7 @@ def minimise(
     low, high = np.array(bounds).T
 
     @lru_cache(1 + len(starts))  # the walk begins by asking for the best start again
-    def asked(values: bytes) -> tuple[float, np.ndarray]:
+    def evaluate_bytes(values: bytes) -> tuple[float, np.ndarray]:
         point = np.frombuffer(values)
         at = torch.from_numpy(point.copy()).requires_grad_()
         try:
@@ -164,13 +164,13 @@ def minimise(
         (slope,) = torch.autograd.grad(value, at)
         return float(value.detach()), slope.numpy()
 
-    def ask(point: np.ndarray) -> tuple[float, np.ndarray]:
-        return asked(point.tobytes())
+    def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
+        return evaluate_bytes(point.tobytes())
 
     points = [np.clip(start, low, high) for start in starts]
-    start = min(points, key=lambda point: ask(point)[0]) if len(points) > 1 else points[0]
+    start = min(points, key=lambda point: evaluate(point)[0]) if len(points) > 1 else points[0]
     result = minimize(
-        ask, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+        evaluate, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
         options={"ftol": tolerance, "maxfun": looks}, callback=stop_when_late,
     )  # fmt: skip
     return result.x, float(result.fun)

@@ -72,7 +72,7 @@ class Factor:
             NotDefiniteError: it has no factor, nor with the largest ridge.
         """
         raise_if_cancelled()
-        lower, failed = _factored(covariance)
+        lower, failed = _cholesky(covariance)
         if not failed or failing == "ignore":
             return cls(lower)
         if failing == "raise" or covariance.dim() > 2:
@@ -84,7 +84,7 @@ class Factor:
             # A ridge replaces the one before: what that added is part of it.
             exact.diagonal().add_(share * bound - added)
             added = share * bound
-            lower, failed = _factored(exact)
+            lower, failed = _cholesky(exact)
             if not failed:
                 return cls(lower.to(covariance.dtype))
         most = RIDGES[-1] * ROUNDING * len(covariance)
@@ -99,13 +99,13 @@ class Factor:
         if values.is_complex() and not self.lower.is_complex():
             return solve_as_pairs(self.whiten, values)
         values = values.to(self.lower.dtype)
-        if values.shape[-1] == 1 or not _alone(self.lower, values):
+        if values.shape[-1] == 1 or not _suits_lapack(self.lower, values):
             return torch.linalg.solve_triangular(self.lower, values, upper=False)
-        return self._triangular(values, adjoint=False)
+        return self._solve_triangular(values, adjoint=False)
 
     @cached_property
-    def _rounded(self) -> list[np.ndarray]:
-        root, step = self._inverted().float().numpy(), -(-len(self.lower) // BANDS)
+    def _inverse_in_float32(self) -> list[np.ndarray]:
+        root, step = self._invert_lower().float().numpy(), -(-len(self.lower) // BANDS)
         # A band of rows ends at its diagonal: the zeros above are neither stored nor read.
         return [np.ascontiguousarray(root[i : i + step, : i + step]) for i in range(0, len(root), step)]
 
@@ -114,14 +114,14 @@ class Factor:
         if values.is_complex() and not self.lower.is_complex():
             return solve_as_pairs(self.solve, values)
         values = values.to(self.lower.dtype)
-        if values.shape[-1] == 1 or not _alone(self.lower, values):
+        if values.shape[-1] == 1 or not _suits_lapack(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
-        return self._triangular(self.whiten(values), adjoint=True)
+        return self._solve_triangular(self.whiten(values), adjoint=True)
 
-    def _triangular(self, values: Tensor, adjoint: bool) -> Tensor:
+    def _solve_triangular(self, values: Tensor, adjoint: bool) -> Tensor:
         """`L^-1 V`, or `L^-H V`."""
         # The transpose of an array in C's order is one in Fortran's: LAPACK reads it without a copy.
-        upper, right = _array(self.lower).T, np.ascontiguousarray(_array(values))
+        upper, right = _to_numpy(self.lower).T, np.ascontiguousarray(_to_numpy(values))
         trsm = get_blas_funcs("trsm", (upper,))
         with BLAS.limit(limits=1):
             return torch.from_numpy(trsm(1.0, upper, right.T, side=1, lower=0, trans_a=2 if adjoint else 0).T)
@@ -129,13 +129,13 @@ class Factor:
     @cached_property
     def root(self) -> Tensor:
         """`L^-1` (..., n, n): `K^-1 = root^H root`."""
-        return self._inverted()
+        return self._invert_lower()
 
-    def _inverted(self) -> Tensor:
-        if not _alone(self.lower):
+    def _invert_lower(self) -> Tensor:
+        if not _suits_lapack(self.lower):
             eye = torch.eye(self.lower.shape[-1], dtype=self.lower.dtype, device=self.lower.device)
             return torch.linalg.solve_triangular(self.lower, eye, upper=False)
-        upper = _array(self.lower).T
+        upper = _to_numpy(self.lower).T
         with BLAS.limit(limits=1):
             return torch.from_numpy(get_lapack_funcs("trtri", (upper,))(upper, lower=0)[0].T)
 
@@ -159,7 +159,7 @@ class Factor:
         return 2 * self.lower.diagonal(dim1=-2, dim2=-1).real.double().log().sum(-1)
 
 
-def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> list[Tensor]:
+def whiten_in_float32(factors: Sequence[Factor], values: Sequence[Tensor]) -> list[Tensor]:
     """Whiten (n, R) by stored inverses in float32: half the memory to read for few columns.
 
     Rounding moves their squares by 1e-6 where the noise is a hundredth of the signal's variance.
@@ -170,7 +170,7 @@ def whitened_rounded(factors: Sequence[Factor], values: Sequence[Tensor]) -> lis
     # OpenBLAS multiplies few columns in a third of torch's time.
     with BLAS.limit(limits=1):
         for one, part in zip(factors, single, strict=True):
-            result.append(np.concatenate([band @ part[: band.shape[1]] for band in one._rounded]))
+            result.append(np.concatenate([band @ part[: band.shape[1]] for band in one._inverse_in_float32]))
     return [torch.from_numpy(part).to(values[0].dtype) for part in result]
 
 
@@ -180,7 +180,7 @@ def solve_as_pairs(solve: Callable[[Tensor], Tensor], values: Tensor) -> Tensor:
     return torch.view_as_complex(solve(pairs).unflatten(-1, (-1, 2)).contiguous())
 
 
-def _alone(*parts: Tensor) -> bool:
+def _suits_lapack(*parts: Tensor) -> bool:
     """Whether these are single matrices for one thread of the processor, without gradients."""
     grows = is_differentiated(*parts)
     fits = all(part.dim() == 2 and part.device.type == "cpu" for part in parts)
@@ -189,17 +189,17 @@ def _alone(*parts: Tensor) -> bool:
     return fits and not grows and not many and len(parts[0]) >= FEW
 
 
-def _array(values: Tensor) -> np.ndarray:
+def _to_numpy(values: Tensor) -> np.ndarray:
     # Conjugates and signs are lazy in torch; NumPy takes the numbers alone.
     return values.detach().resolve_conj().resolve_neg().numpy()
 
 
-def _factored(covariance: Tensor) -> tuple[Tensor, bool]:
+def _cholesky(covariance: Tensor) -> tuple[Tensor, bool]:
     """L, and whether there is none."""
-    if not _alone(covariance):
+    if not _suits_lapack(covariance):
         lower, info = torch.linalg.cholesky_ex(covariance)
         return lower, bool(info.any())
-    transposed = _array(covariance).T  # in LAPACK's order of columns as it lies, its conjugate
+    transposed = _to_numpy(covariance).T  # in LAPACK's order of columns as it lies, its conjugate
     potrf = get_lapack_funcs("potrf", (transposed,))
     with BLAS.limit(limits=1):
         # A copy, as LAPACK factors in place and the caller keeps the covariance.

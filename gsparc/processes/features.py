@@ -39,7 +39,7 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
     return TERMS[name](length).correlation(distances(a, b))
 
 
-def matern_parts(length: float, name: Correlation) -> tuple[float, float, float, float]:
+def matern_mixture(length: float, name: Correlation) -> tuple[float, float, float, float]:
     """Return share and length [m] of a correlation's Matern-5/2, share and length of its Matern-3/2."""
     if name == "matern32":
         return 0.0, length, 1.0, length

@@ -273,13 +273,13 @@ class Kernel(Stored):
         return f"{kind}{word} {' and '.join(parts)}, noise {self.noise:.3g} of the signal's variance"
 
     @property
-    def compiled(self) -> list[float] | None:
+    def compiled_lengths(self) -> list[float] | None:
         """Lengths as compiled kernels have them, negative of Matern-1/2; None where they cannot answer."""
         signed = [term.compiled * float(term.length) for term in self.signals]
         return signed if all(signed) and len(signed) <= COMPILED else None
 
     @property
-    def by_distance(self) -> bool:
+    def is_isotropic(self) -> bool:
         """Whether distances are all that counts, also where both ends move."""
         return self.terms[0].by_distance
 
@@ -290,13 +290,13 @@ class Kernel(Stored):
         first, *others = (term.share * term.correlation(distance) for term in self.signals)
         return sum(others, first)
 
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
+    def correlations(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
-        return self.correlation(distances(a, b)) if self.by_distance else self.terms[0].covariance(a, b)
+        return self.correlation(distances(a, b)) if self.is_isotropic else self.terms[0].covariance(a, b)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""
-        result = self.between(places, places)
+        result = self.correlations(places, places)
         result.diagonal().add_(self.noise)
         return result
 

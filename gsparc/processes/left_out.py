@@ -7,6 +7,7 @@ for each group instead of one of all other rows.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,9 +18,16 @@ from gsparc.processes.factor import Factor
 ENTRIES = 2_000_000  # of systems solved at a time: memory
 
 
+class LeftOutErrors(NamedTuple):
+    """Residuals (n, R) of rows that were left out, and their variances (n,); of a group their covariance."""
+
+    residual: Tensor
+    variance: Tensor
+
+
 def left_out_residuals(
     inverse: Tensor, weights: Tensor, groups: Iterable[Tensor] | None = None
-) -> tuple[Tensor, Tensor]:
+) -> LeftOutErrors:
     """Return residuals, shaped as the weights, and their variances (n,).
 
     >>> inverse = torch.tensor([[2.0, 1.0], [1.0, 2.0]]).inverse()
@@ -34,21 +42,21 @@ def left_out_residuals(
     """
     if groups is None:
         precision = inverse if inverse.dim() == 1 else inverse.diagonal().real
-        return weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision
+        return LeftOutErrors(weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision)
     residual, variance = torch.empty_like(weights), torch.empty_like(inverse.diagonal().real)
     for rows in groups:
         residual[rows], covariance = left_out_group(inverse, weights, rows)
         variance[rows] = covariance.diagonal().real
-    return residual, variance
+    return LeftOutErrors(residual, variance)
 
 
-def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> LeftOutErrors:
     """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s)."""
     block = Factor.from_gram(inverse[rows[:, None], rows])
-    return block.solve(weights[rows]), block.inverse
+    return LeftOutErrors(block.solve(weights[rows]), block.inverse)
 
 
-def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> LeftOutErrors:
     """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool, and variances.
 
     Small systems of many sizes, solved as batches of the largest with units where a group has ended.
@@ -69,7 +77,7 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
         share = Factor.from_gram(block, "raise").solve(unit[..., None])[..., 0] * valid
         residual[part] = torch.einsum("cm,cmr->cr", share.to(weights.dtype), weights[index])
         variance[part] = (share * unit).sum(1).real
-    return residual, variance
+    return LeftOutErrors(residual, variance)
 
 
 def left_out_signal(

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsparc.ops.queries import has_query_kernel, nearest_weights
 from gsparc.ops.transforms import to_numpy
-from gsparc.processes.averages import mean_at_places
+from gsparc.processes.averages import MeanVariance, mean_at_places
 from gsparc.processes.density import TINY, fit_kernel
 from gsparc.processes.factor import Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel, distances
@@ -47,7 +47,14 @@ JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres a
 EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
 
 
-def kriging_weights(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
+class KrigingWeights(NamedTuple):
+    """Weights (B, k) of near values in the mean at places, and what they take off its variance (B,)."""
+
+    weights: Tensor
+    explained_variance: Tensor
+
+
+def kriging_weights(gram: Tensor, cross: Tensor) -> KrigingWeights:
     """Return weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
 
     Args:
@@ -55,14 +62,14 @@ def kriging_weights(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
         cross: (B, k) of the places with them.
     """
     weights = Factor.from_gram(gram, "raise").solve(cross[..., None])[..., 0]
-    return weights, (weights * cross).sum(-1)
+    return KrigingWeights(weights, (weights * cross).sum(-1))
 
 
-def neighbour_weights(kernel: Kernel, places: Tensor, near: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+def neighbour_weights(kernel: Kernel, places: Tensor, neighbours: Tensor, noise: Tensor) -> KrigingWeights:
     """Return the same at places (B, D) float64 [m], with autograd, by rows (B, k, D) of `noise` (B, k)."""
-    gram = kernel.between(near, near)
+    gram = kernel.correlations(neighbours, neighbours)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
-    return kriging_weights(gram, kernel.between(places[:, None], near)[:, 0])
+    return kriging_weights(gram, kernel.correlations(places[:, None], neighbours)[:, 0])
 
 
 @dataclass(frozen=True)
@@ -127,21 +134,23 @@ class Nearest(Posterior):
 
     def answer(self, queries: Tensor, float64: bool = False) -> Answer:
         """See `Posterior`."""
-        return self._answers(queries, None, float64)
+        return self._answer_in_blocks(queries, None, float64)
 
     def mean_at(self, queries: Tensor, float64: bool = False) -> Tensor:
         """See `Posterior`."""
         return torch.cat([self._answer(part, None, float64).mean for part in queries.split(self._block)])
 
-    def left_out(self) -> tuple[Tensor, Tensor]:
+    def left_out(self) -> MeanVariance:
         """See `Posterior`."""
-        result = self._answers(self.places, np.arange(len(self.places)))
-        return result.mean, result.variance
+        result = self._answer_in_blocks(self.places, np.arange(len(self.places)))
+        return MeanVariance(result.mean, result.variance)
 
-    def _answers(self, queries: Tensor, without: np.ndarray | None, float64: bool = False) -> Answer:
+    def _answer_in_blocks(
+        self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False
+    ) -> Answer:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
-        parts = (self._answer(queries[b], None if without is None else without[b], float64) for b in blocks)
+        parts = (self._answer(queries[b], None if excluded is None else excluded[b], float64) for b in blocks)
         if len(blocks) < 2 or not has_query_kernel(queries):
             return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
         first = next(parts)
@@ -153,9 +162,9 @@ class Nearest(Posterior):
             result.mean[block], result.variance[block] = part.mean, part.variance
         return result
 
-    def _answer(self, queries: Tensor, without: np.ndarray | None, float64: bool) -> Answer:
-        index = torch.from_numpy(self.near.nearest(to_numpy(queries), without, self.most))
-        weights, known = self._weights(queries, index)
+    def _answer(self, queries: Tensor, excluded: np.ndarray | None, float64: bool) -> Answer:
+        index = torch.from_numpy(self.near.nearest_rows(to_numpy(queries), excluded, self.most))
+        weights, known = self._weigh_neighbours(queries, index)
         rest = self.rest[index]
         if float64:
             rest = rest.to(torch.complex128 if rest.is_complex() else torch.float64)
@@ -163,31 +172,35 @@ class Nearest(Posterior):
         left = 1 + self.prior.kernel.noise - known
         if self.prior.trend is not None:
             # What the near rows leave open of the mean law's terms.
-            unsure = self.prior.columns(queries) - torch.bmm(weights[:, None], self._columns[index])[:, 0]
+            unsure = (
+                self.prior.columns(queries) - torch.bmm(weights[:, None], self._trend_columns[index])[:, 0]
+            )
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
         return Answer(mean, left.clamp_min(0.0))
 
-    def _weights(self, queries: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+    def _weigh_neighbours(self, queries: Tensor, index: Tensor) -> KrigingWeights:
         """Of rows (B, k), see `neighbour_weights`."""
         kernel = self.prior.kernel
-        if (lengths := kernel.compiled) and has_query_kernel(queries):
-            result = nearest_weights(queries, self.places, self._solvable, index, lengths, kernel.shares)
+        if (lengths := kernel.compiled_lengths) and has_query_kernel(queries):
+            result = nearest_weights(
+                queries, self.places, self._regularised_noise, index, lengths, kernel.shares
+            )
             if result is None:
                 raise NotDefiniteError("a covariance of near rows is not positive definite")
-            return result
+            return KrigingWeights(*result)
         return neighbour_weights(kernel, queries, self.places[index], self.noise[index])
 
     @cached_property
-    def _columns(self) -> Tensor:
+    def _trend_columns(self) -> Tensor:
         return self.prior.columns(self.places)
 
     @cached_property
-    def _solvable(self) -> Tensor:
+    def _regularised_noise(self) -> Tensor:
         """Noise (n,) that lets any system be solved; of a million rows, made once."""
         return self.noise + JITTER
 
-    def distance(self, queries: Tensor) -> Tensor:
+    def nearest_distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return nearest_distance(self.near.tree, queries)
 
@@ -233,12 +246,12 @@ def condition_on_nearest(
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
     chosen = covering_rows(every.places, COVER, seed)
-    terms, spread = fit_trend_weights(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
+    terms, spread = trend_mean_and_covariance(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
     return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
 @torch.no_grad()
-def fit_trend_weights(
+def trend_mean_and_covariance(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms given rows, unit normal before.
@@ -257,7 +270,7 @@ def fit_trend_weights(
     # Values and terms side by side: both are whitened by the same weights.
     both = torch.cat([rest[torch.from_numpy(order)], prior.columns(at)], 1)
     first = min(FIRST, len(places))
-    gram = kernel.between(at[:first], at[:first])
+    gram = kernel.correlations(at[:first], at[:first])
     gram.diagonal().add_(noise[:first])
     white = [Factor.from_gram(gram, "raise").whiten(both[:first])]
     start = first
@@ -349,7 +362,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
     noise = start.noise / values.count[chosen]
-    about, _ = fit_trend_weights(prior, values.places[chosen], rest[chosen], noise, seed)
+    about, _ = trend_mean_and_covariance(prior, values.places[chosen], rest[chosen], noise, seed)
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]

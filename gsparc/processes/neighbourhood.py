@@ -64,7 +64,7 @@ class Neighbourhood(Stored):
     A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
 
     >>> line = np.linspace(0, 100, 11)[:, None]  # every 10 m
-    >>> Neighbourhood.from_places(line, seed=0).nearest(np.array([[41.0]]), most=2).tolist()
+    >>> Neighbourhood.from_places(line, seed=0).nearest_rows(np.array([[41.0]]), most=2).tolist()
     [[4, 5]]
 
     Attributes:
@@ -106,25 +106,25 @@ class Neighbourhood(Stored):
         counts = [most - share * sparser, *[share] * sparser]
         return [(own, count) for (own, _), count in zip(self._trees[::-1], counts, strict=True)]
 
-    def nearest(
-        self, queries: np.ndarray, without: np.ndarray | None = None, most: int = NEIGHBOURS
+    def nearest_rows(
+        self, queries: np.ndarray, excluded: np.ndarray | None = None, most: int = NEIGHBOURS
     ) -> np.ndarray:
         """Return numbers (B, k) of neighbours of queries (B, D).
 
         Args:
             queries: [m].
-            without: (B,) a place for each query that is no neighbour of it; None: none. Of one place
+            excluded: (B,) a place for each query that is no neighbour of it; None: none. Of one place
                 alone there is then no neighbour.
             most: neighbours.
         """
         result: list[np.ndarray] = []
         # One more is looked for, as the place itself is among the nearest.
-        more = 0 if without is None else 1
+        more = 0 if excluded is None else 1
         for (own, count), (_, tree) in zip(self.split_by_density(most), self._trees[::-1], strict=True):
             row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
-            if without is not None:
+            if excluded is not None:
                 # A stable sort puts the place itself last and keeps the others from near to far.
-                later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
+                later = np.argsort(row == excluded[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
                 row = np.take_along_axis(row, later, 1)
             result.append(row)
         return np.concatenate(result, 1)
@@ -138,7 +138,7 @@ def rows_with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOUR
     """
     # A row need not come first among its neighbours, as others may lie at its place.
     alike = Neighbourhood(places, np.zeros(len(places), np.int8))
-    return np.c_[row, alike.nearest(places[row], row, most)]
+    return np.c_[row, alike.nearest_rows(places[row], row, most)]
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
@@ -149,10 +149,10 @@ def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     return distances(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]
 
 
-def spacing(places: np.ndarray) -> float:
+def median_spacing(places: np.ndarray) -> float:
     """Return the median distance [m] from a place (n, D) to the next other one.
 
-    >>> spacing(np.array([[0.0], [0.0], [2.0], [4.0]]))
+    >>> median_spacing(np.array([[0.0], [0.0], [2.0], [4.0]]))
     2.0
     """
     places = np.unique(places, axis=0)

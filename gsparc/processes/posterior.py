@@ -12,10 +12,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from gsparc.processes.averages import MeanVariance
 from gsparc.processes.conditioned import weighted_sum
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances
-from gsparc.processes.left_out import left_out_residuals
+from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.prior import Answer, Posterior, Prior
@@ -74,18 +75,18 @@ class Exact(Posterior):
         """See `Posterior`."""
         own = self.prior.columns(queries)
         cross, prior = self.cross_covariance(queries, own), self.prior.variance(own)
-        if self._near is not None:
-            return Answer(self._mean(queries, cross), self._near.answer(queries).variance.minimum(prior))
+        if self._vecchia is not None:
+            return Answer(self._mean(queries, cross), self._vecchia.answer(queries).variance.minimum(prior))
         known = self.factor.whiten(cross.T).square().sum(0)
         # Rounding may leave a variance below 0 at a row's place.
         return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
 
     @cached_property
-    def _near(self) -> Nearest | None:
+    def _vecchia(self) -> Nearest | None:
         """What states the variance of many rows: exactly it costs their number squared for each place."""
-        if len(self.rows) <= MANY or not self.prior.kernel.by_distance:
+        if len(self.rows) <= MANY or not self.prior.kernel.is_isotropic:
             return None
-        terms = self.factor.whiten(self._columns)
+        terms = self.factor.whiten(self._trend_columns)
         # Covariance of the terms' weights given the rows: I - H^T K^-1 H, as K holds H H^T.
         spread = torch.eye(terms.shape[1], dtype=terms.dtype) - terms.T @ terms
         none, noise = self.rows.new_zeros(len(self.rows), 1), self.prior.kernel.noise + self.extra
@@ -96,7 +97,7 @@ class Exact(Posterior):
         """See `Posterior`."""
         return self._mean(queries, self.cross_covariance(queries, self.prior.columns(queries)))
 
-    def distance(self, queries: Tensor) -> Tensor:
+    def nearest_distance(self, queries: Tensor) -> Tensor:
         """See `Posterior`."""
         return distances(queries, self.rows).amin(1)
 
@@ -104,26 +105,26 @@ class Exact(Posterior):
         result = weighted_sum(cross, self.weights)
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
-    def cross_covariance(self, queries: Tensor, own: Tensor) -> Tensor:
-        """Return covariances (B, n) of places (B, D), whose terms are `own` (B, Q), with the rows."""
-        result = self.prior.kernel.between(queries, self.rows)
-        return result if self.prior.trend is None else result.addmm(own, self._columns.T)
+    def cross_covariance(self, queries: Tensor, columns: Tensor) -> Tensor:
+        """Return covariances (B, n) of places (B, D), whose terms are `columns` (B, Q), with the rows."""
+        result = self.prior.kernel.correlations(queries, self.rows)
+        return result if self.prior.trend is None else result.addmm(columns, self._trend_columns.T)
 
     @cached_property
-    def _columns(self) -> Tensor:
+    def _trend_columns(self) -> Tensor:
         return self.prior.columns(self.rows)
 
-    def values(self) -> Tensor:
+    def given_values(self) -> Tensor:
         """Return the values that it was given (n, P)."""
         lower = self.factor.lower
         return self.prior.mean(self.rows) + weighted_sum(lower, weighted_sum(lower.T, self.weights))
 
-    def left_out(self) -> tuple[Tensor, Tensor]:
+    def left_out(self) -> MeanVariance:
         """See `Posterior`."""
-        residual, variance = self.left_out_residual()
-        return self.values() - residual, variance
+        residual, variance = self.left_out_residuals()
+        return MeanVariance(self.given_values() - residual, variance)
 
-    def left_out_residual(self) -> tuple[Tensor, Tensor]:
+    def left_out_residuals(self) -> LeftOutErrors:
         """Return what all other rows miss of each (n, P), and its variance (n,)."""
         return left_out_residuals(self.factor.precision, self.weights)
 
@@ -132,7 +133,7 @@ class Exact(Posterior):
         """Return the covariance (B, B) of the signal at places (B, D), in the kernel's units."""
         cross = self.cross_covariance(queries, self.prior.columns(queries))
         white = self.factor.whiten(cross.T)
-        return self.prior.kernel.amplitude * (self.prior.between(queries, queries) - white.T @ white)
+        return self.prior.kernel.amplitude * (self.prior.cross_covariance(queries, queries) - white.T @ white)
 
 
 def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
@@ -140,7 +141,7 @@ def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
     for start in range(0, len(places), BLOCK):
         part = slice(start, start + BLOCK)
         # One triangle, all that a factor reads, in blocks that stay in the processor's caches.
-        gram[part, : start + BLOCK] = prior.between(places[part], places[: start + BLOCK])
+        gram[part, : start + BLOCK] = prior.cross_covariance(places[part], places[: start + BLOCK])
     gram.diagonal().add_(prior.kernel.noise + extra)
     return Factor.from_gram(gram, "raise")
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.processes.averages import mixture_moments
+from gsparc.processes.averages import MeanVariance, mixture_moments
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, distances
@@ -33,7 +33,7 @@ class PowerRows:
     """Powers and where they were measured.
 
     >>> rows = PowerRows(np.zeros((3, 3)), np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8))
-    >>> rows.silent, len(rows.measured.decibels)  # the second lies below its level
+    >>> rows.silent, len(rows.measured_rows.decibels)  # the second lies below its level
     (array([False,  True, False]), 2)
 
     Attributes:
@@ -56,42 +56,42 @@ class PowerRows:
         return type(self)(*(part[chosen] for part in vars(self).values()))
 
     @property
-    def measured(self) -> Self:
+    def measured_rows(self) -> Self:
         """Those that were measured."""
         return self.subset(np.flatnonzero(~self.silent))
 
     @property
-    def heard(self) -> Self:
+    def heard_rows(self) -> Self:
         """Those that were measured, or all where none was."""
-        return self if self.silent.all() else self.measured
+        return self if self.silent.all() else self.measured_rows
 
     def means_at_places(self) -> PlaceValues:
         """Return means (m, 1) [dB] over the rows of each place."""
         return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
-    def regression_about(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
+    def distances_terms_values(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
         """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
         return distances(places, places), trend.columns(places), rest[:, None]
 
-    def draw_subset(self, most: int, seed: int) -> Self:
+    def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
-        return self.subset(draw_rows(self.silent, most, seed))
+        return self.subset(draw_rows(self.silent, count, seed))
 
 
-def draw_rows(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
+def draw_rows(silent: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Draw at most so many rows, sorted; at least half of them were heard where as many were.
 
-    >>> len(draw_rows(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
+    >>> len(draw_rows(np.arange(100) >= 10, count=8, seed=0))  # ten were heard, 90 were not
     8
     """
     rng = np.random.default_rng(seed)
     loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
-    if len(loud) + len(quiet) > most:
-        share = round(most * len(loud) / (len(loud) + len(quiet)))
-        first = max(share, min(len(loud), most // 2))
-        loud, quiet = loud[:first], quiet[: most - first]
+    if len(loud) + len(quiet) > count:
+        share = round(count * len(loud) / (len(loud) + len(quiet)))
+        first = max(share, min(len(loud), count // 2))
+        loud, quiet = loud[:first], quiet[: count - first]
     return np.sort(np.concatenate([loud, quiet]))
 
 
@@ -99,7 +99,7 @@ def trend_about_rows(rows: PowerRows, law: Law | None) -> Trend:
     """Return a trend about a law; about the mean of what was heard where that is None."""
     if law is not None:
         return Trend.from_law(law, torch.from_numpy(rows.places))
-    return Trend(float(rows.heard.decibels.mean()))
+    return Trend(float(rows.heard_rows.decibels.mean()))
 
 
 class PowerAnswer(NamedTuple):
@@ -165,13 +165,13 @@ class PowerProcess(Stored):
         own = 1 + self.kernel.noise
         whole = max(self.heard, own)
         by_law = 1 - own / whole  # share of that variance
-        far = self.posterior.distance(queries) / self._reach
+        far = self.posterior.nearest_distance(queries) / self._trend_reach
         # What the law explains counts as unknown where no row is near.
         unknown = result.variance / whole + by_law * (1 - (-far.square()).exp())
         return PowerAnswer(result.mean[:, 0], self.kernel.amplitude * result.variance, unknown.clamp_max(1.0))
 
     @cached_property
-    def _reach(self) -> float:
+    def _trend_reach(self) -> float:
         return max(self.posterior.extent * REACH, 1e-9)
 
     def mean_at(self, queries: Tensor) -> Tensor:
@@ -181,17 +181,17 @@ class PowerProcess(Stored):
             queries.new_zeros(len(queries)),
         )
 
-    def left_out(self, at: np.ndarray) -> tuple[Tensor, Tensor]:
+    def left_out(self, places: np.ndarray) -> MeanVariance:
         """Return mean [dB] and variance [dB^2] of a measurement at each heard row without its own.
 
         Args:
-            at: (n,) places of the rows, where the nearest alone are looked at.
+            places: (n,) numbers of the rows' places, where the nearest alone are looked at.
         """
         parts = []
         for share, one in self.members:
             mean, variance = one.posterior.left_out()
             exact = one.posterior if isinstance(one.posterior, Exact) else None
-            heard = torch.from_numpy(at) if exact is None else exact.extra == 0
+            heard = torch.from_numpy(places) if exact is None else exact.extra == 0
             parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
         return mixture_moments(parts)
 
@@ -219,8 +219,8 @@ def condition_on_powers(
         least: silent rows that are used where fewer were heard.
     """
     if len(rows.places) <= MOST_ROWS or rows.silent.all():
-        return _exact_process(rows.draw_subset(MOST_ROWS, seed), prior, least)
-    loud = rows.measured
+        return _condition_exactly(rows.draw_subset(MOST_ROWS, seed), prior, least)
+    loud = rows.measured_rows
     values = loud.means_at_places()
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
@@ -229,13 +229,13 @@ def condition_on_powers(
     if not rows.silent.any():
         return PowerProcess(condition_on_nearest(prior, values, seed), heard), (note,)
     part = rows.draw_subset(MOST_ROWS, seed)
-    few, notes = _exact_process(part, prior, least)
+    few, notes = _condition_exactly(part, prior, least)
     posterior = few.posterior
     assert isinstance(posterior, Exact)
     quiet = posterior.extra > 0
     stand_ins = PlaceValues(
         posterior.rows[quiet].numpy(),
-        posterior.values()[quiet],
+        posterior.given_values()[quiet],
         torch.ones(int(quiet.sum()), dtype=torch.float64),
     )
     of = f"of {int(rows.silent.sum())} censored rows {int(part.silent.sum())}, drawn evenly, are looked at"
@@ -243,17 +243,17 @@ def condition_on_powers(
     return PowerProcess(nearest, heard), (note, of, *notes)
 
 
-def _exact_process(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
+def _condition_exactly(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
     counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
     notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
-    places, decibels, extra, factor = _with_pseudo_values(rows, prior, least, notes)
+    places, decibels, extra, factor = _add_pseudo_values(rows, prior, least, notes)
     posterior = Exact.from_values(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
     heard = float(loud.var(correction=0)) / prior.kernel.amplitude if len(loud) else 0.0
     return PowerProcess(posterior, heard), tuple(notes)
 
 
-def _with_pseudo_values(
+def _add_pseudo_values(
     rows: PowerRows, prior: Prior, least: int, notes: list[str]
 ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
     """Places, decibels, extra variances and a factor; pseudo-values of the silent rows that say anything."""
@@ -262,7 +262,7 @@ def _with_pseudo_values(
     if not rows.silent.any():
         return places, decibels, extra, None
     deviation, mean = math.sqrt(prior.kernel.amplitude), prior.mean(places)[:, 0]
-    gram = prior.between(places, places)
+    gram = prior.cross_covariance(places, places)
     gram.diagonal().add_(prior.kernel.noise)
     # In deviations of the process, as its covariance has amplitude 1.
     unit = (decibels - mean) / deviation

@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from gsparc.processes.averages import MeanVariance
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Trend
@@ -48,9 +49,9 @@ class Prior(Stored):
         mean, columns = self.trend.mean_and_columns(places)
         return mean[:, None], columns
 
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
+    def cross_covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return the covariance (n, m) of values at places (n, D) and (m, D) [m], without noise."""
-        result = self.kernel.between(a, b)
+        result = self.kernel.correlations(a, b)
         return result if self.trend is None else result.addmm(self.columns(a), self.columns(b).T)
 
     def variance(self, columns: Tensor) -> Tensor:
@@ -95,11 +96,11 @@ class Posterior(Stored, ABC):
         """Return the mean alone (B, P), as `answer` has it."""
 
     @abstractmethod
-    def left_out(self) -> tuple[Tensor, Tensor]:
+    def left_out(self) -> MeanVariance:
         """Return the mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
 
     @abstractmethod
-    def distance(self, queries: Tensor) -> Tensor:
+    def nearest_distance(self, queries: Tensor) -> Tensor:
         """Return distances (B,) [m] from places (B, D) to the nearest row."""
 
     @cached_property

@@ -66,7 +66,7 @@ class Sectors(Trend):
     unit: float = 1.0
 
     @cached_property
-    def units(self) -> tuple[Tensor, Tensor]:
+    def indicators(self) -> tuple[Tensor, Tensor]:
         """Return which of its site (T, R) each sector is, and of which band (T, bands), as units."""
         rank = (self.site[:, None] == self.site).tril(-1).sum(1)
         units = torch.nn.functional.one_hot
@@ -112,7 +112,7 @@ class Sectors(Trend):
         loss = across.minimum(floor) + over.clamp_max(ELEVATION_FLOOR_DB)
         return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
-    def slopes(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def linearise(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return means (n,), and what deviations of all shared parameters, of a sector's own, do to them.
 
         The latter (n, 10) [dB] are central differences, half a spread to either side.
@@ -123,8 +123,8 @@ class Sectors(Trend):
 
     def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
         """Return columns (n, 6 + bands) [dB] of what all sectors share, for unit normal weights."""
-        slopes = self.slopes(places)[1] if slopes is None else slopes
-        bands = self.units[1][sector_of(places).long()]
+        slopes = self.linearise(places)[1] if slopes is None else slopes
+        bands = self.indicators[1][sector_of(places).long()]
         return torch.cat([slopes[:, : len(SHARED)], LEVEL_DB * bands], 1)
 
     def columns(self, places: Tensor) -> Tensor:
@@ -134,10 +134,10 @@ class Sectors(Trend):
     def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """See `Trend`."""
         assert self.law is not None
-        (mean, slopes), decades = self.slopes(places), (self.law.decades(places) - self.middle)[:, None]
+        (mean, slopes), decades = self.linearise(places), (self.law.decades(places) - self.middle)[:, None]
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
-        own = (self.units[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
+        own = (self.indicators[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
         return mean, torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
 
 

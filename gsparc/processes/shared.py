@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from gsparc.processes.factor import Factor, whitened_rounded
-from gsparc.processes.left_out import left_out_residuals
+from gsparc.processes.averages import MeanVariance
+from gsparc.processes.factor import Factor, whiten_in_float32
+from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
@@ -44,6 +46,22 @@ class Block:
         # L^T K^-1 y = L^-1 y, for covariances in units of the amplitude.
         values = (process.factor.lower.T @ process.weights)[:, 0] / deviation
         return cls(process, process.factor.whiten(columns) / deviation, values)
+
+
+class Conditioning(NamedTuple):
+    """What S processes of one prior say.
+
+    Attributes:
+        prior: of them.
+        more: (S, k) mean beyond the prior's.
+        white: (k, n) roots of each of the variance that rows take away, none without rows.
+        shared: (S, k, P) root of the variance that the shared weights leave.
+    """
+
+    prior: Prior
+    more: Tensor
+    white: list[Tensor]
+    shared: Tensor
 
 
 class SharedTermsPosterior:
@@ -76,7 +94,7 @@ class SharedTermsPosterior:
             self._blocks[number] = Block.from_process(process, self.columns(process.rows))
         return self._blocks[number]
 
-    def answer(self, queries: Tensor, number: Tensor, float64: bool = False) -> tuple[Tensor, Tensor]:
+    def answer(self, queries: Tensor, number: Tensor, float64: bool = False) -> MeanVariance:
         """Return the mean and variance of a measurement, each (B,).
 
         Args:
@@ -97,7 +115,7 @@ class SharedTermsPosterior:
                 spread = (spread - known[there]).clamp_min(0.0)
             mean = mean.index_add(0, at, more[there])
             left = left.index_add(0, at, spread + shared.square().sum(2)[there])
-        return mean, left
+        return MeanVariance(mean, left)
 
     def predict_joint(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
@@ -106,7 +124,7 @@ class SharedTermsPosterior:
         asked = flat[None], (number,), own[None], self.columns(flat)[None]
         prior, more, white, shared = self._condition(*asked, rounded=False)
         terms, kernel = own.unflatten(0, groups), prior.kernel
-        left = kernel.between(queries, queries) + terms @ terms.mT
+        left = kernel.correlations(queries, queries) + terms @ terms.mT
         left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
         # Rows take variance away; weights that are not fully known give some back.
         for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
@@ -128,12 +146,8 @@ class SharedTermsPosterior:
 
     def _condition(
         self, queries: Tensor, asked: tuple[int, ...], own: Tensor, columns: Tensor, rounded: bool
-    ) -> tuple[Prior, Tensor, list[Tensor], Tensor]:
-        """What S processes of one prior say at (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P).
-
-        The prior; the mean (S, k) beyond its; roots (k, n) of each of the variance that rows take away, none
-        without rows, float32 if `rounded`; and (S, k, P) of that which the shared weights leave.
-        """
+    ) -> Conditioning:
+        """At (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P); roots are float32 if `rounded`."""
         more, shared = columns @ self.mean, columns.flatten(0, 1)
         prior, white = self.never, list[Tensor]()
         if asked[0] in self.processes:
@@ -141,14 +155,14 @@ class SharedTermsPosterior:
             # With less noise float32's rounding would show in the variance.
             rounded &= prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
             places, terms, weights = self._stack(asked, torch.float32 if rounded else torch.float64)
-            near = prior.kernel.between(queries.to(places), places)
+            near = prior.kernel.correlations(queries.to(places), places)
             cross = process_deviation(prior) * near.baddbmm(own.to(places), terms.mT)
             more = more + (cross @ weights)[..., 0]
             blocks = [self.block(one) for one in asked]
             factors = [block.process.factor for block in blocks]
             parts = [part[:, : len(one.lower)].T for one, part in zip(factors, cross, strict=True)]
             if rounded:
-                white = [one.T for one in whitened_rounded(factors, parts)]
+                white = [one.T for one in whiten_in_float32(factors, parts)]
             else:
                 white = [one.whiten(part).T for one, part in zip(factors, parts, strict=True)]
             if len(self.mean):
@@ -156,7 +170,7 @@ class SharedTermsPosterior:
                 shared = shared - torch.cat(told)
         if len(self.mean):
             shared = self.factor.whiten(shared.T).T
-        return prior, more, white, shared.unflatten(0, queries.shape[:2])
+        return Conditioning(prior, more, white, shared.unflatten(0, queries.shape[:2]))
 
     def _stack(self, asked: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
         """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes; 0 beyond the rows of one."""
@@ -173,7 +187,7 @@ class SharedTermsPosterior:
         return self._stacks[asked, dtype]
 
     @torch.no_grad()
-    def left_out(self, number: int) -> tuple[Tensor, Tensor]:
+    def left_out(self, number: int) -> LeftOutErrors:
         """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,)."""
         block = self.block(number)
         root = block.process.factor.root / process_deviation(block.process.prior)
@@ -199,7 +213,7 @@ def shared_weights(blocks: list[Block]) -> tuple[Factor, Tensor]:
     return factor, factor.solve(right[:, None])[:, 0]
 
 
-def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
+def left_out_processes(blocks: list[Block]) -> list[LeftOutErrors]:
     """Return errors (n,) of each process's rows predicted from the other processes, and variances.
 
     With C the covariance of the weights the inverse of a block is `L^-T (1 - V C V^T) L^-1`.
@@ -211,5 +225,5 @@ def left_out_processes(blocks: list[Block]) -> list[tuple[Tensor, Tensor]]:
         lower = block.process.factor.lower * process_deviation(block.process.prior)
         inner = Factor.from_gram(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
         error = inner.solve((block.values - block.columns @ mean)[:, None])[:, 0]
-        result.append((lower @ error, inner.whiten(lower.T).square().sum(0)))
+        result.append(LeftOutErrors(lower @ error, inner.whiten(lower.T).square().sum(0)))
     return result

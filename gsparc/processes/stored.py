@@ -12,7 +12,7 @@ import torch
 
 PLUGINS = "gsparc.terms"  # entry points of installed kinds
 MAIN = "__main__"  # module of what a notebook or script defines
-KINDS: dict[str, type[Stored]] = {}  # by the name that `stored` gives them
+KINDS: dict[str, type[Stored]] = {}  # by the name that `to_plain` gives them
 
 
 def kind_name(kind: type) -> str:
@@ -34,35 +34,35 @@ class Stored:
     def state(self) -> dict[str, Any]:
         """Return what `read` needs: the fields of a dataclass, else all attributes."""
         names = [one.name for one in fields(self)] if is_dataclass(self) else vars(self)
-        return {name: stored(getattr(self, name)) for name in names}
+        return {name: to_plain(getattr(self, name)) for name in names}
 
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> Self:
         """Return the object whose `state()` this was."""
-        return cls(**{name: restored(part) for name, part in state.items()})
+        return cls(**{name: from_plain(part) for name, part in state.items()})
 
 
-def stored(part: Any) -> Any:
-    """Return what `restored` reads.
+def to_plain(part: Any) -> Any:
+    """Return what `from_plain` reads.
 
-    >>> stored((1.0, None, np.zeros(2)))
+    >>> to_plain((1.0, None, np.zeros(2)))
     [1.0, None, {'array': tensor([0., 0.], dtype=torch.float64)}]
     """
     if isinstance(part, Stored):
         return {"kind": kind_name(type(part)), "state": part.state()}
     if isinstance(part, np.ndarray):
         return {"array": torch.from_numpy(part)}
-    return [stored(each) for each in part] if isinstance(part, (tuple, list)) else part
+    return [to_plain(each) for each in part] if isinstance(part, (tuple, list)) else part
 
 
-def restored(part: Any) -> Any:
-    """Return what `stored` was given; lists as tuples.
+def from_plain(part: Any) -> Any:
+    """Return what `to_plain` was given; lists as tuples.
 
     Raises:
         ValueError: see `find_kind`.
     """
     if isinstance(part, list):
-        return tuple(restored(each) for each in part)
+        return tuple(from_plain(each) for each in part)
     if not isinstance(part, Mapping) or part.keys() not in ({"kind", "state"}, {"array"}):
         return part
     if "array" in part:
@@ -71,7 +71,7 @@ def restored(part: Any) -> Any:
 
 
 def find_kind(name: str) -> type[Stored]:
-    """Return the kind that `stored` names so, of what was imported or is installed.
+    """Return the kind that `to_plain` names so, of what was imported or is installed.
 
     Raises:
         ValueError: there is none.

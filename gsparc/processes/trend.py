@@ -42,18 +42,18 @@ class Law(Stored):
     scale: float
     place: tuple[float, float, float] | None
 
-    def _squared(self, places: Tensor) -> Tensor:
+    def _squared_distance(self, places: Tensor) -> Tensor:
         still = other_end(places) if self.place is None else places.new_tensor(self.place)
         return (moving_end(places) - still).square().sum(1).clamp_min(max(self.floor, TINY_M) ** 2)
 
     def distance(self, places: Tensor) -> Tensor:
         """Return the distance [m], floored, (n,) at (n, 3), or of both ends (n, 6) [m]."""
-        return self._squared(places).sqrt()
+        return self._squared_distance(places).sqrt()
 
     def decades(self, places: Tensor) -> Tensor:
         """Return log10 of `distance` in metres (n,)."""
         # Half the logarithm of the square: the root, whose slope at 0 is infinite, is never taken.
-        return 0.5 * torch.log10(self._squared(places))
+        return 0.5 * torch.log10(self._squared_distance(places))
 
     def mean(self, places: Tensor) -> Tensor:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m], with autograd."""

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import torch
 
-from gsparc.processes.density import Profiled, covariance_of, fit_kernel
+from gsparc.processes.density import ProfiledDensity, covariance_of, fit_kernel
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.neighbourhood import covering_rows
 
@@ -54,5 +54,5 @@ def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start
         (-LOGIT, LOGIT), (math.log(NOISES[0]), math.log(NOISES[1])),
     ]  # fmt: skip
     distance = distances(at, at)
-    evidence = lambda kernel: Profiled.apply(covariance_of(kernel, distance), real)  # noqa: E731
+    evidence = lambda kernel: ProfiledDensity.apply(covariance_of(kernel, distance), real)  # noqa: E731
     return fit_kernel(evidence, [start], bounds, LOOKS, SETTLED)[1]

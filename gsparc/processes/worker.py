@@ -14,7 +14,7 @@ class Cancelled(BaseException):
 
 
 @contextmanager
-def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
+def _add_condition(name: str, condition: Callable[[], bool]) -> Iterator[None]:
     """Within, this thread is asked `condition` as `name`, beside what surrounds it."""
     before = getattr(_asked, name, None)
     # What surrounds it is asked first: an outer end is one of all within.
@@ -25,9 +25,9 @@ def _within(name: str, condition: Callable[[], bool]) -> Iterator[None]:
         setattr(_asked, name, before)
 
 
-def cancel_when(unwanted: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Make `raise_if_cancelled` raise, within, as soon as `unwanted`, or who surrounds it, says so."""
-    return _within("unwanted", unwanted)
+def cancel_when(condition: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Make `raise_if_cancelled` raise, within, as soon as `condition`, or who surrounds it, says so."""
+    return _add_condition("unwanted", condition)
 
 
 def raise_if_cancelled() -> None:
@@ -38,8 +38,8 @@ def raise_if_cancelled() -> None:
         raise Cancelled
 
 
-def end_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Make `out_of_time` say, within, what `over`, or who surrounds it, says, in this thread.
+def end_when(condition: Callable[[], bool]) -> AbstractContextManager[None]:
+    """Make `out_of_time` say, within, what `condition`, or who surrounds it, says, in this thread.
 
     >>> with end_when(lambda: True):
     ...     out_of_time()
@@ -47,12 +47,12 @@ def end_when(over: Callable[[], bool]) -> AbstractContextManager[None]:
     >>> out_of_time()
     False
     """
-    return _within("over", over)
+    return _add_condition("over", condition)
 
 
-def step_limit(most: int) -> Callable[[], bool]:
-    """Return a call: whether this thread has made `most` further factors and blocks of candidates."""
-    end = getattr(_asked, "steps", 0) + most
+def step_limit(steps: int) -> Callable[[], bool]:
+    """Return a call: whether this thread has made `steps` further factors and blocks of candidates."""
+    end = getattr(_asked, "steps", 0) + steps
     return lambda: getattr(_asked, "steps", 0) >= end
 
 

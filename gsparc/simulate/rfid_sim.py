@@ -22,7 +22,7 @@ from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
-from gsparc.physics.array_response import steering
+from gsparc.physics.array_response import steering_matrix
 from gsparc.simulate.shoebox import Room, trace_room
 
 GATEWAY = np.array([5.0, 0.26, 0.0])  # [m], as in the release
@@ -72,7 +72,7 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     with whole_folder(folder) as partial:
         (partial / "spectrum").mkdir()
         grid = SphereGrid.hemisphere(HEIGHT, WIDTH)
-        matrix = steering(planar_array(), grid, WAVELENGTH).numpy().astype(np.complex64)
+        matrix = steering_matrix(planar_array(), grid, WAVELENGTH).numpy().astype(np.complex64)
         for i, vector in enumerate(vectors):
             image = np.abs(vector.astype(np.complex64) @ matrix.conj()).reshape(HEIGHT, WIDTH)
             # Each image by its own largest value, as in the release.

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.training import curve
-from gsparc.training.cost import NO_COST, Cost
+from gsparc.training.cost import LINE, NO_COST, Cost
 from gsparc.training.race import Race
 from gsparc.training.time_budget import NOTHING, Clock, Effort, Spent, TimeBudget
 
@@ -44,7 +44,7 @@ class FitReport:
 
     def with_cost(self, cost: Cost) -> FitReport:
         """Return the report with its stages, which are logged."""
-        log.info("cost: %s", cost.describe(self.limited_by))
+        log.info(LINE.format(of_what="", cost=cost.describe(self.limited_by)))
         return replace(self, cost=cost)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from gsparc.training.time_budget import Clock
 
+LINE = "cost{of_what}: {cost}"  # of a log and of a summary
 LEAST_S = 0.05  # of a stage that is named
 
 

@@ -46,33 +46,33 @@ class Race:
         missed = (mean - target).detach()
         return Race(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
-    def log_candidate(self, what: str, rows: np.ndarray, missed: Tensor, before: float = 0.0) -> float:
+    def check_candidate(self, name: str, rows: np.ndarray, missed: Tensor, last_error: float = 0.0) -> float:
         """Return the mean squared error of another candidate, where both left rows out.
 
         Args:
-            what: it is, for the learning curve.
+            name: of it, for the learning curve.
             rows: (m,) rows, which it missed by `missed` (m, ...).
-            before: what was returned a look ago; infinity at the first.
+            last_error: what was returned a look ago; infinity at the first.
 
         Raises:
             Behind: it is `STALLED` while `FAR` behind, or weighing it gains less than `LEAST_GAIN`, even
                 `SURE` errors above.
         """
         now = mean_square(missed)
-        self.note(what, now)
+        self.note(name, now)
         _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
         best, own = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
         whole = max(float(best.abs().square().sum()), 1e-30)
         gains = (best * (best - own).conj()).real.double().sum(1) / whole
         gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
-        if now <= STALLED * before:
+        if now <= STALLED * last_error:
             return now
         known = f"what misses {self.error:.3f} of the energy of rows held out"
         if now > FAR * mean_square(best):
-            raise FellBehind(f"{what}: {now / mean_square(best):.0f} times the error of {known}")
+            raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {known}")
         if gain + SURE * error < LEAST_GAIN:
             raise FellBehind(
-                f"{what}: a mean with {known} gains {gain:.0%} at most, give or take {error:.0%}"
+                f"{name}: a mean with {known} gains {gain:.0%} at most, give or take {error:.0%}"
             )
         return now
 

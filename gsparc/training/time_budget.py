@@ -77,7 +77,7 @@ class Spent:
 NOTHING = Spent()
 
 
-def less_repeatable(*clocks: Clock | None) -> Clock | None:
+def worst_clock(*clocks: Clock | None) -> Clock | None:
     """Of clocks that decided something, return the one whose seconds repeat results worst; None of none."""
     return "wall" if "wall" in clocks else next(filter(None, clocks), None)
 
@@ -105,21 +105,21 @@ class TimeBudget:
         self.seconds, self.clock, self.limited = seconds, clock, False
         self._threads = torch.get_num_threads()  # searches change it for a while
         self._before = before
-        self._since = self._now()
+        self._since = self._read_clocks()
 
-    def _now(self) -> Spent:
+    def _read_clocks(self) -> Spent:
         # Seconds of threads add up: divided, both clocks agree where all of them work.
         return Spent(time.monotonic(), time.process_time() / self._threads)
 
     @property
-    def counted(self) -> Spent:
+    def by_clock(self) -> Spent:
         """Seconds by both clocks."""
-        return self._before + (self._now() - self._since)
+        return self._before + (self._read_clocks() - self._since)
 
     @property
     def spent(self) -> float:
         """[s]"""
-        return self.counted.seconds_on(self.clock)
+        return self.by_clock.seconds_on(self.clock)
 
     @property
     def left_s(self) -> float | None:
@@ -138,7 +138,7 @@ class TimeBudget:
 
     def restart(self) -> None:
         """Count on from now, with what was counted as spent before: what another process goes on from."""
-        self._before, self._since = self.counted, self._now()
+        self._before, self._since = self.by_clock, self._read_clocks()
 
     def restart_processor(self) -> None:
         """Count on in another process, whose processor time began with it."""

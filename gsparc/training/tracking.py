@@ -36,7 +36,7 @@ class PartLogger(Logger):
     name = property(lambda self: self.whole.name)
     version = property(lambda self: self.whole.version)
 
-    def log_hyperparams(self, *unused: Any, **named: Any) -> None:
+    def log_hyperparams(self, *params: Any, **kwargs: Any) -> None:
         """Log nothing: the run's are said once."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
@@ -104,13 +104,13 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
     given = {name: value for name, value in settings.items() if value}
     # `mode` as an argument: Lightning's `offline` sets a variable that wandb, asked for a login, warns of
     # and does not read; of `anonymous` it warns whatever the value.
-    logger = WandbLogger(offline=mode == "offline", **{**_of_job(), **given, "mode": mode})
+    logger = WandbLogger(offline=mode == "offline", **{**_job_tags(), **given, "mode": mode})
     logger._offline = False
     logger._wandb_init.pop("anonymous", None)
     return logger
 
 
-def _of_job() -> dict[str, Any]:
+def _job_tags() -> dict[str, Any]:
     """What runs are sorted by: choices of groups, and of a job its multirun and what it differs in."""
     if not HydraConfig.initialized():
         return {}

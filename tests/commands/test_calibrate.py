@@ -28,7 +28,7 @@ from gsparc.prediction.risk import (
     rank_correlation,
     risk_coverage,
     run_trials,
-    split_evidence,
+    split_choose_calibrate_test,
     threshold_levels,
 )
 
@@ -174,7 +174,7 @@ def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
 
 def test_parts_are_disjoint_and_cells_stay_whole() -> None:
     evidence = _evidence()
-    parts = split_evidence(evidence, "spatial", np.random.default_rng(0))
+    parts = split_choose_calibrate_test(evidence, "spatial", np.random.default_rng(0))
     assert len(np.unique(np.concatenate(parts))) == sum(map(len, parts)) == len(evidence)
     cell = np.floor((evidence.position[:, :2] - evidence.position[:, :2].min(0)) / (2 / 6) * 0.9999)
     names = [set(map(tuple, cell[part])) for part in parts]
@@ -206,11 +206,11 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     rng = np.random.default_rng(0)
     two = _evidence(40)
     two.position[:] = np.where(np.arange(40)[:, None] < 20, 0.0, 5.0)
-    assert len(split_evidence(two, "random", rng)[2]) == 16
+    assert len(split_choose_calibrate_test(two, "random", rng)[2]) == 16
     with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
-        split_evidence(two, "spatial", rng)
+        split_choose_calibrate_test(two, "spatial", rng)
     with pytest.raises(ValueError, match="2 positions cannot be parted"):
-        split_evidence(_evidence(2), "random", rng)
+        split_choose_calibrate_test(_evidence(2), "random", rng)
 
 
 def test_positions_on_a_plumb_line_have_patches() -> None:

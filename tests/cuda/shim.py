@@ -46,7 +46,7 @@ def gpu() -> cuda_library.Library:
 
 
 def on_gpu(run: Callable) -> Callable:
-    """`run` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
+    """`launch` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
 
     def there(name, like, *tensors, **options):
         moved = [None if t is None else t.cuda() for t in tensors]
@@ -67,10 +67,10 @@ def serving(where: str) -> Iterator[cuda_library.Library]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(calls.libraries, "cpu", kernels)
         patch.setitem(operators.KERNELS, "cpu", operators.KERNELS["cuda"])
-        patch.setattr(backends, "_cpu", lambda: cuda)
-        patch.setattr(backends, "_cuda", lambda: cuda)
+        patch.setattr(backends, "_load_cpu", lambda: cuda)
+        patch.setattr(backends, "_load_cuda", lambda: cuda)
         if where == "gpu":
-            patch.setattr(calls, "run", on_gpu(calls.run))
-        cuda._tables.cache_clear()
+            patch.setattr(calls, "launch", on_gpu(calls.launch))
+        cuda._sincos.cache_clear()
         yield kernels
-    cuda._tables.cache_clear()
+    cuda._sincos.cache_clear()

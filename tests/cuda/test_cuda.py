@@ -104,14 +104,14 @@ def test_tables_that_a_graph_holds_are_never_freed(where):
     tables = []
     for height in [20, *range(21, 60), 20]:
         make_plan(*model, origin(), SphereGrid(height, 8, -0.3, 2.5, 0.01, 0.05))
-        tables.append(cuda._tables.cache_info().misses)
+        tables.append(cuda._sincos.cache_info().misses)
     assert tables[-1] == tables[-2]
 
 
 def test_captured_plan_with_headroom_is_the_plan(where, monkeypatch):
     scene = random_scene(n=40).to(torch.float32)
     want = render(scene, poses(3), GRIDS["hemisphere"])
-    monkeypatch.setattr(cuda, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda, "_is_capturing", lambda tensor: True)
     got = render(scene, poses(3), GRIDS["hemisphere"])
     for name, value in want.items():
         assert torch.equal(value, got[name]), name
@@ -120,15 +120,15 @@ def test_captured_plan_with_headroom_is_the_plan(where, monkeypatch):
 def test_captured_plan_without_room_is_nan_never_wrong(where, monkeypatch):
     scene, grid = random_scene(n=40).to(torch.float32), GRIDS["hemisphere"]
     render(scene, poses(0), grid)
-    monkeypatch.setattr(cuda, "_capturing", lambda tensor: True)
-    monkeypatch.setattr(cuda, "_with_headroom", lambda entries: 5)
+    monkeypatch.setattr(cuda, "_is_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda, "_capacity_with_headroom", lambda entries: 5)
     got = render(scene, poses(0), grid)
     for name in ("image", "transmittance", "d_means", "d_quats", "d_scales", "d_opacities", "d_features"):
         assert torch.isnan(got[name]).all(), name
 
 
 def test_captured_plan_needs_an_earlier_one(where, monkeypatch):
-    monkeypatch.setattr(cuda, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda, "_is_capturing", lambda tensor: True)
     monkeypatch.setattr(cuda, "_capacities", {})
     scene = random_scene(n=4)
     with pytest.raises(RuntimeError, match="plan once before capturing"):

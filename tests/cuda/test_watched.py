@@ -77,10 +77,10 @@ def ends(*command: str) -> subprocess.CompletedProcess[str]:
 @contextmanager
 def recording(path: Path) -> Iterator[None]:
     """Every call of the kernels goes into a file as replay.cpp reads it, then runs."""
-    run = calls.run
+    run = calls.launch
 
     def kept(name, like, *tensors, **numbers):
-        call = calls.call_for(like, **numbers)
+        call = calls.make_call(like, **numbers)
         with path.open("ab") as file:
             file.write(name.encode().ljust(32, b"\0") + bytes(call) + len(tensors).to_bytes(8, "little"))
             for tensor in tensors:
@@ -91,7 +91,7 @@ def recording(path: Path) -> Iterator[None]:
         return run(name, like, *tensors, **numbers)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(calls, "run", kept)
+        patch.setattr(calls, "launch", kept)
         yield
 
 

@@ -24,24 +24,24 @@ def test_the_best_confidence_is_alpha_over_loss():
 def test_the_range_comes_from_calibration_and_is_not_moved_by_queries():
     sure = confidence()
     calibration = torch.rand(50, 3)
-    sure.calibrate(calibration)
-    own = sure.normalised(calibration)
+    sure.store_range(calibration)
+    own = sure.normalised_confidence(calibration)
     assert own.min() == 0 and own.max() == 1
     before = (sure.low.clone(), sure.high.clone())
-    anywhere = sure.normalised(100 * torch.randn(500, 3))
+    anywhere = sure.normalised_confidence(100 * torch.randn(500, 3))
     assert ((anywhere >= 0) & (anywhere <= 1)).all()
     assert (sure.low, sure.high) == before
 
 
 def test_one_calibration_position_gives_a_range():
     sure = confidence()
-    sure.calibrate(torch.zeros(1, 3))
-    assert torch.isfinite(sure.normalised(torch.randn(5, 3))).all()
+    sure.store_range(torch.zeros(1, 3))
+    assert torch.isfinite(sure.normalised_confidence(torch.randn(5, 3))).all()
 
 
 def test_far_from_what_was_measured_nothing_is_sure():
     near, far = torch.rand(200, 3) * 2 - 1, torch.randn(500, 3) * 300
     for seed in range(5):
         sure = confidence(seed)
-        sure.calibrate(near)
-        assert sure.normalised(far).median() < 1e-6 < sure.normalised(near).median()
+        sure.store_range(near)
+        assert sure.normalised_confidence(far).median() < 1e-6 < sure.normalised_confidence(near).median()

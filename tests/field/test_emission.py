@@ -57,7 +57,7 @@ def test_inverse_undoes_the_activation(activation, log_distance):
     many = emission(activation=activation, log_distance=log_distance)
     distance = torch.rand(7, 5) + 0.1
     wanted = torch.rand(7, 5, 2) * 0.9 + 0.05
-    logits = many.inverse(wanted, distance)
+    logits = many.to_logits(wanted, distance)
     frozen = dataclasses.replace(many.settings, hidden=0)
     direct = Emission(frozen, 5, 2, many.encoding)
     direct.logits = lambda position: logits  # type: ignore[method-assign]
@@ -68,5 +68,5 @@ def test_inverse_undoes_the_activation(activation, log_distance):
 def test_inverse_of_impossible_powers_is_finite(activation):
     many = emission(activation=activation)
     assert torch.isfinite(
-        many.inverse(torch.tensor([[[-3.0], [0.0], [1.0], [40.0], [1e-9]]]), torch.ones(1, 5))
+        many.to_logits(torch.tensor([[[-3.0], [0.0], [1.0], [40.0], [1e-9]]]), torch.ones(1, 5))
     ).all()

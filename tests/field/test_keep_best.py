@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import EarlyStopping
 
 from gsparc.callbacks import CostLedger
 from gsparc.field.gradient_stage import LOOKS
-from gsparc.field.keep_best import PATIENCE, _surely_less
+from gsparc.field.keep_best import PATIENCE, _is_surely_less
 from gsparc.models.registry import build
 from gsparc.training import curve
 from gsparc.training.context import FitContext
@@ -96,7 +96,7 @@ def test_a_second_stage_asked_for_figures_it_has_not_and_took_more_steps(measure
 def test_a_look_is_kept_where_its_rows_are_better_by_two_standard_errors(errors, kept):
     """One row of four that gains nothing but noise chose steps that cost the others."""
     start = torch.ones(4, dtype=torch.float64)
-    assert _surely_less(torch.tensor(errors, dtype=torch.float64), start) == kept
+    assert _is_surely_less(torch.tensor(errors, dtype=torch.float64), start) == kept
 
 
 def test_the_start_is_the_first_point_of_the_curve_and_the_result_the_last(measured, tmp_path):

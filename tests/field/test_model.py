@@ -60,10 +60,10 @@ def test_attenuation_is_gain_over_distance_and_can_be_off(campaign):
     on = model(data, attenuation=AttenuationSettings(inverse_distance=True, gain=3.0, d_ref=2.0, d_min=0.1))
     off = model(data, attenuation=AttenuationSettings(inverse_distance=False))
     apart = (batch.tx[:, None] - on.gaussians.means).square().sum(-1).add(0.01).sqrt() / 2.0
-    assert torch.allclose(on.distances(batch.tx), apart, atol=1e-6)
-    plain = off.features(batch.tx, batch.rx)
+    assert torch.allclose(on.relative_distances(batch.tx), apart, atol=1e-6)
+    plain = off.emissions(batch.tx, batch.rx)
     assert off.attenuation(apart) is None
-    assert torch.allclose(on.features(batch.tx, batch.rx), plain * (3.0 / apart)[..., None], rtol=1e-4)
+    assert torch.allclose(on.emissions(batch.tx, batch.rx), plain * (3.0 / apart)[..., None], rtol=1e-4)
 
 
 def test_the_reference_distance_is_from_the_still_end_to_the_moving_box(campaign):

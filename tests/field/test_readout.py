@@ -20,7 +20,7 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     method.fit(data, fold, short(tmp_path, 0))
     model, batch = method.fitted_model(), data.batch(fold.train[:8])
     densify = Densify(grad_threshold=0.5)
-    densify.statistics = densify._blank(model)
+    densify.statistics = densify._zero_statistics(model)
     densify.statistics["gradient"][::20], densify.statistics["seen"] = 1.0, torch.ones(len(model.gaussians))
     planned = densify.plan(model, torch.Generator().manual_seed(0), in_place=True)
     before = model(batch.tx, batch.rx).mean

@@ -48,7 +48,7 @@ class Looks:
 def watched() -> Iterator[Looks]:
     """Watch the block: budgets read, workers that ask whether to end, signals in this, the main thread."""
     looks = Looks()
-    counted, ask = TimeBudget.counted.fget, worker.raise_if_cancelled
+    counted, ask = TimeBudget.by_clock.fget, worker.raise_if_cancelled
 
     def reads(budget: TimeBudget):
         looks.look("clock")
@@ -63,7 +63,7 @@ def watched() -> Iterator[Looks]:
     before = signal.signal(signal.SIGALRM, lambda signum, frame: looks.look("interrupt", frame))
     signal.setitimer(signal.ITIMER_REAL, OFTEN_S, OFTEN_S)
     try:
-        with mock.patch.object(TimeBudget, "counted", property(reads)):
+        with mock.patch.object(TimeBudget, "by_clock", property(reads)):
             for module in modules:
                 module.raise_if_cancelled = asks
             looks.look("clock")

@@ -32,10 +32,10 @@ def model(campaign, activation: str) -> GaussianModel:
 def test_finite_there_with_no_pull(campaign, activation):
     field = model(campaign, activation)
     tx = field.gaussians.means.detach().clone()
-    features = field.features(tx, RECEIVER)
+    features = field.emissions(tx, RECEIVER)
     features.sum().backward()
     assert torch.isfinite(features).all()
-    assert float(field.distances(tx).detach()) == pytest.approx(D_MIN / D_REF)
+    assert float(field.relative_distances(tx).detach()) == pytest.approx(D_MIN / D_REF)
     assert (field.gaussians.means.grad == 0).all()
     assert all(p.grad is None or p.grad.isfinite().all() for p in field.parameters())
 
@@ -43,7 +43,7 @@ def test_finite_there_with_no_pull(campaign, activation):
 def test_no_jump_on_the_way_through(campaign):
     field = model(campaign, "sigmoid")
     steps = torch.linspace(-0.2, 0.2, 401)[:, None] * torch.tensor([1.0, 0.0, 0.0])
-    seen = field.features(field.gaussians.means.detach() + steps, RECEIVER).detach()[:, 0, 0]
+    seen = field.emissions(field.gaussians.means.detach() + steps, RECEIVER).detach()[:, 0, 0]
     assert seen.diff().abs().max() < 0.05 * seen.max()
 
 
@@ -51,7 +51,7 @@ def test_no_jump_on_the_way_through(campaign):
 def test_the_right_slope_far_away(campaign, far):
     field = model(campaign, "linear")
     tx = (field.gaussians.means.detach() + torch.tensor([[far, 0.0, 0.0]])).requires_grad_()
-    weakened = field.attenuation(field.distances(tx))
+    weakened = field.attenuation(field.relative_distances(tx))
     (slope,) = torch.autograd.grad(weakened.sum(), tx)
     assert float(weakened.detach()) == pytest.approx(D_REF / far, rel=2 * (D_MIN / far) ** 2 + 1e-5)
     assert float(slope[0, 0]) == pytest.approx(-D_REF / far**2, rel=2 * (D_MIN / far) ** 2 + 1e-4)

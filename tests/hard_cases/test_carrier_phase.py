@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.physics.waves import LIGHT, ranges, reduced_phase, wave, wave_over_band
+from gsparc.physics.waves import LIGHT, point_wave, ranges, reduced_phase, wave_over_band
 
 CARRIER = 60e9  # [Hz]
 FAR = [10_000.0, 9_999.123_456, 4_321.000_789, 777.7, 12.345]  # [m]
@@ -58,13 +58,13 @@ def test_every_subcarrier_of_the_factored_band(tones):
 def test_uneven_tones_are_not_factored():
     frequency = torch.tensor([1.0, 1.01, 1.03, 1.07, 1.08, 1.11, 1.2], dtype=torch.float64) * 2.4e9
     distance = torch.tensor([123.456], dtype=torch.float64)
-    torch.testing.assert_close(wave_over_band(distance, frequency), wave(distance[:, None], frequency))
+    torch.testing.assert_close(wave_over_band(distance, frequency), point_wave(distance[:, None], frequency))
 
 
 def test_band_backward_equals_tone_by_tone():
     frequency = torch.linspace(2.4e9, 2.5e9, 32, dtype=torch.float64)
     slopes = []
-    for build in (wave_over_band, lambda d, f: wave(d[..., None], f)):
+    for build in (wave_over_band, lambda d, f: point_wave(d[..., None], f)):
         distance = torch.tensor([3.0, 1_000.0], dtype=torch.float64, requires_grad=True)
         build(distance, frequency).real.mul(torch.arange(32.0)).sum().backward()
         slopes.append(distance.grad)
@@ -73,6 +73,6 @@ def test_band_backward_equals_tone_by_tone():
 
 def test_at_the_receiver_the_wave_and_its_slope_are_finite():
     place = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    value = wave(ranges(torch.zeros(1, 3), place), CARRIER)
+    value = point_wave(ranges(torch.zeros(1, 3), place), CARRIER)
     value.abs().sum().backward()
     assert value.abs().isfinite().all() and place.grad.isfinite().all()

@@ -169,7 +169,7 @@ def layers(drawn: Drawn) -> Layers:
     )
     shapes = reference.footprints(seen, drawn.grid, optics, torch.zeros_like(scene.means[:, :2]))
     most = seen.gain[:, None] * scene.opacities[order, None] * shapes
-    alpha = reference.layers(seen, shapes, scene.opacities[order], optics)
+    alpha = reference.layer_opacities(seen, shapes, scene.opacities[order], optics)
     light, _ = reference.transmittances(alpha, optics.cutoff.transmittance)
     directions = drawn.grid.directions().flatten(0, 1)
     return Layers(

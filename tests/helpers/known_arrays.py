@@ -7,7 +7,7 @@ import torch
 
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.ops import SphereGrid
-from gsparc.physics.array_response import steering
+from gsparc.physics.array_response import steering_matrix
 from gsparc.simulate.shoebox import Room, trace_room
 
 WAVELENGTH = 0.3259
@@ -30,7 +30,7 @@ def array_site(grid: SphereGrid, array: np.ndarray, **changes) -> Site:
 def spectra(site: Site, vectors: torch.Tensor) -> torch.Tensor:
     """`|A^H h|` (B, H, W) without shortcuts: what `SpectrumRenderer` must equal where nothing is unknown."""
     array, grid, wavelength = site.array_geometry()
-    matrix = steering(array, grid, wavelength).to(vectors.dtype)
+    matrix = steering_matrix(array, grid, wavelength).to(vectors.dtype)
     return (vectors @ matrix.conj()).abs().view(-1, grid.height, grid.width)
 
 

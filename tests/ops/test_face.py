@@ -36,7 +36,7 @@ def test_frozen_view_of_any_number_of_channels(channels, samples):
     frozen = freeze(plan, *scene.model, version=0)
     want = composite(plan, *scene.model, scene.features).image
     assert torch.allclose(frozen.render(scene.features, version=0), want, rtol=0, atol=1e-12)
-    assert torch.allclose(frozen.compose(scene.features[:, frozen.order]), want, rtol=0, atol=1e-12)
+    assert torch.allclose(frozen.render_visible(scene.features[:, frozen.order]), want, rtol=0, atol=1e-12)
 
 
 def test_plans_and_views_of_other_fields_are_refused():

@@ -7,7 +7,7 @@ from gsparc.data.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.ops.queries import array_spectrum, has_query_kernel, nearest_weights
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.processes.features import correlation, matern_parts
+from gsparc.processes.features import correlation, matern_mixture
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing, WhiteNoise
 from gsparc.processes.nearest import JITTER, neighbour_weights
 
@@ -33,7 +33,7 @@ def test_spectra_of_an_array(grid, height, name):
     for rows in (slice(None), slice(2, 3)):
         image, unknown = array_spectrum(
             places[rows], (anchors, whitening), (weights, offset), renderer.tables, renderer.square,
-            matern_parts(0.4, name),
+            matern_mixture(0.4, name),
         )  # fmt: skip
         torch.testing.assert_close(image, expected[rows], atol=2e-5, rtol=1e-4)
         torch.testing.assert_close(unknown, share[rows], atol=2e-6, rtol=0)
@@ -51,7 +51,7 @@ def test_weights_of_the_nearest_rows(near, kernel):
     noise = kernel.noise * (1 + torch.rand(200, dtype=torch.float64))
     rows = torch.cdist(queries, places).topk(near, largest=False).indices
     expected = neighbour_weights(kernel, queries, places[rows], noise[rows])
-    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled, kernel.shares)
+    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled_lengths, kernel.shares)
     assert found is not None
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, atol=1e-10, rtol=1e-9)

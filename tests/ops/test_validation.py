@@ -125,7 +125,7 @@ def test_features_of_a_frozen_view_were_not_looked_at(backend):
     features = scene.features.clone()
     features[1, view.order[3], 0] = math.nan
     words = f"Gaussian {int(view.order[3])} has features that are not finite"
-    for draw in (lambda: view.render(features, 0), lambda: view.compose(features[:, view.order])):
+    for draw in (lambda: view.render(features, 0), lambda: view.render_visible(features[:, view.order])):
         with pytest.raises(UnsoundGaussian, match=words):
             draw()
     view.render(torch.full_like(features, 1e308), 0)  # their sum is no number, each of them is
@@ -137,7 +137,7 @@ def test_features_of_a_frozen_view_were_not_looked_at(backend):
             "are torch.float32, this view was frozen in torch.float64",
         ),
         (features[:, :5], view.render, ValueError, r"this view shows Gaussian \d+, got features of 5"),
-        (features[:, :1], view.compose, ValueError, r"of those seen, got \(2, 1, 2\)"),
+        (features[:, :1], view.render_visible, ValueError, r"of those seen, got \(2, 1, 2\)"),
     ):  # the kernel picks the rows itself: it may not read beyond them
         with pytest.raises(error, match=words):
             draw(values, *([0] if draw == view.render else []))

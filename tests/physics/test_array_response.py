@@ -19,18 +19,18 @@ def _vectors(rows, elements, seed=0):
 @pytest.mark.parametrize("array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2])
 def test_squared_spectrum_is_linear_in_the_lags(array):
     grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
-    lags = array_response.co_array(array, WAVELENGTH)
-    direct = array_response.bartlett(h, array_response.steering(array, grid, WAVELENGTH)) ** 2
+    lags = array_response.make_co_array(array, WAVELENGTH)
+    direct = array_response.bartlett_spectrum(h, array_response.steering_matrix(array, grid, WAVELENGTH)) ** 2
     v = torch.cat([h.real, h.imag], 1)
-    numbers = torch.einsum("bi,kij,bj->bk", v, lags.forms(), v)
-    torch.testing.assert_close(numbers @ lags.basis(grid, WAVELENGTH).T, direct)
+    numbers = torch.einsum("bi,kij,bj->bk", v, lags.quadratic_forms(), v)
+    torch.testing.assert_close(numbers @ lags.spectrum_basis(grid, WAVELENGTH).T, direct)
 
 
 def test_array_output_is_the_weighted_sum_over_directions():
     grid, array = SphereGrid.hemisphere(4, 6), planar_array(2, 2)
     z = _vectors(1, 24).view(1, 4, 6)
     pattern = array_response.element_pattern(grid, 1.5)
-    h = array_response.array_output(z, array_response.steering(array, grid, WAVELENGTH), grid, pattern)
+    h = array_response.array_output(z, array_response.steering_matrix(array, grid, WAVELENGTH), grid, pattern)
     expected = torch.zeros(4, dtype=torch.complex128)
     for i in range(4):
         for j in range(6):
@@ -44,11 +44,11 @@ def test_array_output_is_the_weighted_sum_over_directions():
 @pytest.mark.parametrize("how", ["max", "minmax", "power", "none"])
 def test_slopes_through_the_array_and_the_normalisation(how):
     grid, array = SphereGrid.hemisphere(3, 4), planar_array(2, 2)
-    matrix = array_response.steering(array, grid, WAVELENGTH)
+    matrix = array_response.steering_matrix(array, grid, WAVELENGTH)
 
     def splat_then_array(real, imag):
         h = array_response.array_output(torch.complex(real, imag), matrix, grid)
-        return array_response.normalise_spectrum(array_response.bartlett(h, matrix), how)
+        return array_response.normalise_spectrum(array_response.bartlett_spectrum(h, matrix), how)
 
     parts = [v.clone().requires_grad_() for v in torch.view_as_real(_vectors(2, 12).view(2, 3, 4)).unbind(-1)]
     assert torch.autograd.gradcheck(splat_then_array, parts)
@@ -57,7 +57,7 @@ def test_slopes_through_the_array_and_the_normalisation(how):
 def test_slope_where_the_spectrum_vanishes_is_zero_not_nan():
     matrix = torch.ones(2, 1, dtype=torch.complex128)
     h = torch.tensor([[1.0 + 0j, -1.0]], dtype=torch.complex128, requires_grad=True)
-    array_response.bartlett(h, matrix).sum().backward()
+    array_response.bartlett_spectrum(h, matrix).sum().backward()
     assert torch.equal(h.grad, torch.zeros_like(h))
 
 

@@ -23,7 +23,7 @@ def test_a_plane_wave_has_the_atom_of_its_direction():
     direction = np.array([0.3, -0.5, 0.0])
     direction[2] = np.sqrt(1 - (direction**2).sum())
     wave = np.exp(2j * np.pi / WAVELENGTH * ELEMENTS @ direction)
-    image = space.spectrum(space.atoms(torch.tensor(direction).float()[None]))
+    image = space.spectrum(space.plane_wave_lags(torch.tensor(direction).float()[None]))
     np.testing.assert_allclose(image[0], bartlett(wave[None]), atol=1e-5)
 
 

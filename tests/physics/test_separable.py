@@ -14,7 +14,7 @@ def images(count=12):
 def test_images_of_low_rank_come_back():
     known = images()
     basis = fit_separable(known.double().split(5), 1e-12)
-    assert basis.project(known).shape == (12, 12) and basis.image == (10, 20)
+    assert basis.project(known).shape == (12, 12) and basis.image_shape == (10, 20)
     torch.testing.assert_close(basis.images(basis.project(known)), known, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(basis.rows.T @ basis.rows, torch.eye(3), rtol=0, atol=1e-6)
     energy = basis.project(known).square().sum(1)

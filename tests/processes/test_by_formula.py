@@ -14,8 +14,8 @@ KERNEL = Kernel.from_lengths((1.2, 6.0), (0.4, 0.6), 0.08)
 def test_variance_of_places_is_what_known_ones_leave():
     rng = np.random.default_rng(0)
     known, places = rng.uniform(0, 9, (30, 3)), rng.uniform(0, 9, (7, 3))
-    between = KERNEL.between(torch.from_numpy(known), torch.from_numpy(places)).numpy()
-    gram = KERNEL.between(torch.from_numpy(known), torch.from_numpy(known)).numpy() + 0.08 * np.eye(30)
+    between = KERNEL.correlations(torch.from_numpy(known), torch.from_numpy(places)).numpy()
+    gram = KERNEL.correlations(torch.from_numpy(known), torch.from_numpy(known)).numpy() + 0.08 * np.eye(30)
     wanted = 1.08 - np.diag(between.T @ np.linalg.solve(gram, between))
     np.testing.assert_allclose(process_variance(KERNEL, known, places), wanted, rtol=1e-9)
 
@@ -27,7 +27,7 @@ def test_density_of_rows_given_their_neighbours():
     squared, variance = [], []
     for row, value, times in zip(places, values, count, strict=True):
         at = torch.from_numpy(row)
-        gram = KERNEL.between(at, at).numpy() + np.diag(0.08 / times)
+        gram = KERNEL.correlations(at, at).numpy() + np.diag(0.08 / times)
         weights = np.linalg.solve(gram[1:, 1:], gram[1:, 0])
         squared.append(np.mean((value[0] - weights @ value[1:]) ** 2))
         variance.append(gram[0, 0] - weights @ gram[1:, 0])

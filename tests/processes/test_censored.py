@@ -55,8 +55,8 @@ def test_stand_ins_of_a_similar_vector_are_a_start(monkeypatch):
     found = log_evidence(gram, values, sides, last)
     alone, calls = log_evidence(gram, values, sides), []
     assert found[0] == pytest.approx(alone[0], abs=1e-3) and torch.allclose(found[1], alone[1], atol=1e-3)
-    sweep = censored._sites
-    monkeypatch.setattr(censored, "_sites", lambda *given: calls.append(1) or sweep(*given))
+    sweep = censored._match_sites
+    monkeypatch.setattr(censored, "_match_sites", lambda *given: calls.append(1) or sweep(*given))
     log_evidence(gram, values, sides, last)
     again = len(calls)
     log_evidence(gram, values, sides)

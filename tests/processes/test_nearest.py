@@ -53,8 +53,8 @@ def test_given_all_rows_as_neighbours_it_is_the_exact_process():
 
 def test_the_only_place_was_its_own_neighbour():
     one = neighbourhood.Neighbourhood.from_places(np.zeros((1, 3)), 0)
-    assert one.nearest(np.zeros((2, 3)), np.zeros(2, int)).shape == (2, 0)
-    assert one.nearest(np.ones((1, 3))).tolist() == [[0]]
+    assert one.nearest_rows(np.zeros((2, 3)), np.zeros(2, int)).shape == (2, 0)
+    assert one.nearest_rows(np.ones((1, 3))).tolist() == [[0]]
     assert np.allclose(neighbourhood.nearest_distance(one.tree, torch.ones(1, 3).double()), 3**0.5)
 
 

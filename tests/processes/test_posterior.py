@@ -37,7 +37,7 @@ def test_twenty_random_problems_are_scikit_learns(seed):
     np.testing.assert_allclose(found.mean, mean.reshape(7, -1) + level, atol=1e-8)
     np.testing.assert_allclose(found.variance, covariance.diagonal() + noise, atol=1e-8)
     np.testing.assert_allclose(posterior.covariance(torch.from_numpy(queries)), covariance, atol=1e-8)
-    np.testing.assert_allclose(posterior.values(), values, atol=1e-8)
+    np.testing.assert_allclose(posterior.given_values(), values, atol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -106,7 +106,7 @@ def test_density_and_slope_of_circular_values():
     change = 1e-6 * (change + change.mH)
     ends = [Conditioned.from_gram(covariance + step * change, values).nll for step in (-0.5, 0.5)]
     told = Conditioned.from_gram(covariance, values)
-    expected = float((told.slope @ change).diagonal().sum().real)
+    expected = float((told.nll_gradient @ change).diagonal().sum().real)
     assert ends[1] - ends[0] == pytest.approx(expected, rel=1e-5)
     density = (
         3 * torch.logdet(covariance).real + (values.mH @ torch.linalg.solve(covariance, values)).trace().real

@@ -21,24 +21,24 @@ def test_a_candidate_behind_goes_on_where_its_errors_are_its_own():
     looks = []
     one = race(looks)
     assert one.error == pytest.approx(0.01, rel=0.2)
-    one.log_candidate("behind", ROWS, 1.5 * OWN[1])
+    one.check_candidate("behind", ROWS, 1.5 * OWN[1])
     assert looks == [("behind", pytest.approx(2.25, rel=0.2))]
 
 
 def test_a_candidate_ends_that_stays_far_behind():
     one = race()
     with pytest.raises(FellBehind, match=r"^far: \d+ times the error of what misses 0\.0"):
-        one.log_candidate("far", ROWS, 5 * OWN[1], 25.0)
-    assert one.log_candidate("falling", ROWS, 5 * OWN[1], 100.0) == pytest.approx(25, rel=0.2)
+        one.check_candidate("far", ROWS, 5 * OWN[1], 25.0)
+    assert one.check_candidate("falling", ROWS, 5 * OWN[1], 100.0) == pytest.approx(25, rel=0.2)
 
 
 def test_a_candidate_ends_that_misses_what_the_best_misses():
     with pytest.raises(FellBehind, match=r"^near: a mean with what misses 0\.0\d+ .* gains -?\d+% at most"):
-        race().log_candidate("near", ROWS, OWN[0] + 0.1 * OWN[1])
-    assert race().log_candidate("falling", ROWS, OWN[0] + 0.1 * OWN[1], 3.0) == pytest.approx(1, rel=0.2)
+        race().check_candidate("near", ROWS, OWN[0] + 0.1 * OWN[1])
+    assert race().check_candidate("falling", ROWS, OWN[0] + 0.1 * OWN[1], 3.0) == pytest.approx(1, rel=0.2)
 
 
 def test_only_rows_that_both_left_out_are_compared():
     rows = np.r_[ROWS[30:][::-1], 100 + ROWS]
     with pytest.raises(FellBehind):
-        race().log_candidate("one", rows, torch.cat([OWN[0, 30:].flip(0), -9 * OWN[0]]))
+        race().check_candidate("one", rows, torch.cat([OWN[0, 30:].flip(0), -9 * OWN[0]]))

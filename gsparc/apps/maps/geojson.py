@@ -71,7 +71,8 @@ def read_shapes(
             except DataError as error:
                 raise DataError(f"{where}: {error} (longitude first, then latitude)") from None
         if np.abs(places).max(initial=0) > FARTHEST:
-            raise DataError(f"{where}: {np.abs(places).max():.3g} is no coordinate in metres")
+            far = f"{np.abs(places).max():.3g} is no coordinate in metres"
+            raise DataError(f"{where}: {far}; give those of the measurements, within {FARTHEST:g} m")
         return places
 
     parts = shapely.transform(parts, in_metres)

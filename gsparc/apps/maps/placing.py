@@ -205,7 +205,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     for one in chosen:
         own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
-        parts.append(held_out_evidence(learned.forget(inner), data, inner, np.full(int(own.sum()), one)))
+        parts.append(held_out_evidence(learned.unlearn(inner), data, inner, np.full(int(own.sum()), one)))
     parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
     if not parts:
         return NewStationError()

@@ -117,7 +117,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         split = SplitSettings("blocks", side_m=wide, share=SHARE_OUT, val_fraction=0.1)
         cut = learned.cut_folds(1, settings.seed + number // len(SIDES), split)
         inner = learned.drop_unlearned(cut.folds[0])
-        less = learned.forget(inner, split)
+        less = learned.unlearn(inner, split)
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Blocks of two folds are never one, though they may hold the same rows.

@@ -12,7 +12,7 @@ from gsparc.data.limits import SettingError
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import neighbour_distance
-from gsparc.physics.row_factors import FREEDOMS, Freedom, align_factors, freedom_words, resolvable_delays
+from gsparc.physics.row_factors import FREEDOMS, Freedom, align_factors, describe_freedom, resolvable_delays
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class Coherence:
     freedom: Freedom
 
     def __str__(self) -> str:
-        own = "" if self.freedom == "none" else f"every row has {freedom_words(self.freedom)} of its own: "
+        own = "" if self.freedom == "none" else f"every row has {describe_freedom(self.freedom)} of its own: "
         return (
             f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
             f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "

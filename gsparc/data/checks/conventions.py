@@ -214,7 +214,7 @@ def _spectra(data: Measurements) -> Score:
     assert grid is not None
     x, y, z = np.einsum("sji,sj->is", data.rx_rotation, data.tx - data.rx_position)
     row = np.rint((np.arctan2(z, np.hypot(x, y)) - grid.first_elevation) / grid.elevation_step).astype(int)
-    column = np.rint((np.arctan2(y, x) - grid.first_azimuth) / grid.azimuth_step % grid.turn).astype(int)
+    column = np.rint((np.arctan2(y, x) - grid.first_azimuth) / grid.azimuth_step % grid.per_turn).astype(int)
     column = column % grid.width if grid.periodic else column
     inside = (row >= 0) & (row < grid.height) & (column < grid.width)
     angle = grid.solid_angles().numpy() / float(grid.solid_angles().sum())

@@ -12,8 +12,8 @@ import numpy as np
 
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.conventions import convention_warnings
-from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
+from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
 from gsparc.data.files import SeveralFiles, read_text
@@ -70,7 +70,7 @@ class Campaign(DataModule):
             log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
         for warning in _implausible(reading.data):
             log.warning("%s: %s", self.file, warning)
-        for hint in suspicious_values(reading.data):
+        for hint in unit_warnings(reading.data):
             log.warning("%s: units? %s", self.file, hint)
         return reading.data
 

@@ -25,7 +25,7 @@ from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import wrap_per_station
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
-from gsparc.training.time_budget import Clock, less_repeatable
+from gsparc.training.time_budget import Clock, worst_clock
 
 
 def fit_context(config: DictConfig, **others: Any) -> FitContext:
@@ -139,5 +139,5 @@ def fit_folds(
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
         methods, tuple(one.seconds for one in reports), processor, {}, reports[0].notes,
-        less_repeatable(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
+        worst_clock(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip

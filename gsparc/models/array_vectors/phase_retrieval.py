@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.physics.array_response import co_array
+from gsparc.physics.array_response import make_co_array
 from gsparc.processes.factor import Factor
 from gsparc.training.time_budget import Effort
 
@@ -142,11 +142,11 @@ class _Problem:
     @staticmethod
     def from_images(site: Site, images: np.ndarray) -> _Problem:
         array, grid, wavelength = site.array_geometry()
-        known = co_array(array, wavelength)
-        basis = known.basis(grid, wavelength)
+        known = make_co_array(array, wavelength)
+        basis = known.spectrum_basis(grid, wavelength)
         # Whitened: squares of lag coordinates are mean squares over pixels.
         q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
-        forms = torch.einsum("ij,jkl->ikl", r, known.forms())
+        forms = torch.einsum("ij,jkl->ikl", r, known.quadratic_forms())
         projector = q / len(basis) ** 0.5
         parts = []
         eight_bits = images.dtype == np.uint8

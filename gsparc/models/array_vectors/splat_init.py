@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_error_law
+from gsparc.field.confidence import fit_level_and_power
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import gaussian_vectors
 from gsparc.field.initial import InitTask, Start
@@ -30,7 +30,7 @@ from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
-from gsparc.physics.array_response import steering
+from gsparc.physics.array_response import steering_matrix
 from gsparc.processes.features import whitened_features
 from gsparc.processes.neighbourhood import covering_rows
 from gsparc.training.time_budget import Spent, TimeBudget
@@ -75,7 +75,7 @@ def start_from_vectors(task: InitTask) -> Start:
             "init=vectors solves a linear read-out: leave init=auto, or set model.emission.hidden=0 and "
             "model.attenuation.inverse_distance=false"
         )
-    process = learn_vector_process(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+    process = learn_vector_process(task.data, task.rows, task.most_anchors, task.seed, task.run_dir)
     return Start(
         process.prior, partial(set_emissions, process=process, receiver=task.receiver),
         astuple(process.training), astuple(process.elapsed), process.left_out,
@@ -104,10 +104,10 @@ def learn_vector_process(
         raise ValueError("the training set is empty")
     (array, grid, wavelength), watch = site.array_geometry(), TimeBudget()
     recovery, training = recover_cached(data, rows, seed)
-    elapsed = watch.counted
+    elapsed = watch.by_clock
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         write_recovery_report(recovery, data, rows, run_dir / "array_recovery.csv")
-    matrix = steering(array, grid, wavelength).numpy()
+    matrix = steering_matrix(array, grid, wavelength).numpy()
     partner, places = index_mirror_elements(array), data.tx[rows]
     core = covering_rows(places, MOST_ROWS, seed)
     images = to_real(training_targets(data, rows[core]), "spectrum")
@@ -132,7 +132,7 @@ def learn_vector_process(
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
-        fit_error_law(tuned.unknown, tuned.error),
+        fit_level_and_power(tuned.unknown, tuned.error),
         tuned.left_out,
         elapsed,
         training,

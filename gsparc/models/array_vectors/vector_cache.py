@@ -53,7 +53,7 @@ def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         watch = TimeBudget()
         recovery = recover_vectors(data.site, training_targets(data, part), data.tx[part], seed)
-        spent = np.tile([*vars(watch.counted).values()], (len(part), 1)) / len(part)
+        spent = np.tile([*vars(watch.by_clock).values()], (len(part), 1)) / len(part)
         parts = zip(*(getattr(recovery, name) for name in names), spent, strict=True)
         known.update(zip(part.tolist(), parts, strict=True))
     *columns, seconds = (np.stack(part) for part in zip(*(known[row] for row in rows.tolist()), strict=True))

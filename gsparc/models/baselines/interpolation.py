@@ -15,7 +15,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import heard_rows, power_rows, to_targets, training_targets, unheard_note
 from gsparc.processes.powers import PowerRows
-from gsparc.processes.stored import restored, stored
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -110,12 +110,12 @@ class Interpolator(Method):
         """Predict at (B, 3) float64 [m]."""
 
     def _stored_state(self) -> dict[str, Any]:
-        return {name: stored(getattr(self, name, None)) for name in self.stored}
+        return {name: to_plain(getattr(self, name, None)) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
         """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
-            setattr(self, name, restored(state[name]))
+            setattr(self, name, from_plain(state[name]))
 
 
 class Differentiable(Interpolator):

@@ -293,7 +293,7 @@ def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditione
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape
-        nll += outputs * (count * math.log(max(given.scale, TINY)) + float(given.factor.log_determinant))
+        nll += outputs * (count * math.log(max(given.power, TINY)) + float(given.factor.log_determinant))
         # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll

@@ -31,12 +31,12 @@ from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import PlaceValues, condition_on_nearest, kriging_weights
-from gsparc.processes.neighbourhood import Neighbourhood, covering_rows, spacing
+from gsparc.processes.neighbourhood import Neighbourhood, covering_rows, median_spacing
 from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.prior import Prior
-from gsparc.processes.stored import restored, stored
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Effort, TimeBudget
@@ -95,7 +95,7 @@ class ComplexGP(ClosedForm):
         assert self.site is not None and self.site.wavelength is not None
         if self.site.phase_reference == "neighbours":
             at = places.numpy()
-            kernel, rows = initial_kernel(self.site.wavelength, spacing(at)), (at, values.numpy())
+            kernel, rows = initial_kernel(self.site.wavelength, median_spacing(at)), (at, values.numpy())
             for _ in range(REFINED):
                 kernel = fit_two_lengths(*rows, self.site.wavelength, kernel)
             yield replace(kernel, amplitude=1.0)
@@ -141,7 +141,7 @@ class ComplexGP(ClosedForm):
         scatter = torch.from_numpy((count * (squares - _mean_square(means))).clip(0))
         near = Neighbourhood.from_places(values.places, 0)
         row = covering_rows(values.places, TRIED_ON, 0)
-        rows = np.c_[row, near.nearest(values.places[row], row, NEAREST)]
+        rows = np.c_[row, near.nearest_rows(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
         at = torch.from_numpy(values.places)
         sample = at[rows], values.values[rows][..., entries], values.count[rows], scatter[row]
@@ -182,12 +182,16 @@ class ComplexGP(ClosedForm):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"posterior": stored(self._posterior()), "runs": stored(self.runs), "shape": list(self.shape)}
+        return {
+            "posterior": to_plain(self._posterior()),
+            "runs": to_plain(self.runs),
+            "shape": list(self.shape),
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.posterior, self.runs = restored(state["posterior"]), restored(state["runs"])
+        self.posterior, self.runs = from_plain(state["posterior"]), from_plain(state["runs"])
 
     def count_components(self) -> int:
         """Return the number of training samples kept."""
@@ -201,7 +205,7 @@ def _mean_square(channels: np.ndarray) -> np.ndarray:
 
 def _fit_factors(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
     """See `columns.fit_factors`; of a kernel of unit power."""
-    gram = kernel.between(rows.places, rows.places)
+    gram = kernel.correlations(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
     return fit_run_factors((rows,), [gram], runs)
 
@@ -214,7 +218,7 @@ def _neighbour_nll(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, s
         at, values, counts: (T, 1 + k, D) [m], (T, 1 + k, R) and (T, 1 + k): rows first, then neighbours.
         scatter: (T,) squares of visits about their mean.
     """
-    covariance, noise = kernel.between(at, at), kernel.noise / counts
+    covariance, noise = kernel.correlations(at, at), kernel.noise / counts
     gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:])
     weights, known = kriging_weights(gram, covariance[:, 0, 1:])
     missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])

@@ -141,7 +141,7 @@ def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     given = Conditioned.from_gram(covariance, part.target)
     count, outputs = part.group.target.shape
     # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
-    quadratic = given.scale * part.target.numel() + part.rest / noise
+    quadratic = given.power * part.target.numel() + part.rest / noise
     scale = max(quadratic / (count * outputs), TINY)
     determinant = float(given.factor.log_determinant) + (count - size) * math.log(noise)
     return SolvedGroup(outputs * (count * math.log(scale) + determinant), given, scale)

@@ -36,7 +36,7 @@ from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import ENTRIES
-from gsparc.processes.stored import restored, stored
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
 
 ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
@@ -113,7 +113,7 @@ class ChannelField(ClosedForm):
         self.site, self.channel = data.site, (int(data.target.shape[1]), int(data.target.shape[2]))
         self.prior, notes = find_terms(data, rows, self.settings, budget)
         self.condition(data, rows)
-        return FitReport(budget.counted.wall, notes, budget.limited_by)
+        return FitReport(budget.by_clock.wall, notes, budget.limited_by)
 
     @property
     def by_antenna(self) -> bool:
@@ -157,7 +157,7 @@ class ChannelField(ClosedForm):
         factors, told = fit_run_factors(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
-        self.weights = tuple(Weights(group, given, max(given.scale, TINY), *rest) for group, given in told)
+        self.weights = tuple(Weights(group, given, max(given.power, TINY), *rest) for group, given in told)
         self.stations = {}
         for known in self.weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
@@ -277,7 +277,7 @@ class ChannelField(ClosedForm):
         groups = [each.group for each in self._require_weights()]
         return {
             "prior": self.prior.state(), "channel": list(self.channel), "rows": torch.from_numpy(self.rows),
-            "runs": stored(self.runs), "groups": [group.state(self.runs.factors) for group in groups],
+            "runs": to_plain(self.runs), "groups": [group.state(self.runs.factors) for group in groups],
         }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -285,5 +285,5 @@ class ChannelField(ClosedForm):
         antennas, tones = (int(n) for n in state["channel"])
         self.site, self.channel = site, (antennas, tones)
         self.prior, self.rows = ChannelPrior.read(state["prior"]), state["rows"].numpy()
-        runs = restored(state["runs"])
+        runs = from_plain(state["runs"])
         self._condition_groups(tuple(map(Group.read, state["groups"])), runs.runs, runs.factors)

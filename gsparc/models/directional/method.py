@@ -25,7 +25,7 @@ from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, en
 from gsparc.models.image_sources.frame import Frame, SourcePaths, SourcesInFrame, require_static_phase
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
-from gsparc.physics.waves import wave, wave_over_band
+from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
 
@@ -169,7 +169,7 @@ class DirectionalGP(SourcesInFrame):
     def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """See `SourcesInFrame`."""
         at = self.posterior.arrival_at(places, torch.tensor(self.frame.carrier_hz))
-        gain = at.probability * wave(at.away, self.frame.carrier_hz)
+        gain = at.probability * point_wave(at.away, self.frame.carrier_hz)
         gain = self.posterior.mean_gains(at) * gain[:, :, None]
         return SourcePaths(gain.mT, at.away, self.posterior.positions.points)
 

@@ -23,7 +23,7 @@ from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.method import to_double
-from gsparc.physics.waves import ranges, wave
+from gsparc.physics.waves import point_wave, ranges
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import distances, matern32_of_squares
 from gsparc.processes.left_out import left_out_group, rows_of_groups
@@ -190,7 +190,7 @@ class SightedSources:
     def error_and_power(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
         """Return the expected squared error and expected power (m,); of gains, noise and visibility."""
         probability, noise = at.probability, self.kernel.noise
-        arriving = wave(at.away, carrier_hz, self.power.dtype)
+        arriving = point_wave(at.away, carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
         cross = self._cross_covariance(arriving * probability, at.retained, self.power) * at.correlation
         gains = (powers * probability.square()).sum(1) - self.conditioned.explained_variance(cross)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.physics.rays import closest_approach
+from gsparc.physics.rays import closest_ranges_and_gap
 
 MIN_ERROR, MAX_ERROR = 1e-4, 0.12  # [rad], of a direction: rounding in files; no position information
 ERRORS = tuple(np.geomspace(MIN_ERROR, MAX_ERROR, 7))  # [rad], tried on the first point
@@ -257,7 +257,7 @@ def _midpoints(rays: Rays, error: float, rng: np.random.Generator, pairs: int, l
     for a, b in couples[couples[:, 0] != couples[:, 1]]:
         one, two = rays.direction[groups[a]], rays.direction[groups[b]]
         here, there = rays.places[owners[a]], rays.places[owners[b]]
-        s, t, gap = closest_approach(here, one, there, two)
+        s, t, gap = closest_ranges_and_gap(here, one, there, two)
         near = gap < 3 * error * np.hypot(s, t)
         i, j = np.nonzero(near)
         points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)

@@ -136,7 +136,7 @@ class PhasedGains(CircularGains):
         along, across = (
             (slope * z[:, None] * z).view(2, n, 2, n).sum((0, 2)) for z in stack_real_imag(scaled)
         )
-        # Half, as d nll of real values is half of trace(G dK) (`Conditioned.slope`).
+        # Half, as d nll of real values is half of trace(G dK) (`Conditioned.nll_gradient`).
         return ((1 - share) * along + share * across) / 2
 
 

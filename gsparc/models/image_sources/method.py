@@ -36,9 +36,9 @@ from gsparc.models.image_sources.scene import JITTER, Scene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
-from gsparc.physics.mirror_planes import image_rotations, normal_form
+from gsparc.physics.mirror_planes import hesse_form, image_rotations
 from gsparc.physics.row_factors import Freedom, align_factors
-from gsparc.physics.waves import wave, wave_over_band
+from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import Race
 from gsparc.training.time_budget import TimeBudget
@@ -132,7 +132,7 @@ class ImageSourceGP(SourcesInFrame):
         self._set_members(rows, members)
         self.held = self._predict_left_out(data, seen, members, len(rows))
         notes += self._describe_search(members, budget)
-        return FitReport(budget.counted.wall, tuple(notes), budget.limited_by)
+        return FitReport(budget.by_clock.wall, tuple(notes), budget.limited_by)
 
     def _set_posteriors(self, rows: Rows, scenes: list[Scene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
@@ -189,7 +189,7 @@ class ImageSourceGP(SourcesInFrame):
         mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(race.log_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
+        errors.append(race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
 
     def _draw(self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
@@ -274,7 +274,7 @@ class ImageSourceGP(SourcesInFrame):
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
         away = self.query.ranges(places)
         gain = self.query.gains(places) * weight[:, None, None]
-        gain = gain * wave(away, self.frame.carrier_hz).T[..., None]
+        gain = gain * point_wave(away, self.frame.carrier_hz).T[..., None]
         return SourcePaths(gain.movedim(0, -1), away, self.query.sources)
 
     def left_out(self) -> LeftOutRows:
@@ -326,7 +326,7 @@ class ImageSourceGP(SourcesInFrame):
     def objects(self) -> SiteObjects:
         """Return planes and boxes of the heaviest search."""
         scene, middle = self.members[int(self.weights.argmax())].scene, self.frame.middle.double()
-        normal, offset = normal_form(scene.planes.double())
+        normal, offset = hesse_form(scene.planes.double())
         # n.p = b about the frame's middle m is n.p = b + n.m in local coordinates.
         moved = torch.cat([normal, offset + (normal @ middle)[:, None]], 1)
         boxes = scene.clutter.boxes.double().unflatten(1, (2, -1)) + middle

@@ -84,11 +84,11 @@ def _cost_and_gradient(
     for k, one in enumerate(correlation):
         gains.add_source(scaled[:, k], one)
     conditioned = gains.condition(noise + scene.noise_floor)
-    by_waves = gains.grad_waves(conditioned.slope, scaled, correlation)
+    by_waves = gains.grad_waves(conditioned.nll_gradient, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     slopes = torch.autograd.grad(waves, leaves, by_waves * amplitude, materialize_grads=True)
     by_place, by_normal, by_offset, _, _, *by_phase = slopes
-    by_noise = noise * gains.grad_noise(conditioned.slope)
+    by_noise = noise * gains.grad_noise(conditioned.nll_gradient)
     gradient = [by_place, by_normal, by_offset, by_amplitude, by_noise, *by_phase]
     if cost is None:
         return conditioned.nll, gradient
@@ -126,7 +126,7 @@ def learn_visibility(
         if out_of_time():
             break
         posterior = Posterior(rows, current_scene())
-        slope, gains = posterior.conditioned.slope, posterior.empty_covariance()
+        slope, gains = posterior.conditioned.nll_gradient, posterior.empty_covariance()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
             gains.quadrature = torch.sigmoid(value[-1])
         scaled = posterior.waves * scene.log_amplitude.exp()

@@ -16,7 +16,7 @@ from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.refine import ROUND_STEPS, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
-from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, normal_form, reflect
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, hesse_form, images, reflect
 from gsparc.processes.worker import out_of_time
 
 LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
@@ -143,7 +143,7 @@ def find_orthogonal_walls(scene: Scene) -> Tensor | None:
 def _wall_axes(scene: Scene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
     used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
-    normals, _ = normal_form(scene.planes)
+    normals, _ = hesse_form(scene.planes)
     pairs = [(i, j) for i in range(len(used)) for j in range(i) if (normals[i] @ normals[j]).abs() < 0.02]
     if not pairs:
         return None

@@ -16,7 +16,7 @@ from gsparc.models.image_sources.clutter.blocking import Clutter, Obstacles
 from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
-from gsparc.physics.waves import ranges, wave
+from gsparc.physics.waves import point_wave, ranges
 from gsparc.processes.kernel import matern32_of_squares
 from gsparc.processes.places import moving_end
 
@@ -201,7 +201,7 @@ def spherical_waves(rows: Rows, sources: Tensor) -> Tensor:
         if sources.dim() == 2:
             raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
         sources = sources.index_select(0, rows.element)  # (n, K, 3)
-    return wave(ranges(rows.position, sources), rows.frequency[:, None])
+    return point_wave(ranges(rows.position, sources), rows.frequency[:, None])
 
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:

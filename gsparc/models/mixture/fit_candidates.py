@@ -67,13 +67,13 @@ def fit_candidates(
     race: Race | None = None
 
     def log_error(what: str, error: float) -> None:
-        context.log_curve(budget.counted.wall, what, error)
+        context.log_curve(budget.by_clock.wall, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
         if name in SEARCHES and (why := _why_not_searched(race, bool(fields) and budget.is_spent())):
             log.info("init=%s is left out: %s", name, why)
             continue
-        within, began = replace(context, budget_s=budget.left_s), budget.counted.wall
+        within, began = replace(context, budget_s=budget.left_s), budget.by_clock.wall
         try:
             leave_out = groups if name in OPEN_ENDED else ()  # these predict the groups themselves
             near = name in SEARCHES and race is not None and race.error < NEAR
@@ -97,7 +97,7 @@ def fit_candidates(
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:
             if isinstance(error, FellBehind):  # a `ValueError`, too
-                reports[name] = FitReport(budget.counted.wall - began)
+                reports[name] = FitReport(budget.by_clock.wall - began)
             elif len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)

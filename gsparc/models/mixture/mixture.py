@@ -39,7 +39,7 @@ from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import less_repeatable
+from gsparc.training.time_budget import worst_clock
 
 log = logging.getLogger(__name__)
 
@@ -129,12 +129,12 @@ class Mixture(LearnsTogether, ClosedForm):
             note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
         if not by.any() or budget.limited:
-            limited = less_repeatable(report.limited_by, budget.limited_by)
+            limited = worst_clock(report.limited_by, budget.limited_by)
             return replace(report, notes=(note, *report.notes), limited_by=limited)
-        limited, spent = report.limited_by, budget.counted.wall
+        limited, spent = report.limited_by, budget.by_clock.wall
         rest = replace(context, budget_s=budget.left_s)
         report = self._solve(parts, init, move_rows(data, rows, by), fold, rest)
-        limited = less_repeatable(limited, report.limited_by)
+        limited = worst_clock(limited, report.limited_by)
         cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
         notes = (note, *report.notes)
         return replace(report, seconds=spent + report.seconds, notes=notes, limited_by=limited, cost=cost)
@@ -156,7 +156,7 @@ class Mixture(LearnsTogether, ClosedForm):
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
         self.runs = _estimate_run_factors(data, known, context)
         data = self.runs.remove_factors(data)
-        stages = {"factors of runs": budget.counted.wall} if len(self.runs) > 1 else {}
+        stages = {"factors of runs": budget.by_clock.wall} if len(self.runs) > 1 else {}
         cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
         found, reports, read = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, budget, cut
@@ -165,7 +165,7 @@ class Mixture(LearnsTogether, ClosedForm):
         heeded.count_reads(*(path for name in chosen for path in read[name]))
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
-        self.site, self.init_s = data.site, budget.counted.wall
+        self.site, self.init_s = data.site, budget.by_clock.wall
         self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
             self.condition(data, known)
@@ -173,7 +173,7 @@ class Mixture(LearnsTogether, ClosedForm):
             "%s of %d Gaussians from init=%s, terms %s", type(self).__name__, self.count_gaussians,
             self.started, ", ".join(self.terms) or "none",
         )  # fmt: skip
-        seconds = budget.counted.wall
+        seconds = budget.by_clock.wall
         if several:
             context.log_curve(seconds, "final")
         stages |= {name: report.seconds for name, report in reports.items()}
@@ -182,7 +182,7 @@ class Mixture(LearnsTogether, ClosedForm):
         stages["final weights"] = seconds - self.init_s
         unused = {name: spent for name, spent in stages.items() if name in reports and name not in chosen}
         notes = [note for name in chosen for note in reports[name].notes]
-        limited = less_repeatable(budget.limited_by, *(report.limited_by for report in reports.values()))
+        limited = worst_clock(budget.limited_by, *(report.limited_by for report in reports.values()))
         return FitReport(seconds, tuple(notes), limited).with_cost(Cost(stages, unused))
 
     def _explained_share(self, data: Measurements, fold: Fold, is_conditioned: bool) -> float | None:

@@ -118,7 +118,7 @@ def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor
 def _precision(kernel: Kernel, places: Tensor) -> Tensor:
     """Inverse correlations (m, k, k) with noise, of rows at (m, k, 3) float64 [m]."""
     noise = max(kernel.noise, LEAST_NOISE) * torch.eye(places.shape[1], dtype=torch.float64)
-    return Factor.from_gram(kernel.between(places, places) + noise, "raise").inverse
+    return Factor.from_gram(kernel.correlations(places, places) + noise, "raise").inverse
 
 
 def _posterior_variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:

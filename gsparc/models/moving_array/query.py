@@ -44,7 +44,7 @@ class ReceivingArray:
 
     def atoms(self, sources: Tensor, receivers: Tensor) -> Tensor:
         """Return lags (n, K, Q) of sources (K, 3) of unit power at receivers (n, 3) [m]."""
-        return self.space.atoms(bearings(sources, receivers, self.rotation))
+        return self.space.plane_wave_lags(bearings(sources, receivers, self.rotation))
 
     def render(self, sources: Tensor, receivers: Tensor, power: Tensor) -> Tensor:
         """Return images (n, H, W) of sources of powers (n, K)."""

@@ -110,7 +110,7 @@ def find_sources(
 
     def residual_lags(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Residual lags (n, Q) of sources of the best powers."""
-        atoms = space.atoms(bearings(sources, receivers, rotation))
+        atoms = space.plane_wave_lags(bearings(sources, receivers, rotation))
         return lags - sum_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 
     positions, residual = known, residual_lags(lags, receivers, known) if len(known) else lags

@@ -64,7 +64,7 @@ class GaussianNetwork(Network):
 
     def to_cloud(self, strengths: Tensor) -> GaussianCloud:
         """Return the Gaussians, with what each emits (N,)."""
-        return self.field.cloud(strengths, "emission of a Gaussian")
+        return self.field.to_cloud(strengths, "emission of a Gaussian")
 
 
 def initial_gaussians(scene: Scene, count: int) -> GaussianField:

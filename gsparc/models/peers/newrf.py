@@ -29,7 +29,7 @@ from gsparc.data.schema import Kind, Measurements
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Pose
-from gsparc.physics.rays import closest_approach
+from gsparc.physics.rays import closest_ranges_and_gap
 
 NEAR = 0.1  # [m] from the receiver, where rays begin
 AROUND = 0.1  # [m], half the interval of the fine samples
@@ -160,7 +160,7 @@ def locate_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.
     for i, row in enumerate(np.atleast_2d(near)):
         meetings = [np.full((len(rays[i]), 1), np.nan)]
         for j in row[row != i]:
-            along, _, miss = closest_approach(places[i], rays[i], places[j], rays[j])
+            along, _, miss = closest_ranges_and_gap(places[i], rays[i], places[j], rays[j])
             meetings.append(np.where(miss < MISS, along, np.nan))
         known = np.ma.masked_invalid(np.concatenate(meetings, 1))
         distance = np.ma.median(known, axis=1).filled(np.nan)

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.models.peers.trained import Network, Scene, TrainedPeer
 from gsparc.ops import Pose
-from gsparc.physics.array_response import bartlett, normalise_spectrum, steering
+from gsparc.physics.array_response import bartlett_spectrum, normalise_spectrum, steering_matrix
 from gsparc.physics.waves import LIGHT
 
 MARGIN = 3.0  # [m] around the moving end's box, where radiators start
@@ -57,7 +57,7 @@ class Radiators(Network):
             receiver = scene.receiver
             assert receiver is not None and site.grid is not None and site.array is not None
             assert site.wavelength is not None
-            matrix = steering(site.array, site.grid, site.wavelength).to(torch.complex64)
+            matrix = steering_matrix(site.array, site.grid, site.wavelength).to(torch.complex64)
             heading = nn.functional.normalize(receiver.local(means), dim=-1)
             turns = heading @ torch.as_tensor(site.array).float().T / site.wavelength
             response = torch.view_as_real(torch.polar(torch.ones(()), 2 * math.pi * turns))
@@ -77,7 +77,7 @@ class Radiators(Network):
         arriving = torch.view_as_complex(self.antennas).mT @ (strength.unsqueeze(-1) * waves)
         if self.steering is None:
             return arriving
-        image = bartlett(arriving[..., 0], self.steering)
+        image = bartlett_spectrum(arriving[..., 0], self.steering)
         return normalise_spectrum(image, self.scene.site.normalisation).view(-1, *self.scene.shape)
 
 

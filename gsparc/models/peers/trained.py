@@ -24,7 +24,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget, less_repeatable
+from gsparc.training.time_budget import TimeBudget, worst_clock
 
 DEFAULT_BUDGET_S = 60.0
 FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
@@ -187,8 +187,8 @@ class TrainedPeer(Method):
         self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        limited_by = less_repeatable(budget.limited_by, "wall" if result.timed_out else None)
-        return FitReport(budget.counted.wall, (note,), limited_by)
+        limited_by = worst_clock(budget.limited_by, "wall" if result.timed_out else None)
+        return FitReport(budget.by_clock.wall, (note,), limited_by)
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:
         """Return what Lightning trains, with a schedule of `steps`."""

@@ -40,7 +40,7 @@ from gsparc.processes.posterior import Exact, approximation_label
 from gsparc.processes.powers import PowerProcess, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import QUERIES
-from gsparc.processes.stored import restored, stored
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
@@ -104,7 +104,7 @@ class PowerField(ClosedForm):
         own = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
             notes = (*describe_weights(self.powers.posterior, own), *notes)
-        return FitReport(budget.counted.wall, notes, budget.limited_by)
+        return FitReport(budget.by_clock.wall, notes, budget.limited_by)
 
     def _choose_priors(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
@@ -220,19 +220,19 @@ class PowerField(ClosedForm):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            "priors": stored(self.priors),
+            "priors": to_plain(self.priors),
             "seed": self.seed,
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
-            "fringes": stored(self.fringes),
-            "process": stored(self.powers),
+            "fringes": to_plain(self.fringes),
+            "process": to_plain(self.powers),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.seed = site, int(state["seed"])
-        parts = (restored(state[name]) for name in ("priors", "process", "fringes"))
+        parts = (from_plain(state[name]) for name in ("priors", "process", "fringes"))
         self.priors, self.powers, self.fringes = parts
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
 

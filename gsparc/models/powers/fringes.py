@@ -227,7 +227,7 @@ def _errors_and_distances(
         )
         places = torch.from_numpy(rows.places[part])
         error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]
-        distance[part] = known.distance(places).numpy()
+        distance[part] = known.nearest_distance(places).numpy()
     return error, distance
 
 

@@ -119,7 +119,7 @@ def subtract_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
 
 def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
     """Return a trend of rows less the terms' means, with the terms, in units of what it leaves of rows."""
-    heard = rows.heard
+    heard = rows.heard_rows
     left = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
     unit = float(left.std()) or 1.0
     return set_term_unit(replace(trend, more=(*trend.more, *terms)), unit)

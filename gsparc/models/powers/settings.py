@@ -22,7 +22,7 @@ from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.density import LOOKS, Evidence, covariance_of, fit_kernel_by_left_out, minimise
+from gsparc.processes.density import LOOKS, LogEvidence, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
@@ -125,7 +125,7 @@ def candidate_priors(
 
 def _fit_kriging(rows: PowerRows, trend: Trend) -> Candidate:
     """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    fit = fit_variogram(rows.places, rows.regression_about(trend)[2].numpy())
+    fit = fit_variogram(rows.places, rows.distances_terms_values(trend)[2].numpy())
     sill = max(fit.sill, LEAST_SILL * fit.variance)
     kernel = Kernel.from_length(fit.range, max(fit.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
     return Candidate(-math.inf, trend, kernel, 0.0)
@@ -144,7 +144,7 @@ def mix_candidates(
     part = rows.draw_subset(max_rows, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    gram = _relative_gram([_errors_among_rows(rows.measured, one.prior, seed) for one in candidates])
+    gram = _relative_gram([_errors_among_rows(rows.measured_rows, one.prior, seed) for one in candidates])
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
@@ -187,7 +187,7 @@ def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows
 
 def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
-    loud = rows.heard.draw_subset(max_rows, seed)
+    loud = rows.heard_rows.draw_subset(max_rows, seed)
     few = loud.draw_subset(COMPARED_ON, seed)
     weighed = rows.draw_subset(min(WEIGHED_ON, max_rows), seed)
     both = weighed.silent.any() and not weighed.silent.all()
@@ -232,7 +232,7 @@ def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw
 
 
 def _fit_one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
-    distance, terms, values = rows.regression_about(trend)
+    distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
@@ -246,7 +246,7 @@ def _search_kernel(
     rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = fit_kernel_by_left_out(starts, *rows.regression_about(base.trend), looks=limit)
+    value, kernel = fit_kernel_by_left_out(starts, *rows.distances_terms_values(base.trend), looks=limit)
     return replace(base, score=-value - base.cost - cost, kernel=kernel, cost=base.cost + cost)
 
 
@@ -262,9 +262,9 @@ def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
 
 def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.regression_about(base.trend)
+    distance, terms, values = rows.distances_terms_values(base.trend)
     gram = base.kernel.amplitude * covariance_of(base.kernel, distance, terms)
-    silent, most = torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT)
+    silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
     used = ~rows.silent
@@ -274,7 +274,7 @@ def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
 
 def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.regression_about(base.trend)
+    distance, terms, values = rows.distances_terms_values(base.trend)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = base.kernel.bounds(distance)
@@ -284,7 +284,7 @@ def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
 
     def negative_log_evidence(at: Tensor) -> Tensor:
         gram = at[-1].exp() * covariance_of(base.kernel.with_values(at[:-1]), distance, terms)
-        return Evidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
+        return LogEvidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(base.kernel.parameters().numpy(), math.log(base.kernel.amplitude))
     best, value = start, float(negative_log_evidence(torch.from_numpy(start)))

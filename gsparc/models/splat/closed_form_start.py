@@ -17,9 +17,9 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_error_law
+from gsparc.field.confidence import fit_level_and_power
 from gsparc.field.encoding import Prior
-from gsparc.field.initial import InitTask, Start, keep_weights
+from gsparc.field.initial import InitTask, Start, keep_random_weights
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
 from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
@@ -155,10 +155,10 @@ def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weigh
     batch = data.batch(rows)
     images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
     emission = Factor.from_gram(gram + ridge).solve(weights.mT @ images.mT).mT
-    distance = model.distances(batch.tx)
+    distance = model.relative_distances(batch.tx)
     attenuation = model.attenuation(distance)
     emission = emission if attenuation is None else emission / attenuation
-    outputs = model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1)
+    outputs = model.emission.to_logits(emission.unsqueeze(-1), distance).squeeze(-1)
     return ImageEmissions(weights, images, outputs.double(), attenuation)
 
 
@@ -171,7 +171,7 @@ def _error_law(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor
     unknown = (variance - noise).clamp(0, 1)
     images = [seen.render(seen.outputs - residual), seen.render(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])
-    return fit_error_law(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
+    return fit_level_and_power(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
 
 
 def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
@@ -205,11 +205,11 @@ def start_in_closed_form(task: InitTask) -> Start:
         return start_from_vectors(task)
     if task.closed_form:
         assert task.receiver is not None  # else `auto_settings` refuses
-        process = learn_process(task.data, task.rows, task.anchors, task.seed)
+        process = learn_process(task.data, task.rows, task.most_anchors, task.seed)
         solve = partial(
             solve_emissions, data=task.data, rows=task.rows, receiver=task.receiver, process=process
         )
         return Start(process.prior, solve)
     kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
-    prior = learn_prior(task.data, task.rows, task.anchors, task.seed) if kernel else None
-    return Start(prior, keep_weights)
+    prior = learn_prior(task.data, task.rows, task.most_anchors, task.seed) if kernel else None
+    return Start(prior, keep_random_weights)

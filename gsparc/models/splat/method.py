@@ -22,7 +22,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.field import edit, gradient_stage
-from gsparc.field.confidence import ConfidenceSettings, fit_error_law
+from gsparc.field.confidence import ConfidenceSettings, fit_level_and_power
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
@@ -45,9 +45,9 @@ from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupt
 from gsparc.models.splat.closed_form_start import start_in_closed_form
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
-from gsparc.processes.stored import restored, stored
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Clock, Spent, TimeBudget, less_repeatable
+from gsparc.training.time_budget import Clock, Spent, TimeBudget, worst_clock
 
 log = logging.getLogger(__name__)
 
@@ -171,7 +171,7 @@ class LearnedField(Method):
                 continue
             files = GsparcCheckpointIO(self, context.config_yaml, self._extra(stage, budget, origin))
             heeded.count_reads("dataset.batch_size")
-            began = budget.counted
+            began = budget.by_clock
             trainer, batches = gradient_stage.make_trainer(
                 module, data, stage.fold, stage.context, files, budget, self._stage_callbacks(stage)
             )
@@ -180,8 +180,8 @@ class LearnedField(Method):
             self._end_stage(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
         self.frozen = self._doubled = None
         what, count = f"final, {self.steps} of {self.steps_taken} steps kept", self.count_components()
-        context.log_curve(budget.counted.wall, what, step=self.steps_taken, num_gaussians=count)
-        return FitReport(budget.counted.wall, limited_by=self._limited_by)
+        context.log_curve(budget.by_clock.wall, what, step=self.steps_taken, num_gaussians=count)
+        return FitReport(budget.by_clock.wall, limited_by=self._limited_by)
 
     def _begin_fit(self, data: Measurements, fold: Fold, extra: Mapping[str, Any]) -> None:
         """Look at the site, and take what an interrupted run has marked; {} of a new one.
@@ -201,7 +201,7 @@ class LearnedField(Method):
         self._paying, self.init_s = extra.get("paying"), float(extra.get("init_s", 0.0))
         self.steps_taken, self._earlier_s = int(extra.get("taken", 0)), float(extra.get("earlier_s", 0.0))
         self.spent, self._apart = {}, _validation_distance(data, fold)
-        self._left_out = restored(extra.get("left_out"))  # an interrupted run's start is not repeated
+        self._left_out = from_plain(extra.get("left_out"))  # an interrupted run's start is not repeated
         self._billed, self._limited_by = Spent(), extra.get("limited_by")
 
     def _plan_stages(
@@ -255,7 +255,7 @@ class LearnedField(Method):
         """
         context, folder = stage.context, stage.context.run_dir
         L.seed_everything(context.seed, verbose=False)
-        started, before = budget.counted, self.model
+        started, before = budget.by_clock, self.model
         assert self.choices is not None
         if context.init_from is not None and context.resume is None:
             self._start_from(data.site, context.init_from)
@@ -281,7 +281,7 @@ class LearnedField(Method):
             self.fitted_model().confidence, self.fitted_model().error = before.confidence, before.error
             if before.confidence is not None:
                 before.confidence.requires_grad_(False)
-        prepared = (budget.counted - started).wall
+        prepared = (budget.by_clock - started).wall
         self.init_s, self._earlier_s = (self.init_s or 0.0) + prepared, self._earlier_s + prepared
         self.spent["initialiser" + stage.cost_suffix] = prepared
         if not stage.steps:
@@ -301,10 +301,10 @@ class LearnedField(Method):
     def _extra(self, stage: Stage, budget: TimeBudget, origin: Origin) -> dict[str, Any]:
         """What `_begin` reads of a run that is interrupted in a stage."""
         return {
-            "stage": stage.name, "earlier_s": self._earlier_s, "spent": astuple(budget.counted),
+            "stage": stage.name, "earlier_s": self._earlier_s, "spent": astuple(budget.by_clock),
             "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
             "taken": self.steps_taken,
-            "left_out": stored(self._left_out), **origin.to_extra(),
+            "left_out": to_plain(self._left_out), **origin.to_extra(),
         }  # fmt: skip
 
     def _stage_callbacks(self, stage: Stage) -> list[L.Callback]:
@@ -317,13 +317,13 @@ class LearnedField(Method):
         self, stage: Stage, result: gradient_stage.TrainerResult, began: Spent, budget: TimeBudget
     ) -> None:
         """Note what the steps of a stage were worth."""
-        seconds = (budget.counted - began).wall
+        seconds = (budget.by_clock - began).wall
         self._earlier_s += seconds
         self.steps = result.taken if result.kept is None else result.kept
         self.spent["gradient steps" + stage.cost_suffix] = seconds
         if result.timed_out or budget.limited:
             clock: Clock = "wall" if result.timed_out else budget.clock
-            self._limited_by = less_repeatable(self._limited_by, clock)
+            self._limited_by = worst_clock(self._limited_by, clock)
         if stage.name == "train":
             self._paying, self.steps_taken = result.kept, result.taken
 
@@ -347,9 +347,8 @@ class LearnedField(Method):
         if "model" not in state:
             raise ValueError(f"init_from={path}: {stored.method} holds no Gaussian field")
         for name in ("kind", "grid", "static_end"):
-            mine, its = getattr(site, name), getattr(stored.site, name)
-            if mine != its:
-                raise ValueError(f"init_from={path}: its {name} is {its}, here it is {mine}")
+            if getattr(site, name) != getattr(stored.site, name):
+                raise ValueError(f"init_from={path}: its {name} is another; take a model of the same {name}")
         if not np.allclose(site.origin, stored.site.origin, atol=1e-6):
             raise ValueError(
                 f"init_from={path}: its origin is {stored.site.origin} m, here it is {site.origin} m"
@@ -371,13 +370,13 @@ class LearnedField(Method):
         model = self.fitted_model()
         rows = fold.val if len(fold.val) else fold.train
         if model.confidence is not None:
-            model.confidence.calibrate(torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32)))
+            model.confidence.store_range(torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32)))
         if model.error is not None and len(fold.val) >= LEAST_HELD:
             batch = data.batch(fold.val)
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
-            model.error.set_error_law(*fit_error_law(result.unknown.numpy(), error.double().numpy()))
+            model.error.set_error_law(*fit_level_and_power(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -433,7 +432,7 @@ class LearnedField(Method):
             return Prediction(mean, *model.error(result.unknown))
         if model.confidence is None:
             return Prediction(mean)
-        return Prediction(mean, unknown=1 - model.confidence.normalised(model.site.moving(tx, rx)))
+        return Prediction(mean, unknown=1 - model.confidence.normalised_confidence(model.site.moving(tx, rx)))
 
     def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """Return the matrix of the static receiver, made anew after an edit; None for any other pose."""
@@ -453,8 +452,8 @@ class LearnedField(Method):
             raise ValueError(f"{self.name}: nothing here is rendered from Gaussians")
         model, square = self.model, torch.zeros(self.count_components())
         for one in query.split(1):  # features of all would be gigabytes
-            square += model.features(one.tx, one.rx)[0].square().sum(1)
-        return model.gaussians.cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
+            square += model.emissions(one.tx, one.rx)[0].square().sum(1)
+        return model.gaussians.to_cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
 
     # -- what it can do besides ----------------------------------------------------------------------
 

@@ -90,7 +90,7 @@ def _freeze_coarse(
     view = method.frozen_at(Pose(receiver[0], receiver[1:]))
     response, grid = model.response, model.site.grid
     assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
-    renderer = response.coarsen(stride, coarsen_grid(grid, stride)) if stride > 1 else None
+    renderer = response.coarse_renderer(stride, coarsen_grid(grid, stride)) if stride > 1 else None
     return freeze_array(model, view.view, renderer), grid
 
 

@@ -142,10 +142,10 @@ class SourceSearch:
                 # Tipping's update: a gain that noise explains shrinks its own prior, and with it its source.
                 prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(LEAST_SHARE)
             if not last:
-                residual = y - fit.columns.response(fit.gain)
+                residual = y - fit.columns.channels(fit.gain)
         # What was not found yet counted as noise above; the posterior is of the known noise.
         fit = self._fit_gains(y, noise, direction, delay, prior)
-        residual = scale[:, None, None] * (y - fit.columns.response(fit.gain))
+        residual = scale[:, None, None] * (y - fit.columns.channels(fit.gain))
         return self._to_sources(fit, noise, direction, delay, scale), residual
 
     def _peak_directions_and_delays(self, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -160,7 +160,7 @@ class SourceSearch:
         """Best gains of given sources, and the gradient by their directions and delays."""
         n = delay.shape[1]
         columns = Columns.from_sources(direction, delay, self.aperture)
-        gram, inner = columns.gram(), columns.inner(y)
+        gram, inner = columns.gram(), columns.inner_products(y)
         torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
         cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
         gain = (inverse @ inner[:, :n, None])[..., 0]

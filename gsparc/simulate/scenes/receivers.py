@@ -164,7 +164,7 @@ def _along(
     if how.kind == "lines":
         return np.concatenate([_steps(line, how.spacing_m) for line in lines]), None
     if len(lines) > 1:
-        raise ValueError("scene.receivers.points_m: a trajectory is one line")
+        raise ValueError(f"scene.receivers.points_m: a trajectory is one line, not {len(lines)}: use lines")
     walked = _steps(lines[0], how.speed_m_s * how.every_s)
     return walked, np.arange(len(walked)) * how.every_s
 

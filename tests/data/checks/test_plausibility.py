@@ -8,9 +8,9 @@ from releases import real
 from scipy.spatial.distance import cdist
 
 from gsparc.data.checks import plausibility
-from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.checks.level_steps import detect_level_steps
 from gsparc.data.checks.plausibility import LinkLevels, link_levels
+from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.own import from_arrays
 
 
@@ -68,7 +68,7 @@ def measured_at(place):
     ],
 )
 def test_units_of_positions(position, said):
-    found = suspicious_values(measured_at(position(room()[0])))
+    found = unit_warnings(measured_at(position(room()[0])))
     assert len(found) == (said is not None) and all(said in line for line in found), found
 
 

@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from gsparc.data.checks.describe import describe, suspicious_values
+from gsparc.data.checks.describe import describe
+from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.errors import DataError
 from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
@@ -222,7 +223,7 @@ def test_powers_of_zero_raise_a_warning():
     """They are learned as -300 dB, which nobody said."""
     powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
     data = read({**town(rssi_db=None), "rssi": powers}).data
-    assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in suspicious_values(data)[0]
+    assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in unit_warnings(data)[0]
 
 
 def test_nothing_heard_in_any_row_was_zero_everywhere(refused):

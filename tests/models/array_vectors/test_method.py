@@ -27,7 +27,7 @@ from gsparc.models.array_vectors.vector_gp import (
 from gsparc.models.registry import method_class
 from gsparc.models.splat.array import ArrayField
 from gsparc.ops import Pose, SphereGrid
-from gsparc.physics.array_response import steering
+from gsparc.physics.array_response import steering_matrix
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.processes.kernel import Kernel, SmoothRough
 from gsparc.training.context import FitContext
@@ -101,14 +101,14 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
     x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
     kernel, at = Kernel.from_length(0.15, 0.01, term=SmoothRough), torch.from_numpy(x)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
-    matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
+    matrix = steering_matrix(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
     samples = cross_validation._Samples(
         np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
     )
     unknown, predicted = samples.predict(kernel, np.linalg.inv(kernel.gram(at).numpy()), v)
     error = samples.squared_errors(predicted)
     far = distance[7] > 0.03
-    cross = kernel.between(at[far], at[7:8]).numpy()
+    cross = kernel.correlations(at[far], at[7:8]).numpy()
     weights = np.linalg.solve(kernel.gram(at[far]).numpy(), cross)[:, 0]
     assert unknown[0, 0] == pytest.approx(1 - weights @ cross[:, 0], rel=1e-6)
     assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)

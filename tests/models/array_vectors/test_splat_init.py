@@ -19,7 +19,7 @@ from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached
 from gsparc.models.array_vectors.vector_gp import align_by_likelihood, index_mirror_elements
 from gsparc.models.registry import build
-from gsparc.physics.array_response import steering
+from gsparc.physics.array_response import steering_matrix
 
 COUNT = "model.field.count=64"
 
@@ -48,14 +48,14 @@ def process(trained):
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = (
-        steering(site.array, site.grid, site.wavelength).numpy(),
+        steering_matrix(site.array, site.grid, site.wavelength).numpy(),
         index_mirror_elements(site.array),
     )
     found, _ = recover_cached(data, fold.train)  # the same solutions
     kernel = choose_kernel(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = align_by_likelihood(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])
-    inverse, cross = np.linalg.inv(kernel.gram(rows).numpy()), kernel.between(queries, rows).numpy()
+    inverse, cross = np.linalg.inv(kernel.gram(rows).numpy()), kernel.correlations(queries, rows).numpy()
     return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
 
 
@@ -63,12 +63,12 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     method, data, fold = trained
     model, batch = method.fitted_model(), data.batch(fold.test)
     mean, variance = process
-    emitted = torch.view_as_complex(model.features(batch.tx, batch.rx).contiguous()).detach()
+    emitted = torch.view_as_complex(model.emissions(batch.tx, batch.rx).contiguous()).detach()
     vectors = (emitted @ gaussian_vectors(model, batch.rx)).numpy()
     # One phase is common to all vectors and known to nobody.
     turn = np.vdot(vectors, mean) / abs(np.vdot(vectors, mean))
     assert np.linalg.norm(vectors * turn - mean) < 2e-3 * np.linalg.norm(mean)
-    np.testing.assert_allclose(model.unknown(batch.tx, batch.rx).numpy(), variance, atol=1e-4)
+    np.testing.assert_allclose(model.unknown_shares(batch.tx, batch.rx).numpy(), variance, atol=1e-4)
 
 
 def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
@@ -91,7 +91,7 @@ def test_all_is_unknown_far_away_and_little_at_data(trained):
     assert (far.confidence == 0).all() and (far.variance == far.variance[0]).all()
     near = method.predict(Query(tx, rx))
     assert near.confidence.min() > 0.5 and near.variance.max() < 0.5 * far.variance[0]
-    assert (method.fitted_model().unknown(tx, rx) < 0.05).all()
+    assert (method.fitted_model().unknown_shares(tx, rx) < 0.05).all()
 
 
 def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):

@@ -107,7 +107,8 @@ def test_orientation_of_first_and_second_order():
     sequences = [(), (0,), (2,), (0, 1), (2, 1)]
     turned = image_rotations(planes, sequences)
     torch.testing.assert_close(
-        images(centre + antenna, planes, sequences), images(centre, planes, sequences) + turned @ antenna
+        images(centre + antenna, planes, sequences),
+        images(centre, planes, sequences) + turned @ antenna,
     )
     normal = planes[0, :3] / planes[0, :3].norm()
     householder = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)

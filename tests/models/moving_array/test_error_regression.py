@@ -71,7 +71,7 @@ def test_a_variance_needs_the_nearest_rows_only():
     distance = far(queries, places)
     row = distance.argmin(1)
     at = torch.from_numpy(places)
-    cross, gram = KERNEL.between(torch.from_numpy(queries), at).numpy(), KERNEL.gram(at).numpy()
+    cross, gram = KERNEL.correlations(torch.from_numpy(queries), at).numpy(), KERNEL.gram(at).numpy()
     exact = 1.1 - (cross * np.linalg.solve(gram, cross.T).T).sum(1)
     near = _posterior_variance(KERNEL, distance.gather(1, model.near[row]), model.precision[row]).numpy()
     assert (near > exact - 1e-6).all() and (near < 1.5 * exact).all() and near.mean() < 1.1 * exact.mean()

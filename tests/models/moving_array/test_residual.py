@@ -24,7 +24,7 @@ def test_left_out_predictions_are_those_of_the_others(monkeypatch):
     others, at = np.arange(1, 40), torch.from_numpy(places)
     mean = values.mean(0)  # of all rows, as there
     weights = np.linalg.solve(KERNEL.gram(at[1:]).numpy(), (values[others] - mean).numpy())
-    wanted = mean.numpy() + KERNEL.between(at[:1], at[1:]).numpy() @ weights
+    wanted = mean.numpy() + KERNEL.correlations(at[:1], at[1:]).numpy() @ weights
     np.testing.assert_allclose(predicted[0], wanted[0], atol=1e-3)
 
 

@@ -183,8 +183,8 @@ def test_a_term_may_have_the_name_of_one_of_ours():
             return places[:, :1]
 
     wall = trend.Walls(torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1, 2), torch.zeros(3))
-    assert isinstance(stored.restored(stored.stored(wall)), trend.Walls)
-    assert isinstance(stored.restored(stored.stored(Walls())), Walls)
+    assert isinstance(stored.from_plain(stored.to_plain(wall)), trend.Walls)
+    assert isinstance(stored.from_plain(stored.to_plain(Walls())), Walls)
 
 
 def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):

@@ -29,7 +29,7 @@ def test_the_process_has_not_seen_what_lies_within_the_gap(left):
         i = left.centres[c]
         far = np.linalg.norm(left.positions - left.positions[i], axis=1) > left.gaps[g]
         weights = np.linalg.solve(kernel.gram(at[far]).numpy(), left.images[far] - mean)
-        wanted = mean + kernel.between(at[[i]], at[far])[0].numpy() @ weights
+        wanted = mean + kernel.correlations(at[[i]], at[far])[0].numpy() @ weights
         assert np.allclose(found[g, c], wanted, atol=1e-6)
     assert np.isnan(found[2]).all()  # nothing lies beyond 5 m
     assert (

@@ -185,7 +185,9 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
     assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
     snapshot = three.channels(aperture)
     wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)
-    assert torch.allclose(columns.inner(snapshot)[0], wanted.to(torch.complex64), rtol=1e-3, atol=2.0)
+    assert torch.allclose(
+        columns.inner_products(snapshot)[0], wanted.to(torch.complex64), rtol=1e-3, atol=2.0
+    )
 
 
 def test_posterior_tells_the_error_of_the_other_band() -> None:

@@ -10,7 +10,7 @@ from gsparc.data.schema import Site
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import antenna_positions, static_array
-from gsparc.physics.waves import evenly_spaced
+from gsparc.physics.waves import is_comb
 
 # 16 float32 are the widest register; narrower ones take the same rows in two or four steps.
 LANES = 16
@@ -39,7 +39,7 @@ def compile_sources(method: ImageSourceGP, site: Site, query: EnsembleMeans) -> 
     tones = torch.from_numpy(site.tones())
     step = float(tones.diff().mean()) if len(tones) > 1 else 0.0
     # Two tones are evenly spaced whatever they are.
-    even = len(tones) < 3 or evenly_spaced(tones)
+    even = len(tones) < 3 or is_comb(tones)
     # A comb of even tones costs one complex product per tone; uneven ones a sine each.
     combs = [(tones[0], step, len(tones))] if even else [(tone, 0.0, 1) for tone in tones]
     factors = (method.frame.scale * site.target_scale / method.factors).numpy().astype(np.complex64)

@@ -35,12 +35,12 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
         fits = len(files) == len(weights) <= LANES
         return Form(5, [len(weights), *weights], named) if fits else None
     posterior, kernel, trend = process.posterior, process.kernel, process.trend
-    if (signed := kernel.compiled) is None or trend.more:
+    if (signed := kernel.compiled_lengths) is None or trend.more:
         return None
     assert isinstance(posterior, (Exact, Nearest))
     every = isinstance(posterior, Exact)
-    nearest = posterior._near if isinstance(posterior, Exact) else posterior
-    columns = posterior._columns
+    nearest = posterior._vecchia if isinstance(posterior, Exact) else posterior
+    columns = posterior._trend_columns
     if isinstance(posterior, Exact):
         # Exact: one product with weights. Nearest: each query solves its own small system of `values`.
         values, weighed = posterior.weights[:, 0], columns.T @ posterior.weights
@@ -73,7 +73,7 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     numbers = [
         places.shape[1], count, sets[:, 1].sum(), len(sets), columns.shape[1], every, nearest is None, every,
         law is not None, len(signed), shares[0], lengths[0], shares[1], lengths[1], kernel.noise,
-        kernel.amplitude, process.heard, process._reach, *about, trend.middle, trend.spread, scale,
+        kernel.amplitude, process.heard, process._trend_reach, *about, trend.middle, trend.spread, scale,
     ]  # fmt: skip
     return Form(4, [float(number) for number in numbers], arrays)
 

@@ -7,7 +7,7 @@ import numpy as np
 from gsparc.apps.export.compiled.blob import Form
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.field.model import GaussianModel
-from gsparc.processes.features import matern_parts
+from gsparc.processes.features import matern_mixture
 
 ROWS, COLUMNS = 4, 4  # pixels of a block
 ACTIVATIONS = {"linear": 0, "sigmoid": 1, "softplus": 2}
@@ -21,7 +21,7 @@ def compile_array(model: GaussianModel, frozen: FrozenArray) -> Form | None:
     pairs, *rest = frozen.renderer.tables
     square, sizes = frozen.renderer.square, [len(table) for table in rest]
     numbers = [
-        *encoding.anchors.shape[::-1], encoding.width, *matern_parts(encoding.length, encoding.kernel),
+        *encoding.anchors.shape[::-1], encoding.width, *matern_mixture(encoding.length, encoding.kernel),
         frozen.offset.numel() // 2 - 1, square.shape[0], rest[1].shape[1], *[*sizes, 0, 0][:4],
     ]  # fmt: skip
     names = ("table0", "wave0", "table1", "wave1")
@@ -46,7 +46,7 @@ def compile_view(frozen: FrozenView) -> Form | None:
     means = model.gaussians.means.detach().numpy()
     needed = settings.log_distance or attenuation.inverse_distance
     numbers = [
-        *encoding.anchors.shape[::-1], encoding.width, *matern_parts(encoding.length, encoding.kernel),
+        *encoding.anchors.shape[::-1], encoding.width, *matern_mixture(encoding.length, encoding.kernel),
         len(means), height, width, ACTIVATIONS[settings.activation], settings.log_distance,
         attenuation.inverse_distance, model.tells_unknown, float(model.log_gain.detach().exp()),
         # Squared here once, since the library compares squared distances.

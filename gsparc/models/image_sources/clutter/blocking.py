@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsparc.models.image_sources.clutter.unfold import EDGE, Paths
-from gsparc.physics.mirror_planes import normal_form
+from gsparc.physics.mirror_planes import hesse_form
 
 MARGIN = 0.03  # [m], chord that is not blocked: legs end on the faces that reflect them
 SOFT = 0.02  # [m], width of a soft edge; a leg that ends nearer to a patch is reflected by it, not blocked
@@ -86,7 +86,7 @@ class Obstacles:
         self.ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
         self.ends[plane] = True
         used, self.boxes, self.patches = planes[plane], clutter.boxes, clutter.patches
-        normal, offset = (part.float() for part in normal_form(used))
+        normal, offset = (part.float() for part in hesse_form(used))
         self.plane, self.offset = plane.view(-1, 1, 1, 1), offset.view(-1, 1, 1, 1)
         self.axes = torch.cat([normal[None], plane_tangents(used)])
 
@@ -148,7 +148,7 @@ def _share_inside(place: list[Tensor], patches: Tensor) -> Tensor:
 
 def plane_tangents(planes: Tensor) -> Tensor:
     """Return two unit axes (2, ..., 3) float32 along planes (..., 4): level where they can be."""
-    normal = normal_form(planes)[0].float()
+    normal = hesse_form(planes)[0].float()
     up, ahead = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
     level = (normal * up).sum(-1, keepdim=True).abs() > 0.7
     first = torch.where(level, ahead, torch.linalg.cross(up.expand_as(normal), normal))

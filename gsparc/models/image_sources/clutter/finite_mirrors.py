@@ -19,8 +19,8 @@ from gsparc.models.image_sources.clutter.boxes import maximise_by_evolution
 from gsparc.models.image_sources.clutter.residual import UnexplainedRows
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
-from gsparc.physics.draws import draw_in_box, draw_sides
-from gsparc.physics.mirror_planes import normal_form, reflect
+from gsparc.physics.draws import draw_in_box, draw_lengths
+from gsparc.physics.mirror_planes import hesse_form, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -60,7 +60,7 @@ def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]
         return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
     middle = draw_in_box(low, high, DRAWS, unexplained.generator)
-    side = draw_sides(SMALLEST, LARGEST, middle, unexplained.generator)
+    side = draw_lengths(SMALLEST, LARGEST, middle, unexplained.generator)
     starts = repair(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[gain_of_patches(starts).topk(8).indices]
     return maximise_by_evolution(starts, gain_of_patches, repair, unexplained.generator, rounds=10)
@@ -82,7 +82,7 @@ class SmallMirror:
 
     def overlaps(self, other: SmallMirror, max_gap: float) -> bool:
         """Whether both are parallel, closer than `max_gap` [m] and overlap."""
-        (normal, offset), (normal2, offset2) = map(normal_form, (self.plane, other.plane))
+        (normal, offset), (normal2, offset2) = map(hesse_form, (self.plane, other.plane))
         if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > max_gap:
             return False
         low, high = torch.maximum(self.patch, other.patch)[:2], torch.minimum(self.patch, other.patch)[2:]
@@ -106,7 +106,7 @@ def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMi
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []
     for plane in known:
-        normal, _ = normal_form(plane)
+        normal, _ = hesse_form(plane)
         if any((normal @ other).abs() >= PARALLEL for other in normals):
             continue
         normals.append(normal)
@@ -209,7 +209,7 @@ def _images_over_candidates(static: Tensor, candidates: Tensor, known: Tensor) -
 
 def _intersect_planes(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
     """Where lines from (n, 3) or (C, n, 3) to (C, 3) meet planes (C, 4); NaN where not between."""
-    normal, offset = (part.float() for part in normal_form(planes[:, None]))
+    normal, offset = (part.float() for part in hesse_form(planes[:, None]))
     offset, end = offset[..., 0], end[:, None].float()
     above, below = (start * normal).sum(-1) - offset, (end * normal).sum(-1) - offset
     share = torch.where(above * below < 0, above / (above - below), math.nan)

@@ -13,7 +13,7 @@ from itertools import pairwise, permutations
 import torch
 from torch import Tensor
 
-from gsparc.physics.mirror_planes import Reflections, images, normal_form, reflect
+from gsparc.physics.mirror_planes import Reflections, hesse_form, images, reflect
 
 SAME_M = 0.05  # [m], sequences of the same planes whose images are closer are the same source
 EDGE = 1e-6  # tolerance of the intersection of a leg with a plane, and [m] least side of a leg's box
@@ -82,7 +82,7 @@ class Unfolding:
         chain = [transmitter.expand(*self.present.shape, -1)]
         for mirror, here in zip(used, exists, strict=True):
             chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
-        normal, offset = normal_form(used)
+        normal, offset = hesse_form(used)
         self.normal, self.chain = normal.float() * exists[..., None], torch.stack(chain).float()
         self.offset = offset[..., 0].float() * exists
         height = (self.chain[1:] * self.normal).sum(-1) - self.offset

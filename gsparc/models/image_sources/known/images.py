@@ -16,7 +16,7 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls, box_faces, polygon_area, polygon_normal
 from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
-from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images, normal_form
+from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, hesse_form, images
 from gsparc.processes.trend import Walls
 
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
@@ -175,7 +175,7 @@ def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     known = Mirrors.from_walls(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
-    normal, offset = normal_form(planes)
+    normal, offset = hesse_form(planes)
     axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
     corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
     end = torch.from_numpy(np.zeros(0) if static_end is None else static_end).double()

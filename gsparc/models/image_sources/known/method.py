@@ -21,7 +21,7 @@ from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
-from gsparc.physics.mirror_planes import Reflections, normal_form
+from gsparc.physics.mirror_planes import Reflections, hesse_form
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import end_when
 from gsparc.training.time_budget import TimeBudget
@@ -156,7 +156,7 @@ def walls_prior_cost(
     known: Tensor, sequences: tuple[Reflections, ...], planes: Tensor, log_amplitude: Tensor
 ) -> Tensor:
     """Return the negative log prior [nats]: planes (P, 4) about those known, amplitudes (K,) about a law."""
-    (normal, offset), (given_normal, given_offset) = map(normal_form, (planes, known))
+    (normal, offset), (given_normal, given_offset) = map(hesse_form, (planes, known))
     moved = (offset - given_offset).square().sum() / MOVED_M**2
     turned = (normal - given_normal).square().sum() / TURNED**2
     order = torch.tensor([float(len(sequence)) for sequence in sequences])

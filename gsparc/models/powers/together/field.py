@@ -90,7 +90,7 @@ class JointPowerField(ClosedForm):
         self.site, self.inflation = data.site, 1.0
         notes = self._learn(data, rows, budget)
         self.condition(data, rows)
-        return FitReport(budget.counted.wall, notes, budget.limited_by)
+        return FitReport(budget.by_clock.wall, notes, budget.limited_by)
 
     def _learn(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
         """Set the processes and what they share; what must be said of them."""
@@ -148,8 +148,8 @@ class JointPowerField(ClosedForm):
         if self.network is None:  # sites share nothing that is learned here
             elsewhere = self.own.condition(used.thin_rows(UNHEARD_EACH, self.seed), self.unheard, self.seed)
         self.elsewhere = self._unheard_posterior((elsewhere.factor, elsewhere.mean))
-        self.whole = max(float(used.heard.decibels.var()), self.own.variance)
-        self.rows = {n: torch.from_numpy(used.select_station(n).measured.index) for n in used.stations}
+        self.whole = max(float(used.heard_rows.decibels.var()), self.own.variance)
+        self.rows = {n: torch.from_numpy(used.select_station(n).measured_rows.index) for n in used.stations}
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; (B, 1) linear powers.
@@ -210,7 +210,7 @@ class JointPowerField(ClosedForm):
         for number, process in posterior.processes.items():
             error, variance = posterior.left_out(number)
             loud = process.extra == 0
-            means.append((process.values()[:, 0] - error)[loud])
+            means.append((process.given_values()[:, 0] - error)[loud])
             spreads.append(variance[loud])
         mean = self._to_powers(torch.cat(means).float())
         variance = to_entry_variance(torch.cat(spreads).float(), mean, "rssi")

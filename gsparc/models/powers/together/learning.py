@@ -76,7 +76,7 @@ class StationPriors:
                 known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
                 assert isinstance(known, Exact)
                 told = known.extra <= TOLD
-                places, values, extra = known.rows[told], known.values()[told], known.extra[told]
+                places, values, extra = known.rows[told], known.given_values()[told], known.extra[told]
             result[number] = Exact.from_values(prior, places, values, extra)
         return SharedTermsPosterior(result, self.never, terms.columns)
 
@@ -95,7 +95,7 @@ def learn_station_priors(
     their own.
     """
     trend, notes = _fit_site_law(rows, seed)
-    heard = rows.heard
+    heard = rows.heard_rows
     numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else end_when(budget.is_spent):
         kernel, priors = _fit_common_kernel(heard, trend, seed)
@@ -103,7 +103,7 @@ def learn_station_priors(
             numbers = []
         for number in numbers:
             some = heard.select_station(number).thin_rows(ENDS_ON, seed)
-            _, own = fit_kernel_by_left_out([kernel], *some.regression_about(trend), tolerance=SETTLED)
+            _, own = fit_kernel_by_left_out([kernel], *some.distances_terms_values(trend), tolerance=SETTLED)
             priors[number] = Prior(own, trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -126,7 +126,7 @@ def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thin_rows(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
-    views = {number: few.select_station(number).regression_about(trend) for number in few.stations}
+    views = {number: few.select_station(number).distances_terms_values(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
     middle = float(np.median(far.numpy())) or 1.0
@@ -166,7 +166,7 @@ def learn_shared_terms(
         The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
         g gains at these, each after one constant, None if not tried.
     """
-    heard = rows.heard
+    heard = rows.heard_rows
     few = heard.thin_rows(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(priors.never.kernel.lengths)
     bare = SharedTerms.from_rows(few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)

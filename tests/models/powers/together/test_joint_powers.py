@@ -80,7 +80,7 @@ def dense(rows, own: StationPriors, terms: SharedTerms) -> tuple[np.ndarray, np.
     total = columns @ columns.T
     for number in rows.stations:
         at, prior = np.flatnonzero(rows.station == number), own.prior(number)
-        block = prior.between(places[at], places[at]) + prior.kernel.noise * torch.eye(len(at))
+        block = prior.cross_covariance(places[at], places[at]) + prior.kernel.noise * torch.eye(len(at))
         total[np.ix_(at, at)] += prior.kernel.amplitude * block
     return total.numpy(), rows.decibels - terms.trend.mean(places).numpy()
 

@@ -25,7 +25,7 @@ from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
-from gsparc.processes.stored import restored, stored
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.trend import Law
 from gsparc.training.context import FitContext, FitReport
 
@@ -207,10 +207,10 @@ def test_a_station_never_heard_had_the_pattern_of_the_first_sector():
 def test_sectors_of_a_site_share_shadowing():
     kernel = shadowing()
     here, there = places(0, 10.0), places(1, 10.0)
-    assert float(kernel.between(here, here)) == pytest.approx(1.0)
-    assert float(kernel.between(here, there)) == pytest.approx(0.5)
+    assert float(kernel.correlations(here, here)) == pytest.approx(1.0)
+    assert float(kernel.correlations(here, there)) == pytest.approx(0.5)
     both = torch.cat([here, there, places(0, 200.0)])
-    assert torch.linalg.eigvalsh(kernel.between(both, both)).min() > 0
-    for again in (restored(stored(kernel)), kernel.with_values(kernel.parameters())):
+    assert torch.linalg.eigvalsh(kernel.correlations(both, both)).min() > 0
+    for again in (from_plain(to_plain(kernel)), kernel.with_values(kernel.parameters())):
         assert torch.allclose(again.gram(both), kernel.gram(both))
         assert again.amplitude == 20

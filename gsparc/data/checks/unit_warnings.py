@@ -1,0 +1,78 @@
+"""Warnings about values that other units explain: millimetres, degrees, radians, linear powers as dB."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsparc.data.checks.outliers import find_gap
+from gsparc.data.schema import Measurements
+
+TINY_DEGREES = 1.0  # a campaign's extent in degrees
+LONG_ARRAY = 100  # wavelengths: no array of one receiver
+
+
+def unit_warnings(data: Measurements) -> list[str]:
+    """Warn of readable but implausible values: millimetres, radians, linear powers given as dB."""
+    site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
+    hints = []
+    if not np.ptp(data.moving, axis=0).any():
+        hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
+    elif site.georeference is None:  # degrees became metres: no unit to mistake
+        # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
+        hints = _position_hints(ends[np.isfinite(ends).all(axis=1)]) or _position_hints(
+            data.moving[:, :3] + site.origin
+        )
+    if site.array is not None and site.wavelength is not None:
+        reach = float(np.ptp(site.array, axis=0).max())
+        if reach > LONG_ARRAY * site.wavelength:
+            waves = f"{reach / site.wavelength:.3g} wavelengths"
+            hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
+    if site.grid is not None:
+        turn = np.degrees(site.grid.azimuth_step * site.grid.width)
+        # Steps in radians taken for degrees: the columns then span 2 pi degrees.
+        if abs(turn / (2 * np.pi) - 1) < 0.02:
+            hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+    if site.kind == "rssi" and (data.target == 0).any():
+        count = int((data.target == 0).sum())
+        hints.append(
+            f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
+            "rssi_db and sensitivity_db"
+        )
+    if site.kind == "rssi" and (data.target > 0).all():
+        spread = 10 * float(np.log10(data.target.max() / data.target.min()))
+        # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1.
+        if 0 < spread < 0.1:
+            hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
+    return hints
+
+
+def _position_hints(positions: np.ndarray) -> list[str]:
+    """Warnings that positions (n, 3), in the world, may not be metres."""
+    extent, middle = np.ptp(positions, axis=0), np.abs(np.median(positions[:, :2], axis=0))
+    height, width, across = float(extent[2]), float(extent.max()), float(extent[:2].max())
+    reach = np.abs(positions[:, :2]).max(axis=0)
+    on_earth = reach.max() <= 180 and reach.min() <= 90
+    # Metres about a local origin lie near it; degrees of a small site lie many of its widths away.
+    if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
+        near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
+        how = "then give them as latitude and longitude (columns of a table: dataset.columns.lat=HEAD, .lon)"
+        return [f"positions near {near} within {across:.2g}: degrees? {how}"]
+    groups = find_gap(positions[:, :2])
+    if groups is not None:
+        said = f"two groups of places {groups[1] / 1e3:.4g} km apart"
+        return [f"{said}: zones of a projection, or two sites? give degrees, or a file for each"]
+    # Heights 100 m apart, or a width of 10 km, are rarer than wrong units.
+    if height > 100 or width > 1e4:
+        unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
+        size = " x ".join(f"{e * factor:.3g}" for e in extent)
+        hint = f"if these are {unit}, the box is {size} m: convert to metres"
+        far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
+        return [f"{far}; {hint}"]
+    # Survey tools print millimetres as whole numbers; metres come with decimals.
+    if across > 1000 and (positions % 1 == 0).all():
+        size = " x ".join(f"{e / 1000:.4g}" for e in extent)
+        said = f"positions are whole numbers up to {across:.0f} apart"
+        return [f"{said}: millimetres? the box is {size} m then"]
+    if 0 < width < 0.01:
+        return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
+    return []
