@@ -85,7 +85,7 @@ def test_isotropic_term_alone_is_the_plain_process():
     plain = ComplexGP()
     plain.fit(data, fold, FitContext())
     field, notes = fitted_to(ChannelField(PLAIN), data, np.concatenate([fold.train, fold.val]))
-    assert field.terms == ("residual",) and field.count == 0
+    assert field.terms == ("residual",) and field.count_gaussians == 0
     if "kept" in notes[1]:  # powers beside the grid's
         powers = torch.tensor([[1.0], [plain.kernel.noise]]).double()
         terms = zip(field.prior.terms, powers, strict=True)
