@@ -25,8 +25,8 @@ from gsparc.evaluation.experiment.problem import load_every_problem, read_entrie
 from gsparc.evaluation.experiment.run_cells import CellResult, PreparedCell, prepare_cell, run_cells
 from gsparc.evaluation.experiment.table import (
     CELL,
-    ROW,
     average_cells,
+    columns_of_csv,
     markdown,
     remarks,
     split_by_problem,
@@ -97,7 +97,7 @@ def write_comparison(
     blocks = split_by_problem(rows)
     by_draw = rows[rows.draws]
     by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
-    write_samples(run_dir / "compare.csv", rows[ROW].to_dict("list"))
+    write_samples(run_dir / "compare.csv", columns_of_csv(rows))
     write_samples(run_dir / "cells.csv", table_of_cells(filled)[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
     for here in by_set:

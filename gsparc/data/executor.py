@@ -10,8 +10,8 @@ import logging
 import os
 import time
 import warnings
-from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import closing
 from dataclasses import dataclass
@@ -96,9 +96,10 @@ def run_each(
         Exception: the first that `work` raises; pieces that have begun are cancelled.
         BrokenProcessPool, ray.exceptions.RayError: a piece ended its process `TRIES` times.
     """
-    total, ended = sum(map(cost, pieces)), 0.0
+    costs = [cost(piece) for piece in pieces]
+    left, spent = Counter(costs), defaultdict[float, list[float]](list)
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
-    began = logged = time.monotonic()
+    logged = before = time.monotonic()
     if not uses_other_processes() and threads == 1:
         results: Results = ((number, work(pieces[number])) for number in numbers)
     elif not uses_other_processes():
@@ -110,13 +111,23 @@ def run_each(
         for count, (number, result) in enumerate(results, 1):
             if isinstance(result, Exception):
                 raise result
-            ended += cost(pieces[number])
             now = time.monotonic()
-            whole = (now - began) * total / max(ended, 1e-9)
+            left[costs[number]] -= 1
+            spent[costs[number]].append(now - before)
+            before, to_come = now, _time_left(left, spent)
+            whole = to_come + sum(map(sum, spent.values()))
             if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
-                logged, left = now, whole - (now - began)
-                log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, left)
+                logged = now
+                log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, to_come)
             yield number, heeded.take_result(result) if uses_other_processes() else result
+
+
+def _time_left(left: Mapping[float, int], spent: Mapping[float, Sequence[float]]) -> float:
+    """Seconds that pieces `left` by cost take, as those of the same cost took, else in proportion to it."""
+    # Costs are guesses: methods without a budget take a hundredth of theirs, others several times theirs.
+    rate = sum(map(sum, spent.values())) / max(sum(cost * len(own) for cost, own in spent.items()), 1e-9)
+    mean = {cost: sum(own) / len(own) for cost, own in spent.items()}
+    return sum(count * mean.get(cost, rate * cost) for cost, count in left.items())
 
 
 @lru_cache(maxsize=1)

@@ -93,7 +93,10 @@ def error_in_one_line(error: BaseException) -> str:
         hint = suggest_or_list(choice, list_choices(group) or list(error.options))
         return f"{group}={choice}: no such choice{hint}"
     if isinstance(error, errors.OverrideParseException):
-        return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
+        nested = re.search(r"[\[{,:]\s*[\w.]+=", str(error.override))
+        inside = f'; inside brackets quote it: "{nested[0].strip("[{,: ")}..."' if nested else ""
+        form = f"write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\"{inside}"
+        return f"{error.override}: not understood; {form}"
     if isinstance(error, errors.ConfigCompositionException) and isinstance(
         error.__cause__, OmegaConfBaseException
     ):
@@ -139,6 +142,10 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
         return f"{_first(error)} {_first(cause)}"
     known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
+    groups = cause.parent_node.items_ex(resolve=False) if OmegaConf.is_dict(cause.parent_node) else ()
+    for group in [k for k, node in groups if OmegaConf.is_dict(node) and key in node]:
+        # Such as a column's quantity, which is no setting of the dataset.
+        return f"{full}: no such setting; did you mean '{prefix}{dot}{group}.{key}'?"
     hint = suggest_or_list(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
     hint = "; say hydra/launcher=joblib, too, or ray" if prefix == "hydra.launcher" else hint
     return f"{full}: no such setting{hint}"

@@ -14,7 +14,9 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
 from gsparc.evaluation.intervals import pool_figures
+from gsparc.evaluation.metric_formats import main_figure
 from gsparc.evaluation.metrics import paired_values
+from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unseen_runs
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
@@ -103,6 +105,11 @@ def evaluate(
     for stem, one in every.items():
         own = {**pool_figures(one, data, split), "skill": _skill(one, others)}
         facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
+    figure = main_figure({**facts, "dataset/kind": data.site.scored}, eval_on)
+    for name, other in others.items():
+        lead = lead_over_rows(other.scores.samples, scores.samples, figure)
+        if lead is not None and other is not same:
+            facts |= {f"baseline/{name}/ahead{key}": value for key, value in lead.facts().items()}
     facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
     decided = scores.dominant_row()
     if decided and data.row_names:

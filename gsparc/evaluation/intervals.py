@@ -8,8 +8,8 @@ from scipy.stats import norm
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.data.units import power_in_decibels
-from gsparc.evaluation.metric_formats import CALIBRATION
-from gsparc.evaluation.scores import Scores
+from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
+from gsparc.evaluation.scores import Scores, errors_with_silent
 
 SHARE = 0.9  # of the truth that an interval is to hold
 # 1e-4 of a power is .0004 dB: above float32 rounding (6e-8), below any two real levels.
@@ -92,19 +92,15 @@ def sensitivity_levels(data: Measurements) -> np.ndarray | None:
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """RMSE [dB] of all rows, silent ones by what predictions exceed their level; empty where none is.
+    """RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number, if any.
 
     That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
     """
-    side, prediction = data.censored_side(scores.row), scores.samples["prediction"]
-    if not side.any():
+    error = errors_with_silent(scores.samples, scores.row, data).get("error_db_with_silent")
+    if error is None:
         return {}
-    level = data.target[scores.row, 0].astype(np.float64) * data.site.target_scale
-    # A prediction of 0 has no logarithm: it is the weakest level, as in `PowerMetrics`.
-    floor = level[level > 0].min() if (level > 0).any() else np.finfo(np.float64).tiny
-    beyond = side * 10 * np.log10(np.where(prediction > 0, prediction, floor) / np.maximum(level, floor))
-    error = np.where(side == 0, scores.samples["error_db"], np.maximum(beyond, 0.0))
-    return {"rmse_db_with_silent": float(np.sqrt(np.nanmean(error**2)))}
+    silent = int((data.censored_side(scores.row) > 0).sum())
+    return {WITH_SILENT: float(np.sqrt(np.nanmean(error**2))), "silent_samples": silent}
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,6 +81,20 @@ class Scores:
             return None
         means = np.bincount(of_row, error) / np.bincount(of_row)
         return float(np.sqrt(np.mean((error - means[of_row]) ** 2)))
+
+
+def errors_with_silent(
+    samples: Mapping[str, np.ndarray], row: np.ndarray, data: Measurements
+) -> dict[str, np.ndarray]:
+    """`error_db_with_silent` (S,): of silent rows what predictions exceed their level; {} where none is."""
+    side = data.censored_side(row)
+    if data.site.kind != "rssi" or not side.any():
+        return {}
+    level, prediction = data.target[row, 0].astype(np.float64) * data.site.target_scale, samples["prediction"]
+    # A prediction of 0 has no logarithm: it is the weakest level, as in `PowerMetrics`.
+    floor = level[level > 0].min() if (level > 0).any() else TINY
+    beyond = side * 10 * np.log10(np.where(prediction > 0, prediction, floor) / np.maximum(level, floor))
+    return {"error_db_with_silent": np.where(side == 0, samples["error_db"], np.maximum(beyond, 0.0))}
 
 
 def rows_to_score(fold: Fold, eval_on: str) -> np.ndarray:
@@ -165,11 +179,13 @@ def score_methods(
         samples.append({name: values[back] for name, values in metric.compute().items()})
         confidence.append(outputs["confidence"])
         variance.append(outputs["variance"])
+    pooled = {name: np.concatenate([s[name] for s in samples]) for name in samples[0]}
+    row = np.concatenate(every)
     return Scores(
         kind=data.site.scored,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),
-        row=np.concatenate(every),
-        samples={name: np.concatenate([s[name] for s in samples]) for name in samples[0]},
+        row=row,
+        samples=pooled | errors_with_silent(pooled, row, data),
         confidence=np.concatenate(confidence),
         variance=np.concatenate(variance),
     )

@@ -27,6 +27,7 @@ from gsparc.evaluation.metric_formats import (
     number_format,
     score_of,
 )
+from gsparc.evaluation.paired import Lead
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
@@ -139,9 +140,9 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
     made, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
-    named = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
-    learned = str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
-    lines = [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
+    said = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
+    said += str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
+    lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(said)]
     folds = facts.get("split/folds") or 1
     return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
 
@@ -215,15 +216,27 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Return the baseline that beats the method, if one does; where rows were silent, these count too."""
+    """Return whether the best baseline beats the method, or neither; where rows were silent, these count."""
     figure = main_figure(facts, prefix)
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
     known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
     best = max(known, key=lambda name: known[name], default=None)
-    if best is None or own is None or known[best] <= score_of(figure, own):
+    if best is None or own is None:
         return []
-    return [f"the baseline {best} has the better {figure} here: the better choice for this data and split"]
+    lead = Lead.from_facts(facts, f"baseline/{best}/ahead")
+    if lead is None:
+        better = known[best] > score_of(figure, own)
+        return [f"the baseline {best} has the better {figure} here; how surely is not known"] * better
+    return judge_baseline(best, str(facts.get("model/label") or facts.get("model/name")), figure, lead)
+
+
+def judge_baseline(baseline: str, method: str, figure: str, lead: Lead) -> list[str]:
+    """Return whether a baseline, which has `lead` over a method, is better or no different; [] if worse."""
+    if not lead.sure:
+        return [f"the baseline {lead.no_difference(baseline, method, figure)}"]
+    better = f"the baseline {baseline} has the better {figure} here ({lead}): "
+    return [f"{better}the better choice for this data and split"] * (lead.ahead_db > 0)
 
 
 def _value(key: str, value: Any) -> int | float | str | None:

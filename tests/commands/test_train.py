@@ -192,4 +192,16 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
     assert not way or (tmp_path / "run" / "sweep.png").exists()  # of no figure at all: no logarithm
 
 
+def test_the_title_of_a_table_did_not_say_the_draw_of_the_split(tmp_path):
+    """`split random, test, seed 0` stood above three draws."""
+    places = np.random.default_rng(0).uniform(0, 20, (60, 3))
+    file = tmp_path / "own.npz"
+    np.savez(file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0])
+    given = ["dataset=own", f"dataset.file={file}", "model=mean", "baselines=[]", "split.seed=2"]
+    given += [f"hydra.run.dir={tmp_path / 'run'}", "logger=none", "threads=1"]
+    answer = knock(main, "train.py", given)
+    assert "random (split.seed=2), test, seed 0" in " ".join((tmp_path / "run/train.log").read_text().split())
+    assert answer.status == 0
+
+
 # -- the command itself ---------------------------------------------------------------------------------

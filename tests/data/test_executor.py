@@ -63,6 +63,13 @@ def test_one_line_says_how_many_are_left_and_how_long(caplog, monkeypatch):
     assert caplog.messages in (["1 of 2 cells, about 0 s left"], ["1 of 2 cells, about 1 s left"])
 
 
+def test_the_time_left_of_long_cells_was_that_of_short_ones():
+    """7 of 12 cells, about 67 s left; then 9 of 12, about 67 s left; 230 s followed."""
+    spent = {7.0: [1.0, 1.0, 1.0], 14.0: [36.0]}  # methods without a budget are guessed at 7
+    assert executor._time_left({7.0: 0, 14.0: 5}, spent) == 180
+    assert executor._time_left({7.0: 2, 14.0: 2}, {7.0: [1.0]}) == pytest.approx(2 + 28 / 7)
+
+
 def test_an_error_ends_the_work_here():
     seen = []
     with pytest.raises(ZeroDivisionError):

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from gsparc.evaluation.console import ConsoleHandler, error_in_one_line, repeated_warnings
+from gsparc.evaluation.console import ConsoleHandler, config_folder, error_in_one_line, repeated_warnings
 
 
 @pytest.mark.parametrize(
@@ -24,6 +24,19 @@ from gsparc.evaluation.console import ConsoleHandler, error_in_one_line, repeate
 )
 def test_an_error_is_one_line(error, line):
     assert error_in_one_line(error) == line
+
+
+def test_an_equals_sign_in_a_list_was_not_understood_without_saying_why():
+    text = "+splits.squares={choose: [split=blocks, split.side_m=1], draws: 3}"
+    with initialize_config_module("gsparc.conf", version_base="1.3"), pytest.raises(Exception) as error:
+        compose("compare", overrides=[text])
+    assert error_in_one_line(error.value).endswith('; inside brackets quote it: "split=..."')
+    quoted = text.replace("split=blocks", '"split=blocks"').replace("split.side_m=1", '"split.side_m=1"')
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        found = compose("compare", overrides=[quoted])
+    assert found.splits.squares.choose == ["split=blocks", "split.side_m=1"]
+    example = (config_folder() / "compare.yaml").read_text()
+    assert quoted in example
 
 
 def test_evaluate_said_how_every_column_is_read():

@@ -63,6 +63,8 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     train, val, test = (round(rows / count) for rows in whole)
     folds = f"each of {count} folds has about " if count > 1 else ""
     rows = f"{folds}{train} training, {val} validation and {test} test rows"
+    if split.name == "none":
+        rows = f"all {train + val} rows are learned from ({val} decide where a method has choices)"
     return [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),
@@ -114,10 +116,8 @@ def _static(site: Site) -> str:
         lost = len(stations) - len(known)
         where = _box(known) if len(known) else ""
         where += f", {lost} of them at unknown places" if lost else ""
-        pairs = zip(stations.label or stations.name, stations.name, strict=True)
-        names = [own if own == name else f"{own} ({name})" for own, name in pairs]
         count = f"{len(stations)} station{'s' * (len(stations) > 1)}"
-        return f"the {end}, {count}{where}: {list_first(names, 4)}"
+        return f"the {end}, {count}{where}: {list_first(stations.shown, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
@@ -178,7 +178,7 @@ def _units(positions: np.ndarray) -> list[str]:
     # Metres about a local origin lie near it; degrees of a small site lie many of its widths away.
     if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
-        how = "then give them as latitude and longitude"
+        how = "then give them as latitude and longitude (columns of a table: dataset.columns.lat=HEAD, .lon)"
         return [f"positions near {near} within {across:.2g}: degrees? {how}"]
     groups = outliers.find_gap(positions[:, :2])
     if groups is not None:

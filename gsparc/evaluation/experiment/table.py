@@ -23,6 +23,7 @@ from gsparc.evaluation.metric_formats import (
     number_format,
     score_heading,
 )
+from gsparc.evaluation.paired import Lead, lead_over_rows
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Table, value_with_error
@@ -41,6 +42,7 @@ BESIDE_COLUMNS = (
     Column("in 90 % interval", ".2f", of="coverage"), Column("outage, Brier score", ".4f", of="outage"),
     Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2"),
 )  # fmt: skip
+OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 PROBLEM = ["dataset", "split"]
@@ -48,9 +50,10 @@ GROUP = [*PROBLEM, "budget_s", "method"]
 CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
     *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
-    "behind_error_db", *BESIDE, "second", "second_value", "train_s",
+    "behind_error_db", *BESIDE, "second_figure", "second_value", "train_s",
     "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
 ]  # fmt: skip
+CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spread_db` by what it is
 
 
 def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
@@ -62,7 +65,7 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         label = str(own["label"] or "")
         rows.append({
             **own, **asdict(one.cell), "folder": one.folder, "draws": one.drawn, "score_db": score_db(own),
-            "second": second, "second_value": own.get(second),
+            "second_figure": second, "second_value": own.get(second),
             **{name: own.get(key) for name, key in BESIDE.items()},
             "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
@@ -83,8 +86,8 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
             of fewer measurements answer faster.
 
     Returns:
-        Columns `ROW` (those of `compare.csv`) and `folder`, of the first seed's run; NaN where something is
-        not known.
+        Columns `ROW` (see `columns_of_csv`), `folder`, of the first seed's run, and `by_draw`, scores by
+        seed; NaN where something is not known.
         `budget_s` [s]: NaN for a method without one, which stands in the tables of all budgets.
         `score_db`: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE; `spread_db`: its standard
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
@@ -106,8 +109,9 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     groups = cells.groupby(GROUP, dropna=False, sort=False)
     means = ["score_db", "value", "behind_db", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
-    rows[["figure", "second", "folder"]] = groups[["figure", "second", "folder"]].first()
+    rows[["figure", "second_figure", "folder"]] = groups[["figure", "second_figure", "folder"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
+    rows["by_draw"] = groups[["seed", "score_db"]].apply(lambda own: dict(own.itertuples(index=False)))
     rows["draws"] = several
     # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
     rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
@@ -128,7 +132,7 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
         rows[name] = [getattr(one, field, np.nan) for one in times]
     order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
     rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
-    return rows[[*ROW, "folder"]].reset_index(drop=True)
+    return rows[[*ROW, "folder", "by_draw"]].reset_index(drop=True)
 
 
 def _behind(cells: pd.DataFrame) -> pd.Series:
@@ -142,6 +146,17 @@ def _behind(cells: pd.DataFrame) -> pd.Series:
         same = here[groups.ngroup() == groups.ngroup()[best]].set_index("seed").score_db
         behind[here.index] = here.seed.map(same) - here.score_db
     return behind
+
+
+def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
+    """Return the columns of `compare.csv`, with the signs of the tables and errors by what they are."""
+    several = rows.draws.astype(bool)
+    columns = rows.assign(
+        score_db=[shown(*one) for one in zip(rows.figure, rows.score_db, strict=True)],
+        score_error_db=rows.spread_db.where(several), score_std_db=rows.spread_db.where(~several),
+        draws=rows.seeds.where(several, 1), seeds=rows.seeds.where(~several, 1),
+    )  # fmt: skip
+    return columns[CSV].to_dict("list")
 
 
 def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
@@ -158,7 +173,7 @@ def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
 def title_of(block: pd.DataFrame) -> str:
     """Names and budget of a block, and how often its split was drawn."""
     budget = block.budget_s.max()
-    timed = "" if np.isnan(budget) else f", {budget:g} processor seconds of training per model"
+    timed = "" if np.isnan(budget) else f", a budget of {budget:g} processor seconds per model"
     draws = int(block.seeds.max()) if block.draws.any() else 0
     count = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
     return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{timed}{count}"
@@ -170,25 +185,44 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     first = rows[0]
     level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
     lines = [f"first: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
-    if len(rows) > 1:
-        lines[0] += _lead(first, rows[1])
+    leads = {row.method: _lead(first, row) for row in rows[1:]}
+    if len(rows) > 1 and (lead := leads[rows[1].method]):
+        before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
+        lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
+        lines[0] += "" if lead.sure or lead.same else ": they do not differ"
     own = next((row for row in rows if row.method == ours), None)
-    if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
-        wins = f"a simple baseline wins: take {first.method} for this data and split"
-        lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
+    lead = None if own is None else leads.get(own.method)
+    figure = heading_of(first.figure)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
         # Independent errors add in squares.
         spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
-        level = own.score_db >= first.score_db - spread and own.seeds > 1
-        lines.append(gap + (", within the seeds' spread" if level else ""))
+        within = own.score_db >= first.score_db - spread and own.seeds > 1 and not own.draws
+        gap += ", within the seeds' spread" if within else ""
+        unsure = lead is not None and not lead.sure
+        lines.append(lead.no_difference(first.method, ours, figure) if lead and unsure else gap)
+    if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
+        wins = f"a simple baseline wins: take {first.method} for this data and split"
+        if own is None or lead is None or lead.sure:
+            lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
     # False for NaN: methods without a variance have no such figure.
     if own is not None and first.outage > own.outage:
         both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
         lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
     for row in rows[1:]:
-        if own is not None and row.method in SIMPLE and row.score_db > own.score_db:
+        if own is None or row.method not in SIMPLE or row.score_db <= own.score_db:
+            continue
+        ahead = _lead(row, own)
+        if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
+    spent = [
+        f"{row.method} {row.train_cpu_s:.3g}"
+        for row in rows
+        # False for NaN: methods without a budget.
+        if abs(row.train_cpu_s - row.budget_s) > OTHERWISE * row.budget_s
+    ]
+    if spent:
+        lines.append(f"spent of {block.budget_s.max():g} processor seconds: {', '.join(spent)}")
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
@@ -201,44 +235,18 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
 
-def _lead(first: Any, second: Any) -> str:
-    """What the first has more than the second, with its standard error: of the same draws, or the same rows.
-
-    Rows count as independent, which neighbours are not: their error is a lower bound.
-    """
-    ahead, error, of = second.behind_db, second.behind_error_db, "draws"
-    if first.draws and (first.behind_db != 0 or not np.isfinite(error)):
-        return ""
-    if not first.draws:
-        files = [Path(str(row.folder)) / "per_sample.csv" for row in (first, second)]
-        if not all(file.exists() for file in files):
-            return ""
-        one, other = (pd.read_csv(file) for file in files)
-        gains = paired_gains(one, other, first.figure) if list(one.row) == list(other.row) else None
-        if gains is None or len(gains) < 2:
-            return ""
-        ahead, error, of = gains.mean(), gains.sem(), f"{len(gains)} test rows"
-        of += " of the first seeds" if max(first.seeds, second.seeds) > 1 else ""
-    return f"; {ahead:.2f} ± {error:.2f} dB before {second.method} (standard error over the same {of})"
-
-
-def paired_gains(one: pd.DataFrame, other: pd.DataFrame, figure: str) -> pd.Series | None:
-    """Return numbers (n,) whose mean is what the score of `one` has more than that of `other` [dB].
-
-    Args:
-        one, other: columns of `per_sample.csv` of the same n rows.
-        figure: the deciding one; None for those that are no mean over rows.
-    """
-    if figure == "psnr_db":
-        return (one.psnr_db - other.psnr_db).dropna()
-    if figure == "nmse":  # the difference of logarithms, and to first order what each row adds to it
-        ratios = [(error / error.mean()).rename(None) for error in (one.error_power, other.error_power)]
-        ahead = np.log(other.error_power.mean() / one.error_power.mean())
-        return (10 / np.log(10) * (ahead + ratios[1] - ratios[0])).dropna()
-    if figure == "rmse_db":  # a^2 - b^2 = (a - b) (a + b)
-        squares = [frame.error_db**2 for frame in (one, other)]
-        return ((squares[1] - squares[0]) / sum(square.mean() ** 0.5 for square in squares)).dropna()
-    return None
+def _lead(first: Any, other: Any) -> Lead | None:
+    """What the first has more than another one: on the same draws, or the same rows; None: not known."""
+    if min(first.seeds, other.seeds) > 1 and first.draws:
+        both = first.by_draw.keys() & other.by_draw.keys()
+        gains = np.array([first.by_draw[draw] - other.by_draw[draw] for draw in sorted(both)])
+        return Lead.from_gains(gains, "draws") if len(gains) > 1 else None
+    files = [Path(str(row.folder)) / "per_sample.csv" for row in (first, other)]
+    if not all(file.exists() for file in files):
+        return None
+    one, two = (pd.read_csv(file) for file in files)
+    of = "test rows" + " of the first seeds" * (max(first.seeds, other.seeds) > 1)
+    return lead_over_rows(one, two, first.figure, of) if list(one.row) == list(two.row) else None
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:
@@ -249,9 +257,9 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (True, Column(score_heading(figure), ".2f", of=_score)),
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
-        (True, Column(block.second.iloc[0], of="second_value")),
+        (True, Column(block.second_figure.iloc[0], of="second_value")),
         *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
-        (not draws, Column("seeds", "d", of="seeds")),
+        (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
     own = block[block.method == ours]

@@ -19,7 +19,7 @@ from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import better_baseline, busy_machine, run_conditions
+from gsparc.evaluation.summary import better_baseline, busy_machine, judge_baseline, run_conditions
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -64,6 +64,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.group_by_setting(runs)) < len(runs):
         study.tables.append(tables.table_of_seeds(runs))
+    if tables.has_draws(runs):
+        study.tables.append(tables.table_of_leads(runs))
     study.tables += [
         table for table in (tables.table_of_results(runs), tables.table_of_worst(runs)) if table.rows
     ]
@@ -87,7 +89,15 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     # Loads differ from run to run: as remarks of their own there would be one a run.
     remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
     scored = [run for run in runs if run.row["value"] is not None]
-    if scored:  # a baseline must beat the best run of the page
+    if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
+        groups = tables.group_by_setting(scored).values()
+        group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
+        name, lead = max(
+            tables.lead_over_draws(group).items(), key=lambda one: one[1].ahead_db, default=(None, None)
+        )
+        if name and lead:
+            remarks += judge_baseline(name, group[0].setting, group[0].row["figure"], lead)
+    elif scored:  # a baseline must beat the best run of the page
         remarks += better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
     return list(dict.fromkeys(remarks + busy_machine(loads)))

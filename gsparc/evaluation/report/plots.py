@@ -17,7 +17,7 @@ from matplotlib.ticker import NullFormatter
 from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis, style_of
 from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
-from gsparc.evaluation.report.runs import Run, error_sizes
+from gsparc.evaluation.report.runs import Run, distinct_baselines, error_sizes
 from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
 from gsparc.prediction.pareto import pareto_front
 
@@ -87,8 +87,10 @@ def draw_accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].row["kind"]], _axes()
     _cdfs(axes, runs, name)
-    rival = runs[0].samples.get(f"baseline/gp/{name}")
-    if rival is not None and any(base["method"] == "gp" for base in _rivals(runs)):
+    beside = [base["run"].samples for base in _rivals(runs) if base["method"] == "gp"]
+    known = [own[f"baseline/gp/{name}"] for own in beside if f"baseline/gp/{name}" in own]
+    if known:
+        rival = np.concatenate(known)  # of all draws
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **style_of("gp").line)
     axes.set_ylabel("share of samples")
@@ -148,9 +150,9 @@ def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] 
 
 
 def _rivals(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Baselines beside the first run that no run is of."""
+    """Baselines of each draw that no run is of."""
     methods = {run.row["method"] for run in runs}
-    return [row for row in runs[0].baselines if row["method"] not in methods]
+    return [row for row in distinct_baselines(runs) if row["method"] not in methods]
 
 
 def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:

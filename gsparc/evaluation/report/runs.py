@@ -23,7 +23,10 @@ from gsparc.prediction.timing import BLOCKS, Call, p50_p95, time_interleaved
 
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
-HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
+HIDDEN = (
+    "seed", "split.seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment",
+    "logger",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Run:
     @cached_property
     def row(self) -> dict[str, Any]:
         """Its own row of the results, with `setting`, and times measured alone, where they were."""
-        own = {**self.rows[0], "setting": self.setting, "run": self}
+        own = {**self.rows[0], "setting": self.setting, "draw": self.draw, "run": self}
         if len(self.render_ms):
             own["query_ms"], own["query_p95_ms"] = p50_p95(self.render_ms)
         return own
@@ -59,7 +62,16 @@ class Run:
         """Rows of the plain baselines beside it, in the order of `BASELINES`."""
         # A baseline that could not be fitted has a row without a value.
         beside = {row["method"]: row for row in self.rows[1:] if row["value"] is not None}
-        return [{**beside[n], "setting": f"{n} (baseline)", "run": self} for n in BASELINES if n in beside]
+        # A sweep may thin what they learn from.
+        of = [o for o in self._named if o.lstrip("+~").startswith(("split.", "dataset."))]
+        own = {"draw": self.draw, "run": self}
+        settings = {n: " ".join([f"{n} (baseline)", *of]) for n in BASELINES if n in beside}
+        return [{**beside[name], "setting": setting, **own} for name, setting in settings.items()]
+
+    @property
+    def draw(self) -> str:
+        """Which rows learn and test, by the hash of the split."""
+        return str(self.facts.get("split/sha256"))[:8]
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -68,11 +80,14 @@ class Run:
 
     @cached_property
     def setting(self) -> str:
-        """What distinguishes it from others but the seed: the method and its overrides."""
-        overrides = [o for o in self.overrides if not o.lstrip("+~").startswith(HIDDEN)]
-        named = [o for o in overrides if not o.startswith(("model=", "dataset=", "split="))]
-        short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
+        """What distinguishes it from others but seeds and draws: the method and its overrides."""
+        short = [o.removeprefix("model.").removeprefix("trainer.") for o in self._named]
         return " ".join([str(self.facts.get("model/name", "?")), *short])
+
+    @property
+    def _named(self) -> list[str]:
+        overrides = [o for o in self.overrides if not o.lstrip("+~").startswith(HIDDEN)]
+        return [o for o in overrides if not o.startswith(("model=", "dataset=", "split="))]
 
     @property
     def resolved(self) -> dict[str, Any]:
@@ -128,6 +143,14 @@ def group_by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     for run in runs:
         groups.setdefault(run.study, []).append(run)
     return groups
+
+
+def distinct_baselines(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Rows of the baselines of each draw of the split, of its first run."""
+    every: dict[tuple[str, str], dict[str, Any]] = {}
+    for base in (base for run in runs for base in run.baselines):
+        every.setdefault((base["draw"], base["setting"]), base)
+    return list(every.values())
 
 
 def drop_shared_overrides(runs: Sequence[Run]) -> list[Run]:

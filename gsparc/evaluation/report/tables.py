@@ -8,15 +8,24 @@ from functools import partial
 import numpy as np
 
 from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
-from gsparc.evaluation.report.runs import Run
+from gsparc.evaluation.paired import Lead
+from gsparc.evaluation.report.runs import Run, distinct_baselines
+from gsparc.evaluation.results import score_db
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
 DRAWS = 1000
 LEVEL = 0.95
 WORST = 3
+# Two latencies of one model: caches hold what was asked before it, of baselines or of other models.
+TIMED = (
+    "Queries: baselines are timed in turns within a run, the models of a sweep again after it, in turns with "
+    "one another: a run's own table has other milliseconds."
+)
 SETTING = Column("method and setting", "", of="setting")
 SEED = Column("seed", "d", of="seed")
+# By its seed, as the command line has it; by its hash where the settings are gone.
+DRAW = Column("draw", "", "split.seed", lambda row: str(row["run"].config.get("split.seed", row["draw"])))
 SIZE = Column("Gaussians", "d", of="gaussians")
 
 
@@ -67,6 +76,36 @@ def interval_over_seeds(values: Sequence[float | None]) -> Interval | None:
     return Interval(float(np.mean(known)), min(known), max(known))
 
 
+def interval_over_draws(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
+    """Mean over draws of the split and its standard error, seeds of each averaged; of one draw over seeds."""
+    known: dict[str, list[float]] = {}
+    for value, draw in zip(values, draws, strict=True):
+        if value is not None:
+            known.setdefault(draw, []).append(value)
+    if len(known) < 2:
+        return interval_over_seeds(values)
+    means = np.array([np.mean(own) for own in known.values()])
+    return Interval(float(means.mean()), error=float(means.std(ddof=1) / len(means) ** 0.5))
+
+
+def has_draws(runs: Sequence[Run]) -> bool:
+    """Return whether a setting was run on several draws of the split."""
+    return any(len({run.draw for run in group}) > 1 for group in group_by_setting(runs).values())
+
+
+def lead_over_draws(group: Sequence[Run]) -> dict[str, Lead]:
+    """Return what each baseline has more than a setting on the same draws, seeds of a draw averaged."""
+    gains: dict[str, dict[str, list[float]]] = {}
+    for run in (run for run in group if run.row["value"] is not None):
+        for base in run.baselines:
+            gain = score_db(base) - score_db(run.row)
+            gains.setdefault(base["method"], {}).setdefault(run.draw, []).append(gain)
+    return {
+        name: Lead.from_gains(np.array([np.mean(own) for own in draws.values()]), "draws")
+        for name, draws in gains.items()
+    }
+
+
 def accuracy_column(figure: str, note: str = "") -> Column:
     """Return a test figure, with its interval."""
     return Column(heading_of(figure), number_format(figure), note, partial(interval_of_figure, figure=figure))
@@ -89,7 +128,8 @@ def table_of_results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
     note = "95 % interval: bootstrap over test samples"
     columns = [
-        SETTING, SEED, *(accuracy_column(f, note) for f in _figures(runs[0].row)),
+        SETTING, *([DRAW] * has_draws(runs)), SEED,
+        *(accuracy_column(f, note) for f in _figures(runs[0].row)),
         Column(heading_of(CALIBRATION), number_format(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
@@ -99,27 +139,42 @@ def table_of_results(runs: Sequence[Run]) -> Table:
         Column("data", "", of=lambda row: str(row["data"])[:8]),
         Column("commit", "", of=lambda row: str(row["git"])[:8]),
     ]  # fmt: skip
-    note = (
-        "Brackets: 95 % intervals over test samples (independent samples assumed). Baselines are timed "
-        "in turns within a run, the models of a sweep alone after it."
-    )
-    return Table.from_rows("Results", columns, [*(run.row for run in runs), *runs[0].baselines], note=note)
+    note = f"Brackets: 95 % intervals over test samples (independent samples assumed). {TIMED}"
+    rows = [*(run.row for run in runs), *distinct_baselines(runs)]
+    return Table.from_rows("Results", columns, rows, note=note)
 
 
 def table_of_seeds(runs: Sequence[Run]) -> Table:
-    """Settings side by side, their spread over seeds, and what they cost."""
-    differs = differing_settings(runs)
+    """Settings and baselines side by side, their spread over seeds or draws of the split, and their cost."""
+    differs, several, spread = differing_settings(runs), has_draws(runs), _spread_columns(runs)
     also = [Column("differs, too", "")] if any(differs.values()) else []
-    spread = _spread_columns(runs)
+    groups: dict[str, list[Row]] = {}
+    for row in [*(run.row for run in runs), *distinct_baselines(runs)]:
+        groups.setdefault(row["setting"], []).append(row)
+    rows = []
+    for setting, group in groups.items():
+        draws = [row["draw"] for row in group]
+        counts = [len(set(draws)), len({row["seed"] for row in group})] if several else [len(group)]
+        values = [interval_over_draws([column.value(row) for row in group], draws) for column in spread]
+        rows.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
+    counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
+    note = "Brackets: least and largest over seeds, on the same split: split.seed draws others. "
+    if several:
+        note = "± standard error of the mean over draws of the split (split.seed). "
+    columns, title = [SETTING, *also, *counted, *spread], f"Settings over {'draws' if several else 'seeds'}"
+    return Table(title, columns, rows, note + TIMED, ends={"low": "least", "high": "largest"})
+
+
+def table_of_leads(runs: Sequence[Run]) -> Table:
+    """Return what each setting has more than each baseline, draw by draw."""
     rows = [
-        [
-            setting, *([differs[setting]] if also else []), len(group),
-            *(interval_over_seeds([column.value(run.row) for run in group]) for column in spread),
-        ]
+        [setting, name, Interval(-lead.ahead_db, error=lead.error_db), lead.pairs]
         for setting, group in group_by_setting(runs).items()
-    ]  # fmt: skip
-    columns = [SETTING, *also, Column("seeds", "d"), *spread]
-    return Table("Settings over seeds", columns, rows, "Brackets: least and largest over seeds.")
+        for name, lead in lead_over_draws(group).items()
+    ]
+    heads = [SETTING, Column("baseline", ""), Column("ahead of it, dB", ".2f"), Column("pairs", "")]
+    note = f"Of {heading_of(runs[0].row['figure'])}, on the same draws; ± standard error of the mean."
+    return Table("Settings against baselines", heads, rows, note)
 
 
 def _spread_columns(runs: Sequence[Run]) -> list[Column]:
@@ -154,7 +209,8 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
     rival = f"baseline/gp/{name}"
     beside = ("gp there",) if any(rival in run.samples for run in runs) else ()
     numbers = [Column(head, ".2f") for head in (heading_of(name), *beside, "confidence")]
-    columns = [SETTING, SEED, Column("sample", ""), Column("where [m]", ""), *numbers]
+    several = has_draws(runs)
+    columns = [SETTING, *([DRAW] * several), SEED, Column("sample", ""), Column("where [m]", ""), *numbers]
     rows = []
     for run in runs:
         own = run.samples
@@ -165,7 +221,13 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
         for i in np.argsort(-np.nan_to_num(error, nan=-np.inf))[:WORST]:
             place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
             there = [float(own[rival][i]) if rival in own else None for _ in beside]
-            head = [run.setting, run.row["seed"], str(own["name"][i]), place]
+            head = [
+                run.setting,
+                *([DRAW.value(run.row)] * several),
+                run.row["seed"],
+                str(own["name"][i]),
+                place,
+            ]
             rows.append([*head, float(own[name][i]), *there, float(own["confidence"][i])])
     hard = "; the Gaussian process there shows whether it is hard for all" if beside else ""
     note = f"The moving end's position{hard}."

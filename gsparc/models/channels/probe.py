@@ -17,6 +17,7 @@ from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.places import ORIGIN
+from gsparc.processes.worker import raise_if_cancelled
 
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
@@ -87,6 +88,7 @@ def likelihood_gains(
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
         for chunk in torch.arange(count).split(max(ENTRIES // len(probe.group), 1)):
+            raise_if_cancelled()
             each = waves_of(probe, chunk)
             size = wave_precision(probe, each)
             total[chunk] += torch.stack([probe.likelihood_gain(each, level, size) for level in levels], 1)

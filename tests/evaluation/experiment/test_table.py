@@ -13,13 +13,14 @@ from gsparc.evaluation.experiment.pictures import draw_budgets
 from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.experiment.table import (
     average_cells,
+    columns_of_csv,
     markdown,
-    paired_gains,
     remarks,
     split_by_problem,
     table_of_cells,
     title_of,
 )
+from gsparc.evaluation.paired import lead_over_rows
 
 
 def filled(method, value, seed=None, budget=None, split="random", kind="spectrum", **more):
@@ -45,8 +46,8 @@ TIMED = {"rfid": {"gp": Latency(2.0, 3.0, 1.5, 60), "gsparc": Latency(0.5, 0.6, 
 def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
     found = split_by_problem(average_cells(FOUND, TIMED))
     assert [(title_of(block), list(block.method)) for block in found] == [
-        ("rfid, split random, 60 processor seconds of training per model", ["gp", "gsparc", "gsrf"]),
-        ("rfid, split random, 300 processor seconds of training per model", ["gp", "gsrf"]),
+        ("rfid, split random, a budget of 60 processor seconds per model", ["gp", "gsparc", "gsrf"]),
+        ("rfid, split random, a budget of 300 processor seconds per model", ["gp", "gsrf"]),
         ("rfid, split grouped", ["gp"]),
     ]
     _, gsparc, gsrf = found[0].itertuples()
@@ -72,7 +73,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert "| outage, Brier score |" in page and "| 0.0125 |" in page
     assert "simple baseline wins" not in page, "there are no others"
     (said, *_) = remarks(block, "gsparc")
-    assert said.endswith("; 1.10 ± 0.06 dB before idw (standard error over the same draws)")
+    assert said.endswith("; 1.10 ± 0.06 dB before idw (standard error over the same 3 draws)")
     assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
 
 
@@ -144,7 +145,7 @@ def test_lists_were_compared_by_their_listed_rows_alone():
     found = [filled(m, e, 0, kind="rssi", **{"test/rmse_db_with_silent": silent}) for m, e, silent in errors]
     (block,) = split_by_problem(average_cells(found, {}))
     first = next(block.itertuples())
-    assert (first.method, first.figure, first.second) == ("gsparc", "rmse_db_with_silent", "rmse_db")
+    assert (first.method, first.figure, first.second_figure) == ("gsparc", "rmse_db_with_silent", "rmse_db")
 
 
 def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
@@ -177,8 +178,8 @@ def test_gains_of_rows_have_the_difference_of_scores_as_their_mean(figure, colum
     )
     means = [(frame[column] ** (2 if figure == "rmse_db" else 1)).mean() for frame in (one, other)]
     score = (lambda x: -(x**0.5)) if figure == "rmse_db" else (lambda x: -10 * np.log10(x))
-    gains = paired_gains(one, other, figure)
-    assert gains.mean() == pytest.approx(score(means[0]) - score(means[1])) and gains.sem() > 0
+    lead = lead_over_rows(one, other, figure)
+    assert lead.ahead_db == pytest.approx(score(means[0]) - score(means[1])) and lead.error_db > 0
 
 
 def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, monkeypatch):
@@ -192,3 +193,48 @@ def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, m
     for axis in axes:
         low, high = axis.get_xlim()
         assert sum(low <= tick <= high for tick in axis.get_xticks()) >= 2
+
+
+def test_methods_with_the_same_figures_in_every_draw_had_a_winner():
+    """`first: gp, 0.00 ± 0.00 dB before gsparc`, and `a simple baseline wins: take gp`."""
+    cells = [
+        filled(method, 5.0 + draw, draw, kind="rssi", split="drawn", drawn=True)
+        for draw in range(3)
+        for method in ("gp", "gsparc")
+    ]
+    (block,) = split_by_problem(average_cells(cells, {}))
+    said = " | ".join(remarks(block, "gsparc"))
+    assert "; the same as gsparc (standard error over the same 3 draws)" in said
+    assert "gp and gsparc have the same RMSE dB over 3 draws" in said
+    assert "wins" not in said and "beats" not in said and "behind" not in said
+
+
+def test_a_simple_baseline_won_by_chance():
+    """The verdict was by means of draws alone, however much their difference varied."""
+    gains = (2.0, -1.5, 0.4)
+    cells = [filled("gsparc", 30.0, draw, drawn=True) for draw in range(3)]
+    cells += [filled("gp", 30.0 + gain, draw, drawn=True) for draw, gain in enumerate(gains)]
+    cells += [filled("nearest", 30.0 + gain / 2, draw, drawn=True) for draw, gain in enumerate(gains)]
+    (block,) = split_by_problem(average_cells(cells, {}))
+    said = " | ".join(remarks(block, "gsparc"))
+    assert "gp and gsparc do not differ in PSNR dB (gp +0.30 ± 1.01 dB over 3 draws)" in said
+    assert "0.15 ± 0.51 dB before nearest (standard error over the same 3 draws): they do not differ" in said
+    assert "wins" not in said and "beats" not in said
+
+
+def test_budgets_called_equal_were_spent_by_half():
+    """newrf spent 6.43 of 12 processor seconds, gsparc 14.2, under a title that gave 12 to each."""
+    cpu = {"gsparc": 14.2, "newrf": 6.43, "blind": 12.5}
+    found = [filled(name, 20.0, 0, 12.0, **{"time/train_cpu_s": own}) for name, own in cpu.items()]
+    said = remarks(split_by_problem(average_cells(found, {}))[0], "gsparc")
+    assert "spent of 12 processor seconds: gsparc 14.2, newrf 6.43" in said
+
+
+def test_the_csv_file_had_other_signs_than_the_console():
+    """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws, a spread was an error."""
+    drawn = [filled("gp", 5.0 + draw, draw, kind="rssi", split="drawn", drawn=True) for draw in range(3)]
+    seeds = [filled("gsparc", 5.0 + seed, seed, 60.0, kind="rssi") for seed in range(2)]
+    gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*drawn, *seeds], {}))).itertuples()
+    assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
+    assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
+    assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(gsparc.score_error_db)

@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from gsparc.evaluation.report import tables
+from gsparc.evaluation.report.page import warnings
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, find_runs
 from gsparc.evaluation.report.tables import bootstrap_interval
 from gsparc.evaluation.table import Column, Interval, Table
@@ -124,3 +125,42 @@ def test_a_report_of_lists_left_out_the_figure_that_decides(tmp_path):
     shown = cells(tables.table_of_results([run]), 0)
     assert list(shown)[2:5] == ["RMSE dB, silent too", "RMSE dB", "MAE dB"]
     assert shown["RMSE dB, silent too"].value == 2.2
+
+
+def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_dir, tmp_path):
+    """One row of gp, of draw 0, stood beside three of gsparc; nothing was pooled over `split.seed`."""
+    for draw, (own, gp) in enumerate([(29.0, 28.9), (28.0, 28.2), (30.0, 29.4)]):
+        folder = run_dir(tmp_path / str(draw), psnr=own, overrides=("dataset=rfid", f"split.seed={draw}"))
+        facts = json.loads((folder / "summary.json").read_text())
+        facts |= {"split/sha256": f"{draw}" * 64, "baseline/gp/psnr_db": gp}
+        (folder / "summary.json").write_text(json.dumps(facts))
+    runs = drop_shared_overrides(find_runs([tmp_path]))
+    pooled = tables.table_of_seeds(runs)
+    assert pooled.title == "Settings over draws" and [row[0] for row in pooled.rows] == [
+        "gsparc", "mean (baseline)", "gp (baseline)",
+    ]  # fmt: skip
+    found = cells(pooled, 0)
+    assert (found["draws"], found["seeds"]) == (3, 1)
+    assert found["PSNR dB"] == Interval(29.0, error=pytest.approx(1 / 3**0.5))
+    assert cells(pooled, 2)["PSNR dB"].value == pytest.approx(28.8333, abs=1e-4)
+    assert "PSNR dB error" in pooled.csv() and "least" not in pooled.csv()
+    ahead = cells(tables.table_of_leads(runs), 1)
+    gains = np.array([0.1, -0.2, 0.6])
+    assert (ahead["baseline"], ahead["pairs"]) == ("gp", "3 draws")
+    assert ahead["ahead of it, dB"].value == pytest.approx(gains.mean())
+    assert ahead["ahead of it, dB"].error == pytest.approx(gains.std(ddof=1) / 3**0.5)
+    results = tables.table_of_results(runs)
+    assert [row[0] for row in results.rows].count("gp (baseline)") == 3
+    assert warnings(runs) == [
+        "the baseline gp and gsparc do not differ in psnr_db (gsparc +0.17 ± 0.23 dB over 3 draws)"
+    ]
+
+
+def test_a_sweep_of_seeds_did_not_say_that_the_split_is_one(three):
+    assert "on the same split: split.seed draws others" in tables.table_of_seeds(find_runs(three)).note
+
+
+def test_one_model_had_two_latencies_and_a_note_in_the_report_alone(three):
+    runs = find_runs(three)
+    notes = [tables.table_of_seeds(runs).note, tables.table_of_results(runs).note]
+    assert all("a run's own table has other milliseconds" in note for note in notes)

@@ -1,6 +1,7 @@
 """Mirror planes that several static ends share: found by all, and of use to one that was never heard."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,11 +18,12 @@ from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.probe import Probe
+from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Direct, Images, Isotropic, Noise
 from gsparc.models.channels.terms.term import Frame
 from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import reflect
+from gsparc.processes.worker import Cancelled, cancel_when
 from gsparc.simulate.shoebox import Room, mirror_images
 
 K = 2 * np.pi / WAVELENGTH
@@ -140,3 +142,10 @@ def test_walls_of_a_room_are_found_together_and_serve_an_antenna_never_heard():
     assert errors[1] < 0.5 * errors[0]
     assert unheard[1] < 0.5 * unheard[0]
     assert len(field.objects().planes) >= 4
+
+
+def test_blocks_of_candidates_did_not_look_at_the_clock():
+    """A search for where the static end is took a third of what followed the end of the seconds."""
+    probes = [SimpleNamespace(group=range(5))]
+    with cancel_when(lambda: True), pytest.raises(Cancelled):
+        likelihood_gains(probes, 7, lambda *unused: pytest.fail("a block"), (1.0,))
