@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ TILTED = (
     "antenna tilts are given, but no heights, so that all is at 0 m: give a column Height in the list of "
     "stations and dataset.columns.height=1.5 for places, or expect no more of the tilts than of azimuths"
 )
-SETTING = re.compile(r"dataset\.([\w.]+)=(.*)", re.DOTALL)
+UNUSED = ("_target_", "name", "batch_size", "align", "file")  # of conf/dataset/own.yaml, by check
 
 
 def check(
@@ -61,7 +61,9 @@ def check(
     if stations is not None and stations.sector is not None and (abs(stations.sector[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
-    for topic, sentence in [*topics, *(("warning", warning) for warning in group_warnings(warnings))]:
+    topics += [("warning", warning) for warning in group_warnings(warnings)]
+    doubts = sum(topic in ("warning", "units?", "outliers?") for topic, _ in topics)
+    for topic, sentence in topics:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
@@ -78,7 +80,8 @@ def check(
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
         return False
-    _line(console, f"{path}: good")
+    verdict = f"readable, but see its {doubts} warning{'s' * (doubts > 1)}" if doubts else "good"
+    _line(console, f"{path}: {verdict}")
     return True
 
 
@@ -87,46 +90,61 @@ def _line(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True, emoji=False)
 
 
-def _value(text: str) -> Any:
-    """A setting's numbers, truth value or word."""
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    words = [one.strip() for one in text.strip("[]").split(",")] if text.startswith("[") else [text]
-    try:
-        values: list[Any] = [float(one) for one in words]
-    except ValueError:  # words as they are: a path has dots, a level may have its unit
-        values = words
-    return values if text.startswith("[") else values[0]
+def read_settings(words: Sequence[str]) -> dict[str, Any]:
+    """Return the settings of conf/dataset/own.yaml with `words` like dataset.absent=silent, as training does.
+
+    Raises:
+        HydraException, OmegaConfBaseException: what cannot be read, or no such setting.
+    """
+    import hydra  # here: a second that --help does without
+    from omegaconf import OmegaConf
+
+    with hydra.initialize_config_module("gsparc.conf", version_base="1.3"):
+        node = hydra.compose("dataset/own", overrides=["dataset.file=", *words]).dataset
+    settings: dict[str, Any] = OmegaConf.to_container(node, resolve=True)  # type: ignore[assignment]
+    return settings
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; exit status 0 when everything given is good, else 1."""
-    parser = argparse.ArgumentParser(prog="gsparc check", description=__doc__)
+    own = files("gsparc.conf").joinpath("dataset/own.yaml").read_text(encoding="utf-8")
+    told = f"settings dataset.KEY=VALUE, as training takes them:\n\n{own[own.index('cell_m') :]}"
+    parser = argparse.ArgumentParser(
+        prog="gsparc check", description=__doc__, epilog=told,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     add = parser.add_argument
     kinds = "npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the RFID release"
-    add("path", nargs="+", help=kinds)
+    add("path", nargs="+", metavar="FILE|dataset.KEY=VALUE", help=kinds)
     add("--stations-file", help="of a table: a second one that lists the stations")
     add("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
     add("--no-draw", action="store_true", help="no map of places, levels and what looks wrong")
     args = parser.parse_intermixed_args(arguments)
-    columns, settings = dict[str, str](), dict[str, Any]()
-    for said in filter(None, map(SETTING.fullmatch, args.path[:])):  # as refusals and notes say them
-        args.path.remove(said[0])
-        if said[1] == "stations_file":
-            args.stations_file = said[2]
-        elif said[1].startswith("columns."):
-            columns[said[1].removeprefix("columns.")] = said[2]
-        else:
-            settings[said[1]] = _value(said[2])
-    if not args.path:
+    words = [word for word in args.path if word.startswith("dataset.") and "=" in word]
+    paths = [path for path in args.path if path not in words]
+    settings: dict[str, Any] = {"stations_file": args.stations_file}
+    if words:  # as refusals and notes say them
+        from hydra.errors import HydraException
+        from omegaconf.errors import OmegaConfBaseException
+
+        from gsparc.evaluation.console import error_in_one_line
+
+        try:
+            said = read_settings(words)
+        except (HydraException, OmegaConfBaseException) as error:
+            _line(Console(stderr=True), f"error: {error_in_one_line(error)}")
+            return 1
+        paths += [said["file"]] if said["file"] else []
+        said["stations_file"] = said["stations_file"] or args.stations_file
+        settings = {name: value for name, value in said.items() if name not in UNUSED}
+    if not paths:
         parser.error("name a file or a folder, too")
-    if args.draw is not None and (len(args.path) > 1 or not args.draw.lower().endswith(".png")):
+    if args.draw is not None and (len(paths) > 1 or not args.draw.lower().endswith(".png")):
         parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
     console = Console()
 
     def picture(path: str) -> str | None:
         return None if args.no_draw else args.draw or f"outputs/check/{Path(path).resolve().stem}.png"
 
-    given = {"columns": columns, "stations_file": args.stations_file, **settings}
-    good = [check(path, console, draw=picture(path), **given) for path in args.path]
+    good = [check(path, console, draw=picture(path), **settings) for path in paths]
     return 0 if all(good) else 1

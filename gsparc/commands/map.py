@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_geotiff
+from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
@@ -82,14 +82,21 @@ def task(config: DictConfig) -> dict[str, Any]:
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
+    tiff = check_geotiff(config.geotiff)
     for layer in list_layers(field):
         for suffix in SUFFIXES:
             name = file_name(layer, suffix)
             if any(fnmatch(name, one) for one in wanted):
-                draw_layer(field, layer, run_dir / name, title, floor)
+                of_one = layer.name in {f"power {station}" for station in field.stations}
+                folder = run_dir / "stations" if of_one else run_dir
+                folder.mkdir(exist_ok=True)
+                draw_layer(field, layer, folder / name, title, floor)
         if layer.words:
             write_samples(run_dir / file_name(layer, ".csv"), layer.class_table())
-    if check_geotiff(config.geotiff):
+        if layer.words and tiff:
+            where = run_dir / file_name(layer, ".tif")
+            write_classes(where, field, predictor.site.georeference, layer.values, layer.words, layer.table())
+    if tiff:
         write_geotiff(run_dir / "map.tif", field, predictor.site.georeference)
     facts = {
         **field.summarise(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,

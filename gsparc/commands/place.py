@@ -58,7 +58,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         f"now {found.before:.1%} of the area with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
         f"with a station at {where}: {found.coverage[0]:.1%} "
-        f"(90 % interval {found.low[0]:.1%} to {found.high[0]:.1%})",
+        f"(90 % interval {found.low[0]:.1%} to {found.high[0]:.1%}), a gain of "
+        f"{found.coverage[0] - found.before:.1%} ({found.low[0] - found.before:.1%} to "
+        f"{found.high[0] - found.before:.1%})",
     ]
     if error.stations:
         lines[-1] += f", which counts how far {error.stations} stations left out were off as a whole"

@@ -377,7 +377,8 @@ def task(config: DictConfig) -> float:
                 draw = "" if config.split.get("seed") is None else f" (split.seed={config.split.seed})"
                 title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
-                show_result(run_dir, table, lines=summary.remarks(facts, config.eval_on))
+                tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
+                show_result(run_dir, *[table] * tested, lines=summary.remarks(facts, config.eval_on))
     figure = main_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:

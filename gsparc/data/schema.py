@@ -56,6 +56,12 @@ class Stations:
     def __len__(self) -> int:
         return len(self.position)
 
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """(T,) label and name, or the name where that is all, for people."""
+        pairs = zip(self.label or self.name, self.name, strict=True)
+        return tuple(own if own == name else f"{own} ({name})" for own, name in pairs)
+
     def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
         optional = (self.rotation, self.carrier_hz, self.sector)

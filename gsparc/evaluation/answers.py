@@ -46,6 +46,7 @@ class Answers:
     Attributes:
         place: (N,) int64, row of the places.
         station: (N,) names; None where the model has no stations.
+        cell: (N,) the same as a list of cells calls them; None where that is no other name.
         mean: (N, ...) in the predictor's unit.
         variance: (N,) float64, expected squared error per entry; None where the method has none.
         confidence: (N,) float32; None where the method has none.
@@ -53,6 +54,7 @@ class Answers:
 
     place: np.ndarray
     station: np.ndarray | None
+    cell: np.ndarray | None
     mean: np.ndarray
     variance: np.ndarray | None
     confidence: np.ndarray | None
@@ -191,7 +193,8 @@ def predict_places(
     variance, confidence = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
     rows = rows[order]
     names = None if stations is None else np.array(stations.name)[number[rows]]
-    return Answers(row[rows], names, whole.mean.numpy(), variance, confidence)
+    cells = None if stations is None or stations.label is None else np.array(stations.label)[number[rows]]
+    return Answers(row[rows], names, cells, whole.mean.numpy(), variance, confidence)
 
 
 def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
@@ -263,7 +266,8 @@ def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]
         axes = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
         for axis, values in zip(axes, where.all().T, strict=True):
             columns[before + axis] = values[predictions.place]
-    return columns if predictions.station is None else {**columns, "station": predictions.station}
+    columns |= {} if predictions.station is None else {"station": predictions.station}
+    return columns if predictions.cell is None else {**columns, "cell": predictions.cell}
 
 
 def _in_order(
@@ -271,16 +275,21 @@ def _in_order(
 ) -> dict[str, np.ndarray]:
     """The columns of a table of places in its order, those that were not read as they are, then the rest."""
     ordered: dict[str, np.ndarray] = {}
+    taken: list[str] = []
     for head, role, words in queries.table:
         # With one end that moves columns have no prefix; "^$" takes nothing away.
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
-        known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*ordered}]
+        known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*taken}]
         if role is not None and known:
-            ordered[known[0]] = columns[known[0]]
+            # Coordinates as they were written: 48.191910 is no 48.19191 to a join.
+            given = axis not in ("station", "row_name")
+            taken.append(known[0])
+            ordered[head if given else known[0]] = words[predictions.place] if given else columns[known[0]]
         elif role is None:
             # A user's own column called like one of ours keeps its words under another head.
             ordered[f"{head} (given)" if head in columns else head] = words[predictions.place]
-    return {**ordered, **{name: values for name, values in columns.items() if name not in ordered}}
+    rest = {name: values for name, values in columns.items() if name not in taken}
+    return {**ordered, **rest}
 
 
 def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:

@@ -142,6 +142,10 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
         return f"{_first(error)} {_first(cause)}"
     known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
+    groups = cause.parent_node.items_ex(resolve=False) if OmegaConf.is_dict(cause.parent_node) else ()
+    for group in [k for k, node in groups if OmegaConf.is_dict(node) and key in node]:
+        # Such as a column's quantity, which is no setting of the dataset.
+        return f"{full}: no such setting; did you mean '{prefix}{dot}{group}.{key}'?"
     hint = suggest_or_list(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
     hint = "; say hydra/launcher=joblib, too, or ray" if prefix == "hydra.launcher" else hint
     return f"{full}: no such setting{hint}"

@@ -92,12 +92,15 @@ def sensitivity_levels(data: Measurements) -> np.ndarray | None:
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """RMSE [dB] of all rows, silent ones by what predictions exceed their level; empty where none is.
+    """RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number, if any.
 
     That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
     """
     error = errors_with_silent(scores.samples, scores.row, data).get("error_db_with_silent")
-    return {} if error is None else {WITH_SILENT: float(np.sqrt(np.nanmean(error**2)))}
+    if error is None:
+        return {}
+    silent = int((data.censored_side(scores.row) > 0).sum())
+    return {WITH_SILENT: float(np.sqrt(np.nanmean(error**2))), "silent_samples": silent}
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:

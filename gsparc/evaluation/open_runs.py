@@ -142,6 +142,16 @@ def open_files(
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
+def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> Measurements:
+    """Return the measurements of another file, read with the settings of a model's data, in its coordinates.
+
+    Raises:
+        ValueError: the file, or the settings, cannot be read.
+    """
+    module = datamodule(_settings("dataset", stored, {"file": str(path)}), trusted=False)
+    return align_to_site(module.measurements, stored.site)
+
+
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
     """The checkpoint's settings of a config group under the ones given now (those that are not null).
 

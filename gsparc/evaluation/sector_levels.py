@@ -50,7 +50,7 @@ def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, pat
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.pattern_loss(at)).median())
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
-        axis.set(title=f"{data.site.stations.name[t]}, {float(trend.table[t, 0]):.0f} deg", xlim=(-180, 180))
+        axis.set(title=f"{data.site.stations.shown[t]}, {float(trend.table[t, 0]):.0f} deg", xlim=(-180, 180))
         axis.set_xticks([-180, -90, 0, 90, 180])
     for axis in axes.flat[len(chosen) :]:
         axis.set_visible(False)

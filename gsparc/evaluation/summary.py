@@ -141,9 +141,9 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
     made, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
-    named = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
-    learned = str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
-    lines = [f"{label}: {text}" for text in named] + [f"  {note}" for note in learned]
+    said = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
+    said += str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
+    lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(said)]
     folds = facts.get("split/folds") or 1
     return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import pandas as pd
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions
 from rich.table import Table as RichTable
 
 Row = Mapping[str, Any]  # of results, see `results.rows_of`
@@ -154,14 +157,55 @@ class Table:
         note = f"\n{self.note}\n" if self.note else ""
         return f"### {self.title}\n{note}\n" + "\n".join([first, rule, *lines]) + "\n"
 
-    def __rich__(self) -> RichTable:
-        """Return what a console shows; words are broken where they are wider than it, never cut."""
-        result, (heads, rows) = RichTable(title=self.title, caption=self.note or None), self.texts()
-        for column, head in zip(self.columns, heads, strict=True):
-            result.add_column(head, justify="right" if column.form else "left", overflow="fold")
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RichTable]:
+        """Yield what a console shows: no column of dashes, and words whole where it is wide enough for them.
+
+        Words are broken where they are wider than it, never cut.
+        """
+        heads, rows = self.texts()
+        shown = [i for i in range(len(heads)) if not rows or any(row[i] != "-" for row in rows)]
+        least = {i: _longest([*HEAD_PART.findall(heads[i]), *_words(row[i] for row in rows)]) for i in shown}
+        fits = sum(least.values()) + RULE * len(shown) < options.max_width
+        natural = sum(max(map(cell_len, (heads[i], *(row[i] for row in rows)))) for i in shown)
+        narrow = fits and natural + RULE * len(shown) >= options.max_width
+        result = RichTable(title=self.title, caption=self.note or None)
+        for i in shown:
+            cells = max((cell_len(row[i]) for row in rows), default=0)
+            # Words leave room to heads, numbers are as wide as they are.
+            head = wrap_head(heads[i], max(least[i], cells if self.columns[i].form else 0))
+            result.add_column(
+                head if narrow else heads[i], justify="right" if self.columns[i].form else "left",
+                overflow="fold", min_width=least[i] if narrow else None,
+            )  # fmt: skip
         for row in rows:
-            result.add_row(*row, style="bold" if row[0] == self.bold else None)
-        return result
+            result.add_row(*(row[i] for i in shown), style="bold" if row[0] == self.bold else None)
+        yield result
+
+
+HEAD_PART = re.compile(r"[^ _]+_?")
+RULE = 3  # characters beside each cell: two spaces and a line
+
+
+def _words(cells: Iterable[str]) -> list[str]:
+    return [word for cell in cells for word in cell.split()]
+
+
+def _longest(words: Iterable[str]) -> int:
+    return max(map(cell_len, words), default=0)
+
+
+def wrap_head(head: str, width: int) -> str:
+    """Return a heading in lines of some characters, broken behind spaces and underscores.
+
+    >>> wrap_head("reduced_chi2", 8)
+    'reduced_\\nchi2'
+    """
+    lines = [""]
+    for part in re.findall(r"[^ _]+[ _]?", head):
+        if lines[-1] and cell_len(lines[-1] + part.rstrip()) > width:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def to_text(value: float | None, form: str) -> str:

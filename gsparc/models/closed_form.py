@@ -58,10 +58,11 @@ class ClosedForm(Method):
     Attributes:
         held: rows of groups, predicted by searches that left their group out; None where none did.
         forgets: whether `condition` on other rows leaves nothing of earlier ones but a few numbers.
+        asks_visibility: whether a fit hangs on the switch of that name.
     """
 
     held: LeftOutRows | None = None
-    forgets = False
+    forgets = asks_visibility = False
 
     @property
     def count_gaussians(self) -> int:

@@ -64,12 +64,17 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
             why = "spectra of a moving array hide nothing" if hides else why
             raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
         reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
-        if kind is Channels and site.phase_reference != "neighbours":
+        if site.phase_reference == "neighbours":
+            options = []  # whatever is said, it is one process
+        elif kind is Channels:
             why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
             reasons.append(f"the residual is all there is: {why}")
         method = settings.create_as(import_path(kind))
         if rendered:
             options += ["init.name"] * (init.name in ("auto", "diffuse"))
+            options += ["model.effects.image"] * (switches.image is True and site.kind == "csi")
+        # Mixtures count it where a candidate hangs on it; powers always have their process.
+        options += ["model.effects.residual"] * (rendered or (kind is Channels and plain))
     heeded.count_reads(*options)
     for reason in reasons:
         log.info("%s", reason)

@@ -23,8 +23,9 @@ class EffectSettings(Checked):
         moving_array: the same of a receiver that moves, in powers: sources seen through the array's lags.
         phase: carrier phase from places of sources, for channels.
         power: distance law in decibels and known walls along the path, for received powers.
-        visibility: what hides: occluding boxes and finite mirrors of sources, known walls of powers and, of
-            several stations, shadowing of a place; rasterized Gaussians always occlude each other.
+        visibility: what hides: occluding boxes and finite mirrors of sources, which receivers measured
+            directions point to, known walls of powers and, of stations never heard, shadowing of a place;
+            rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 
@@ -83,8 +84,7 @@ def resolve_terms(
         "phase": phase_obstacle(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.kind == "rssi" else f"the target is {site.kind}",
     }
-    # Powers always have their process: there the switch means nothing.
-    on, reasons, options = {}, [], [] if site.kind == "rssi" else ["model.effects.residual"]
+    on, reasons, options = {}, list[str](), list[str]()
     for name, obstacle in obstacles.items():
         switch = getattr(switches, name)
         if switch is True and obstacle is not None:
@@ -97,7 +97,7 @@ def resolve_terms(
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True
-    options += ["model.effects.image", "model.loss.snapshot"] if site.kind == "csi" else []
+    options += ["model.loss.snapshot"] if site.kind == "csi" else []
     obstacle = obstacles["phase"]
     return Terms(
         **on, rendered=rendered, obstacle=obstacle, reasons=tuple(reasons), options=tuple(options)

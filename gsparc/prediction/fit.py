@@ -94,6 +94,12 @@ def fit(
 
 def _raw_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:
     """Arrays of the schema with powers in a unit: watts, or decibels as they are."""
+    stations = powers.shape[1] if powers.ndim == 2 else 1
+    for end in ("rx", "tx"):
+        shape = arrays.get(f"{end}_position", np.zeros(0)).shape
+        if 1 < stations != len(powers) and shape[:1] == (stations,) and len(shape) == 2:
+            said = f"{end} and rssi are of {stations} stations: say station_position= in place of {end}="
+            raise DataError(f"gsparc.fit: {said}")
     unknown = unit in ("dB", LINEAR)  # what they refer to
     given = PowerUnit.from_name(str(unit), "dB" if unknown else "dBW")
     if given.decibels:

@@ -102,8 +102,12 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
         stays = not wandb.login(prompt=False) if offline is None else offline
         mode = "offline" if stays else None
     given = {name: value for name, value in settings.items() if value}
-    # As an argument: Lightning's `offline` sets a variable that wandb, once asked for a login, does not read.
-    return WandbLogger(offline=mode == "offline", **{**_job_tags(), **given, "mode": mode})
+    # `mode` as an argument: Lightning's `offline` sets a variable that wandb, asked for a login, warns of
+    # and does not read; of `anonymous` it warns whatever the value.
+    logger = WandbLogger(offline=mode == "offline", **{**_job_tags(), **given, "mode": mode})
+    logger._offline = False
+    logger._wandb_init.pop("anonymous", None)
+    return logger
 
 
 def _job_tags() -> dict[str, Any]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gsparc.commands.check import _value, check, main
+from gsparc.commands.check import check, main, read_settings
 from gsparc.data.load import load
 from gsparc.data.own import write_own
 
@@ -140,8 +140,53 @@ def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("./x", "./x"), ("[A,B]", ["A", "B"]), ("-50dBm", "-50dBm"), ("[1, 2e3]", [1, 2000]), ("2.4e9", 2.4e9)],
+    [("./x", "./x"), ("[A,B]", ["A", "B"]), ("-50dBm", "-50dBm"), ("[1, 2e3]", [1, 2000]), ("2.4e9", 2.4e9),
+     ("[]", []), ("null", None), ("{roof: [3]}", {"roof": [3]})],
 )  # fmt: skip
 def test_a_setting_with_dots_or_a_unit_was_a_number(text, value):
-    """`dataset.root=./x` ended in a traceback, `2.4GHz` was 2.4."""
-    assert _value(text) == value
+    """`dataset.root=./x` ended in a traceback, `2.4GHz` was 2.4; `[]` was a list of an empty word."""
+    assert read_settings([f"dataset.not_heard={text}"])["not_heard"] == value
+
+
+def _table(path):
+    rng = np.random.default_rng(0)
+    rows = [f"{x:.2f},{y:.2f},{-100 if x < 20 else -60 - x:.1f}" for x, y in rng.uniform(0, 30, (60, 2))]
+    path.write_text("x,y,lev\n" + "\n".join(rows) + "\n")
+    return str(path)
+
+
+def test_unknown_settings_were_taken_for_conventions(tmp_path, capsys):
+    """dataset.sensitivity_db=-111, advised by a warning, was to be true, false or null."""
+    file = _table(tmp_path / "a.csv")
+    assert main([file, "--no-draw", "dataset.columns.rssi_db=lev", "dataset.sensitivity_db=-111"]) == 1
+    said = capsys.readouterr().err
+    assert "dataset.sensitivity_db: no such setting; did you mean 'dataset.columns.sensitivity_db'?" in said
+    assert main([file, "--no-draw", "dataset.not_hard=[]"]) == 1
+    assert "did you mean 'dataset.not_heard'?" in capsys.readouterr().err
+
+
+def test_settings_of_training_were_refused_by_check(tmp_path, capsys):
+    """not_heard=[] was refused, columns={...} ended in a traceback, max_rows was no convention."""
+    said = ["dataset.columns={rssi_db: lev}", "dataset.not_heard=[]", "dataset.max_rows=50"]
+    assert main(["--no-draw", f"dataset.file={_table(tmp_path / 'a.csv')}", *said]) == 0
+    told = capsys.readouterr().out
+    assert "50 received powers" in told and "taken as not heard" not in told
+
+
+def test_help_named_no_setting(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    told = capsys.readouterr().out
+    assert "absent: auto" in told and "columns:" in told and "dataset.KEY=VALUE" in told
+
+
+def test_a_file_in_radians_ended_in_good(tmp_path):
+    """Arrays have no heads to say so in, and the doubt was a note among others."""
+    rng = np.random.default_rng(0)
+    places = {name: np.radians(rng.uniform(48, 48.1, 50)) for name in ("latitude", "longitude")}
+    arrays = {**places, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
+    np.savez(tmp_path / "a.npz", **arrays)
+    good, text = _said(tmp_path / "a.npz")
+    assert good and "a.npz: readable, but see its 1 warning\n" in text
+    assert "warning     the places lie in the Gulf of Guinea" in text
+    assert "radians? write degrees, or [rad] in the heads of a table" in text

@@ -49,7 +49,10 @@ def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path
     facts = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (facts["split/train"] + facts["split/val"], facts["split/test"]) == (80, 0)
     assert facts["time/train_s"] > 0 and not any(name.startswith(("test/", "baseline/")) for name in facts)
-    assert "nothing was tested: all 80 rows were learned from (split=none)" in "\n".join(done.out)
+    said = "\n".join(done.out)
+    assert "nothing was tested: all 80 rows were learned from (split=none)" in said
+    # A count of three parts stood above it, and a table of dashes.
+    assert "all 80 rows are learned from (8 decide" in said and "rmse_db" not in said
     own = {"name": "own", "file": str(file)}
     found, _, _ = evaluate_files([tmp_path / "run" / "model.ckpt"], own, eval_on="val")
     assert found.facts["val/rmse_db"] < 1  # an interpolator of rows that it has learned

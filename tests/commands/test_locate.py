@@ -11,6 +11,7 @@ from campaigns import compose, powers, spectra
 from PIL import Image
 
 from gsparc.commands.locate import locate
+from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
 
 UNPLACED = {"x", "y", "z", "area_m2", "modes"}
@@ -65,6 +66,21 @@ def test_a_file_without_places_is_located_too(trained, tmp_path):
     assert len(rows) == 3 and set(rows[0]) == UNPLACED
     found = np.stack([column(rows, axis) for axis in "xyz"], 1)
     assert np.median(np.linalg.norm(found - true, axis=1)) < 0.3
+
+
+def test_a_table_was_refused_and_after_the_calibration(tmp_path):
+    """Rows of another file were npz alone, though training reads tables."""
+    rng = np.random.default_rng(0)
+    place = rng.uniform(0, 30, (120, 2))
+    level = -40 - np.linalg.norm(place[:, None] - [[0, 0], [30, 0], [15, 30]], axis=2)
+    rows = [",".join(f"{value:.2f}" for value in row) for row in np.hstack([place, level])]
+    for name, part in (("a", rows[:100]), ("b", rows[100:])):
+        (tmp_path / f"{name}.csv").write_text("x,y,AP1,AP2,AP3\n" + "\n".join(part) + "\n")
+    ckpt = towns.trained(tmp_path / "a.csv", "gp")
+    facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/b.csv'", "calibrate=0")
+    assert len(found) == 20 and facts["locate/median_m"] < 3
+    with pytest.raises(DataError, match="no such file"):  # at once
+        located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/c.csv'")
 
 
 def test_nobody_is_located_in_a_wall(trained, tmp_path):

@@ -40,7 +40,8 @@ def mapped(model, tmp_path_factory):
 
 def test_every_layer_and_a_table(mapped):
     folder, said = mapped
-    layers = ("power", "best_server", "sinr", "outage", "expected_error", "width", "power_west", "power_east")
+    layers = ("power", "best_server", "sinr", "outage", "expected_error", "width", "stations/power_west",
+              "stations/power_east")  # fmt: skip
     assert all((folder / f"{name}.png").stat().st_size > 5000 for name in layers)
     facts = json.loads((folder / "summary.json").read_text())
     assert facts["promise/calibrated"] == 1 and 0.8 < facts["promise/held/share"] <= 1

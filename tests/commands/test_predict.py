@@ -99,7 +99,7 @@ def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
     assert any("60 places, 2 stations" in line for line in done.out), done
     found = read(tmp_path / "places.predicted.csv")
     given = read(drive.places)
-    assert [row["latitude"] for row in found[::2]] == [row["Latitude"] for row in given]  # every digit
+    assert [row["Latitude"] for row in found[::2]] == [row["Latitude"] for row in given]  # every digit
     level, spread = (column(found, name).reshape(-1, 2) for name in ("rssi_db", "rssi_db_std"))
     error = np.sqrt(np.mean((level - drive.level_db) ** 2, axis=0))
     naive = np.sqrt(np.mean((drive.learned_db.mean(axis=0) - drive.level_db) ** 2, axis=0))
@@ -111,10 +111,19 @@ def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path
     place = [[5, 5, 1.5]]
     (own,) = answered(town, tmp_path, ["x", "y", "z"], place, station="mast")
     monkeypatch.setitem(vars(town.site.stations), "label", ("A-1", "A-2", "B-1"))
-    assert answered(town, tmp_path, ["x", "y", "z"], place, station="B-1") == [own]
+    assert answered(town, tmp_path, ["x", "y", "z"], place, station="B-1") == [{**own, "cell": "B-1"}]
     listed = answered(town, tmp_path, ["x", "y", "z", "station"], [[*place[0], "B-1"]])
     assert [row["rssi_db"] for row in listed] == [own["rssi_db"]]
     assert town.select_station("B-1").site.static_position is not None
+
+
+def test_coordinates_were_written_anew_under_other_heads(valley, tmp_path):
+    """Latitude came back as latitude, 47.003000 as 47.003."""
+    (row,) = answered(
+        valley, tmp_path, ["Longitude", "Latitude", "Height"], [["11.0010", "47.003000", "2.0"]]
+    )
+    assert [*row.items()][:3] == [("Longitude", "11.0010"), ("Latitude", "47.003000"), ("Height", "2.0")]
+    assert [*row][3:5] == ["station", "rssi_db"]
 
 
 def test_every_station_of_every_place(town, tmp_path):
@@ -220,8 +229,8 @@ def test_degrees_metres_and_arrays_are_one_place(valley, tmp_path):
         answered(valley, tmp_path, ["X [km]", "Y [km]", "Z [km]"], metres / 1e3),
         *(read(predict_file(valley, tmp_path / name)["out"]) for name in ("c.npz", "d.npz")),
     ]
-    assert column(found[0], "latitude").tolist() == column(found[2], "latitude").tolist() == [47.003, 47.006]
-    assert np.allclose(column(found[1], "x"), metres[:, 0]) and "latitude" not in found[3][0]
+    assert column(found[0], "lat").tolist() == column(found[2], "latitude").tolist() == [47.003, 47.006]
+    assert np.allclose(1e3 * column(found[1], "X [km]"), metres[:, 0]) and "latitude" not in found[3][0]
     for other in found[1:]:
         assert np.allclose(column(other, "rssi_db"), column(found[0], "rssi_db"), atol=1e-3)
     expected = valley.select_station(0).rssi(rx=metres)
@@ -413,4 +422,4 @@ def test_an_end_that_stood_still_is_where_it_was(town, tmp_path, caplog):
     heads = ["rx_x", "rx_y", "rx_z", "tx_x", "tx_y", "tx_z"]
     found = answered(town, tmp_path, heads, [[5, 5, 1.5, 9, 9, 9]], station="mast")
     assert "not used: coordinates of the transmitter; that end is where it was measured" in caplog.text
-    assert len(found) == 1 and column(found, "x")[0] == 5
+    assert len(found) == 1 and column(found, "rx_x")[0] == 5

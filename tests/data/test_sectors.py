@@ -117,3 +117,29 @@ def test_slots_of_neighbours_become_rows(tmp_path):
     data = reading.data
     assert set(data.site.stations.name) == {str(c + 10) for c in np.unique(order)} | set()
     assert (data.censored == 0).sum() == 299 and "299 rows of 100 moments" in " ".join(reading.notes)
+
+
+@pytest.mark.parametrize("form", ["{}", "PCI {}", "{}_RSRP", "RSRP {} [dBm]"])
+def test_heads_that_hold_a_number_of_the_list_name_its_cells(tmp_path, form):
+    """Of heads 101, PCI 101 and 101_RSRP there was no column of levels, or a line for each cell."""
+    one, _, heads, sites = drive_of(tmp_path)
+    count, moments = 15, slice(60)
+    rows = np.hstack([one.moment[moments, :2].round(2), one.measured[moments, :count].round(1)])
+    drive = write(tmp_path / "wide.csv", ["x", "y", *(form.format(100 + c) for c in range(count))], rows)
+    listed = write(tmp_path / "s.csv", heads, [[*s[:2], 100 + s[2], *s[3:]] for s in sites[:count]])
+    stations = read_any(drive, stations_file=listed).data.site.stations
+    assert stations.name == tuple(str(100 + c) for c in range(count)) and stations.label[4] == "S1_1"
+    wrong = write(tmp_path / "w.csv", ["x", "y", *(f"AP{c}" for c in range(count))], rows)
+    with pytest.raises(DataError) as refused:
+        read_any(wrong, stations_file=listed)
+    assert len(refused.value.problems) == 1 and "'AP4' and 10 more are no listed" in str(refused.value)
+
+
+def test_levels_without_the_suffix_of_the_others_are_named(tmp_path):
+    """Of a release the fixed stations, without _rss, were `and 27 more` of what is not used."""
+    one = network(0)
+    rows = np.hstack([one.moment[:60, :2].round(2), one.measured[:60, :5].round(1), np.full((60, 1), -1)])
+    drive = write(tmp_path / "a.csv", ["x", "y", "a_rss", "b_rss", "c", "d", "noise", "z_rate"], rows)
+    notes = [note for note in read_any(drive).notes if isinstance(note, Caution)]
+    said = "columns 'c' and 'd' hold values like these levels and are not used: of stations, too?"
+    assert any(note.startswith(said) for note in notes), notes

@@ -99,9 +99,9 @@ CASES = {
     "columns that are said": (long("site,antenna", 7 + 0 * BAND, BAND),
         {"columns": {"station": "site+antenna"}}, "2 stations, 2 of", ""),
     "streets of one cell": (long("site,street", "a" * ROWS, np.digitize(PLACES[:, 0], [15, 30, 45])), {},
-        "1 stations", "warning"),
+        "1 station,", "warning"),
     "hopping": (long("gateway,freq_mhz", ["g"] * ROWS, RNG.choice([867.1, 868.1, 868.5], ROWS)), {},
-        "1 stations", "warning"),
+        "1 station,", "warning"),
     "a banner with a role in it": (
         "WigleWifi-1.6,model=x,device=x,display=kismet\n"
         + table(
@@ -228,7 +228,7 @@ STRANGERS = {
     "c02_half_null.csv": "lines 2 to 208:", "c03_minus.csv": "3 stations", "c03_survey.csv": "3 stations",
     "c06_pci.csv": "3 stations", "c06_dms.csv": "3 stations", "c06_nmea.csv": "NMEA",
     "c07_uji.csv": "dataset.columns.x=LONGITUDE", "c08_gw_null.csv": "ttn-roof-3: no fix",
-    "c11_us915.csv": "1 stations", "silent_100.csv": "514 of 720 levels are exactly 100",
+    "c11_us915.csv": "1 station,", "silent_100.csv": "514 of 720 levels are exactly 100",
     "c10_ampphase.csv": "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx",
 }  # fmt: skip
 

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from gsparc.data.errors import Caution, DataError
 from gsparc.data.own import interpret
 from gsparc.data.tables.heads import parse_head
 from gsparc.data.tables.read import parse_table
@@ -362,3 +363,31 @@ def test_parquet_without_pyarrow(write, refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     says = r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"
     refused(says, parse_table, write(b"PAR1", "drive.parquet"))
+
+
+LOSSES = "u_cm,v_cm,loss_dB\n100,200,67\n150,250,71\n"
+
+
+def test_a_table_without_levels_and_coordinates_said_so_one_at_a_time(write):
+    with pytest.raises(DataError) as refused:
+        parse_table(write(LOSSES))
+    levels, coordinates = refused.value.problems
+    assert "no column of levels" in levels and "no coordinates among" in coordinates
+
+
+def test_a_factor_and_the_unit_of_a_head_turned_centimetres_twice(write):
+    given = {"x": "u_cm*0.01", "y": "v_cm", "rssi_db": "loss_dB*-1"}
+    table = parse_table(write(LOSSES), given)
+    doubts = [note for note in table.notes if isinstance(note, Caution)]
+    said = "column 'u_cm' times 0.01, then cm (by its head) into m: 100 in the file is 0.01 m; twice? "
+    assert doubts == [said + "dataset.columns.x=u_cm turns cm alone"]
+    assert "column 'v_cm': cm turned into m" in table.notes
+
+
+@pytest.mark.parametrize(
+    ("head", "unit"), [("loss_dB", "dB"), ("loss", "dB"), ("rsrp", "dBm"), ("level [dBm]", "dBm")]
+)
+def test_losses_became_dbm(write, head, unit):
+    table = parse_table(write(f"x,y,{head}\n1,2,67\n2,3,71\n"), {"rssi_db": f"{head}*-1"})
+    assert table.attributes["level_unit"] == unit and table.arrays["rssi_db"].tolist() == [-67, -71]
+    assert f"column '{head}' times -1: 100 in the file is -100 {unit}" in table.notes

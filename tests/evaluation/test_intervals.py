@@ -92,6 +92,8 @@ def test_silent_rows_counted_nowhere(drawn):
     squares = [float(np.square(one["error_db"][heard]).mean()) for one in (honest, other)]
     both = [replace(scored(data, mean_db, 6.0), samples=one) for one in (honest, other)]
     found = [rmse_with_silent(one, data)["rmse_db_with_silent"] for one in both]
+    # silent_samples was 0 where they count.
+    assert rmse_with_silent(both[0], data)["silent_samples"] == (~heard).sum() > 0
     assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 
 import gsparc.evaluation.summary
 from gsparc.evaluation.summary import (
+    describe_model,
     program_version,
     provenance,
     remarks,
@@ -64,7 +65,7 @@ def test_table_shows_no_accuracy_without_its_time():
     lines = [line for line in console.export_text().splitlines() if "│" in line]
     cells = [[cell.strip() for cell in line.strip("│ ").split("│")] for line in lines]
     assert [row[0] for row in cells] == ["zero", "gp", "gsparc"]
-    assert cells[2] == ["gsparc", "30.00", "-", "0.9123", "-", "-", "123", "1.25"]
+    assert cells[2] == ["gsparc", "30.00", "0.9123", "123", "1.25"]  # without columns of dashes alone
     assert cells[1][-2:] == ["0.5", "2.5"]
     facts |= {"test/reduced_chi2": 1.061, "baseline/gp/reduced_chi2": 3.0}
     heads, rows = results_table(facts, "gsparc").texts()
@@ -145,3 +146,22 @@ def test_a_baseline_was_better_by_chance_or_by_nothing():
 def test_a_report_of_an_installed_wheel_was_made_at_commit_none():
     assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program_version({"git": None}))
     assert program_version({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")
+
+
+def test_headings_were_broken_inside_words_and_columns_of_dashes_shown():
+    facts = {"dataset/kind": "csi", "test/nmse": 0.026, "test/snr_db": 18.7, "test/reduced_chi2": 0.6}
+    facts |= {"baseline/complex_gp/nmse": 0.9, "baseline/complex_gp/train_s": 7.79e-05, "time/train_s": 9.0}
+    shown = {}
+    for width in (200, 60):
+        console = Console(width=width, record=True, soft_wrap=True, file=open(os.devnull, "w"))  # noqa: SIM115
+        console.print(results_table(facts, "gsparc"))
+        shown[width] = console.export_text()
+    assert "reduced_chi2" in shown[200] and max(map(len, shown[60].splitlines())) < 60
+    for word in ("complex_gp", "reduced_", "chi2", "s/fold", "7.79e-05"):
+        assert word in shown[60]
+    assert "skill" not in shown[200] and "scalar" not in shown[60]
+
+
+def test_what_an_own_method_learned_stood_without_its_name():
+    facts = {"model/made": None, "model/label": "own", "model/learned": "ridge 0.001\nrows 9"}
+    assert describe_model(facts) == ["own: ridge 0.001", "  rows 9"]

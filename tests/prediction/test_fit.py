@@ -56,6 +56,14 @@ def test_stations_are_learned_as_a_file_has_them():
     assert np.array_equal(every[:, 1:], near) and found.rssi(rx=PLACES[0]).shape == (2,)
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_places_of_stations_given_as_an_end_were_refused_by_their_shape_alone(count):
+    wrong = {"tx": PLACES[:count], "rssi": np.tile(POWERS[:, None], count)}
+    said = f"gsparc.fit: tx and rssi are of {count} stations: say station_position= in place of tx="
+    with pytest.raises(DataError, match=f"^{said}$"):
+        gsparc.fit(rx=PLACES, **wrong)
+
+
 UNITS = {"dBm": lambda level: level, "dBW": lambda level: level - 30, "mW": lambda level: 10 ** (level / 10)}
 UNITS |= {"W": lambda level: 10 ** (level / 10 - 3), "pW": lambda level: 10 ** (level / 10 + 9)}
 

@@ -82,7 +82,7 @@ def test_searches_for_offsets_are_counted_by_the_same_clock_and_may_be_ended_by_
         budgets.append(budget)
         return found
 
-    monkeypatch.setattr(ImageSourceGP, "_search", ended)
+    monkeypatch.setattr(ImageSourceGP, "_run_searches", ended)
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     method = ImageSourceGP(searches=1, search_rows=60, clutter=False, offsets="phase_timing")
     report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e3, budget_clock="processor"))

@@ -1,11 +1,15 @@
 """Dashboards get settings, names, series, pictures and the final table; read back from what they wrote."""
 
 import json
+import os
 import struct
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -153,11 +157,25 @@ def sweep(tmp_path_factory) -> list[Path]:
 
 @pytest.mark.parametrize("offline", [None, True, False])
 def test_the_environment_s_mode_of_wandb_was_overridden_by_the_configuration(offline, monkeypatch):
-    said = {}
-    monkeypatch.setattr("lightning.pytorch.loggers.WandbLogger", lambda **settings: said.update(settings))
+    said, logger = {}, SimpleNamespace(_wandb_init={"anonymous": None})
+
+    def made(**settings):
+        said.update(settings)
+        return logger
+
+    monkeypatch.setattr("lightning.pytorch.loggers.WandbLogger", made)
     monkeypatch.setenv("WANDB_MODE", "disabled")
-    wandb_logger(offline)
+    assert wandb_logger(offline) is logger and not logger._wandb_init
     assert said["mode"] == "disabled" and not said["offline"]
+
+
+def test_wandb_warned_of_what_the_program_itself_had_said(tmp_path):
+    code = f"from gsparc.training.tracking import wandb_logger as w; w(save_dir={str(tmp_path)!r}).experiment"
+    env = {name: value for name, value in os.environ.items() if not name.startswith("WANDB")}
+    said = subprocess.run(
+        [sys.executable, "-c", code], env={**env, "HOME": str(tmp_path)}, capture_output=True, text=True
+    )
+    assert said.returncode == 0 and "WARNING" not in said.stderr, said.stderr
 
 
 def rises(steps) -> bool:

@@ -25,9 +25,10 @@ from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
+from gsparc.data.tables import is_table
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
+from gsparc.evaluation.open_runs import Opened, align_to_site, open_files, read_like_stored
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Table
@@ -142,6 +143,7 @@ def locate_by_model(
     east_north = data.site.origin[:2]
     light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
+    heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     field, count = SiteField(run.predictor), 0
     locator = Locator(field, cells(data.moving[learned][:, :3]), unknown, start, share)
     if config.calibrate:
@@ -149,9 +151,11 @@ def locate_by_model(
         locator = replace(locator, trust=trust)
         if config.store:
             update_extra(config.ckpt, locating.trust_state(trust, unknown, share))
-    heard, placed = _snapshots(config, run)
     located, trained, origin = locator.locate(heard), group_snapshots(data, learned), data.site.origin
     level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
+    if not config.calibrate and locating.KEY not in run.stored[0].extra:
+        promise += " by the model's own variances, which nothing tested (calibrate=0)"
+    promise += f"; {float(locator.cells.volume.sum()):.3g} m2 were searched"
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
@@ -185,6 +189,9 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     site, placed = run.data.site, True
     if config.data is None:
         heard = group_snapshots(run.data, rows_to_score(run.split.folds[0], config.eval_on))
+    elif is_table(config.data):
+        other = read_like_stored(run.stored[0], config.data)
+        heard = group_snapshots(other, np.arange(len(other)))
     else:
         raw, place = read_raw(config.data), f"{site.moving_end}_position"
         placed = place in raw.arrays

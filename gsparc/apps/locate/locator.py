@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numpy as np
@@ -19,6 +19,7 @@ from gsparc.apps.locate.posterior import Posterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
 from gsparc.apps.locate.site_field import Moments, SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
+from gsparc.data.executor import run_each
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
@@ -103,13 +104,15 @@ class Locator:
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
-        results = []
-        for number in range(len(heard)):
+
+        def one(number: int) -> Located:
             started = time.perf_counter()
             posterior = self.search_cells(heard.subset(np.array([number])), self.trust).posterior(self.trust)
             located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
-            results.append(replace(located, seconds=time.perf_counter() - started))
-        return results
+            return replace(located, seconds=time.perf_counter() - started)
+
+        found = dict(run_each(one, range(len(heard)), "snapshots"))
+        return [found[number] for number in range(len(heard))]
 
 
 def learn_trust(
@@ -136,7 +139,9 @@ def learn_trust(
     places = np.concatenate([heard.place for _, heard in pairs])
 
     def looks(trust: Trust) -> list[Search]:
-        return [without.search_cells(heard, trust) for without, heard in pairs]
+        asked = [partial(without.search_cells, heard, trust) for without, heard in pairs]
+        found = dict(run_each(lambda ask: ask(), asked, "snapshots that were left out"))
+        return [found[number] for number in range(len(pairs))]
 
     trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.

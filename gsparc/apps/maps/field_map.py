@@ -263,27 +263,67 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
     `outage`, `best_server` (number of the station; the band's tags name each), `server_chance`, and then the
-    power of each of several stations. The projection is the one that `Georeference` describes, azimuthal
-    equidistant about its place; without an `origin` there is none, and coordinates are metres.
+    power of each of several stations. Tags give unit, threshold, height and share.
     """
     import rasterio
-    from rasterio.transform import from_origin
 
     bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
     if len(raster.stations) > 1:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
-    left, _, _, high = raster.grid.extent
-    here = None if origin is None else f"+lat_0={origin.latitude!r} +lon_0={origin.longitude!r}"
-    place = None if here is None else f"+proj=aeqd {here} +datum=WGS84 +units=m +no_defs"
-    profile = {
-        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "count": len(bands),
-        "dtype": "float32", "crs": place, "nodata": float("nan"), "compress": "deflate", "tiled": True,
-        "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
+    profile = _profile(raster, origin, len(bands), "float32", float("nan"))
+    facts = {
+        "unit": raster.unit, "threshold_db": raster.threshold_db, "height_m": raster.grid.height,
+        "interval_share": raster.share, "coverage": "the mean of 1 - outage",
     }  # fmt: skip
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
+        file.update_tags(**facts)
         for number, (name, values) in enumerate(bands.items(), 1):
             # GeoTIFF rows go from north to south, ours from south to north.
             file.write(np.flipud(values).astype(np.float32), number)
             file.set_band_description(number, name)
             if name == "best_server":
                 file.update_tags(number, **{str(i): one for i, one in enumerate(raster.stations)})
+
+
+def write_classes(
+    path: str | Path, raster: FieldMap, origin: Georeference | None, number: np.ndarray,
+    names: Sequence[str], colours: np.ndarray,
+) -> None:  # fmt: skip
+    """Write numbers (ny, nx) of classes as whole numbers with a table of colours (k, 3), names as tags.
+
+    Beyond 255 classes they have 16 bits, and no table: GeoTIFF has none of that size.
+    """
+    import rasterio
+
+    small = len(names) < 255
+    kind, none = ("uint8", 255) if small else ("uint16", 65535)
+    values = np.flipud(np.where(np.isfinite(number), number, none)).astype(kind)
+    with (
+        whole_file(path) as partial,
+        rasterio.open(partial, "w", **_profile(raster, origin, 1, kind, none)) as file,
+    ):
+        if small:  # before the values, which fix what colours mean
+            file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
+        file.write(values, 1)
+        file.set_band_description(1, "best_server")
+        file.update_tags(1, **{str(i): one for i, one in enumerate(names)})
+
+
+def _profile(
+    raster: FieldMap, origin: Georeference | None, count: int, kind: str, none: float
+) -> dict[str, Any]:
+    """What rasterio is told of a file, in the projection of `Georeference`.
+
+    Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample them. Without
+    an `origin` coordinates are metres.
+    """
+    from rasterio.transform import from_origin
+
+    left, _, _, high = raster.grid.extent
+    here = None if origin is None else f"+lat_0={origin.latitude!r} +lon_0={origin.longitude!r}"
+    place = None if here is None else f"+proj=aeqd {here} +datum=WGS84 +units=m +no_defs"
+    return {
+        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "count": count,
+        "dtype": kind, "crs": place, "nodata": none, "compress": "deflate", "tiled": True,
+        "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
+    }  # fmt: skip

@@ -61,6 +61,8 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     train, val, test = (round(rows / count) for rows in whole)
     folds = f"each of {count} folds has about " if count > 1 else ""
     rows = f"{folds}{train} training, {val} validation and {test} test rows"
+    if split.name == "none":
+        rows = f"all {train + val} rows are learned from ({val} decide where a method has choices)"
     return [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),
@@ -112,10 +114,8 @@ def _static(site: Site) -> str:
         lost = len(stations) - len(known)
         where = _box(known) if len(known) else ""
         where += f", {lost} of them at unknown places" if lost else ""
-        pairs = zip(stations.label or stations.name, stations.name, strict=True)
-        names = [own if own == name else f"{own} ({name})" for own, name in pairs]
         count = f"{len(stations)} station{'s' * (len(stations) > 1)}"
-        return f"the {end}, {count}{where}: {list_first(names, 4)}"
+        return f"the {end}, {count}{where}: {list_first(stations.shown, 4)}"
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64

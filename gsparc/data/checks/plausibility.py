@@ -50,7 +50,8 @@ def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
     if np.median(latitude) > 75:
         return [f"the places lie in the Arctic ({where}): latitude and longitude swapped?"]
     if np.abs(latitude).max() <= np.pi / 2 and np.abs(longitude).max() <= np.pi:
-        return [f"the places lie in the Gulf of Guinea ({where}), at sea: radians? then say so in the heads"]
+        sea = f"the places lie in the Gulf of Guinea ({where}), at sea"
+        return [f"{sea}: radians? write degrees, or [rad] in the heads of a table"]
     return []
 
 
@@ -67,7 +68,7 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     usual = max(5 * float(np.median(counts)), 3 * counts[1])
     if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, usual):
         share = f"{counts[0]} of {len(values)} levels are exactly {least}"
-        warnings.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={least}")
+        warnings.append(f"{share}, the least: not heard? then say dataset.not_heard=[{least}]")
         values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
     if low < 0 and high > HIGHEST_DBM:
@@ -237,10 +238,14 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
     if silent:
         warnings.append(f"no level in any row{_of(silent, len(names))}")
     if faint:
-        warnings.append(
-            f"{sum(faint.values())} levels missing{_of([*faint], len(names))}, beside the weakest ones: not "
-            f"heard? then give sensitivity_db (at most {np.floor(min(weakest[n] for n in faint)):g} dB), and "
-            "they count as below it; where they have no row, dataset.absent=silent"
+        floor = np.floor(min(weakest[n] for n in faint))
+        # First of all: what is not heard and not said so leaves weak stations far too strong.
+        warnings.insert(
+            0,
+            "not heard? then say dataset.absent=silent (where they have no row) or "
+            f"dataset.columns.sensitivity_db={floor:g} (for empty cells): {sum(faint.values())} levels are "
+            f"missing{_of([*faint], len(names))}, beside the weakest ones; left out, weak levels are "
+            "predicted too high",
         )
     if plain:
         warnings.append(

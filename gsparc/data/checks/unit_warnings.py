@@ -55,7 +55,7 @@ def _position_hints(positions: np.ndarray) -> list[str]:
     # Metres about a local origin lie near it; degrees of a small site lie many of its widths away.
     if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
-        how = "then give them as latitude and longitude"
+        how = "then give them as latitude and longitude (columns of a table: dataset.columns.lat=HEAD, .lon)"
         return [f"positions near {near} within {across:.2g}: degrees? {how}"]
     groups = find_gap(positions[:, :2])
     if groups is not None:

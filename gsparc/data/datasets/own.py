@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,11 @@ from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
 from gsparc.data.errors import DataError
 from gsparc.data.files import SeveralFiles
+from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
+from gsparc.data.selection import Selection
 from gsparc.data.tables import is_table
 
 
@@ -68,7 +70,8 @@ def apply_settings(
         raw: as it was read.
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
         absent: `silent`: a station without a row at a place where others have one was not heard there;
-            `auto`: one that a list of the strongest leaves out is below its weakest; `unknown`: neither.
+            `auto`: one that a list of the strongest leaves out is below its weakest, levels that are missing
+            beside weak ones alone are below their station's; `unknown`: neither.
         saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where it
             repeats; `none`: there is none.
         tx_position: of a transmitter that stood still, where the file does not say it [m].
@@ -120,19 +123,22 @@ def read_any(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
+    cell_m: float | None = None,
     **settings: Any,
 ) -> Reading:
     """Read a folder or file of a release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
-        columns, stations_file: of a table, see `read_own`.
-        **settings: see `apply_settings`.
+        columns, stations_file, cell_m: of a table, see `read_own`.
+        **settings: see `apply_settings`, and of `Selection`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
+    chosen = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
+    part = from_settings(Selection, chosen, "dataset")
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
@@ -145,11 +151,11 @@ def read_any(
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, said = read_file_or_table(path, columns, stations_file), ""
+        raw, said = read_file_or_table(path, columns, stations_file, cell_m), ""
         if (campaign := dataset_by_arrays(raw)) is not None:
             raw, said = LOADERS[campaign](path), f"this is a file of dataset={campaign}"
     raw = replace(raw, notes=(*filter(None, [said]), *raw.notes))
-    return interpret(apply_settings(raw, **settings), path)
+    return interpret(apply_settings(raw, **settings), path, part)
 
 
 def read_file_or_table(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.assemble import FARTHEST
+from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.links.strongest import StrongestLists, number_lists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
@@ -33,7 +34,7 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
 
 
 def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
-    """Add to lists of the strongest rows, twice as many as are listed, of stations that they leave out."""
+    """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out."""
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
     whole = levels.ndim == 1 and "mask" not in arrays
@@ -44,19 +45,35 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
+    most = UNLISTED_EACH * len(heard)
     if not lists.are_strongest():
-        return
-    # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
-    floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
-    of_list, station, below = lists.bound_unlisted(floor, stations.position, UNLISTED_EACH * len(heard))
+        # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
+        said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
+        found = None if said else lists.below_floor()
+        if found is None:
+            return
+        floor, may = found
+        lists, every = replace(lists, length=0), int(may.sum())
+        of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)
+        what = (
+            "levels are missing beside weak ones alone: not heard, below the weakest of each station "
+            f"({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
+        )
+    else:
+        # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
+        floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
+        of_list, station, below = lists.bound_unlisted(floor, stations.position, most)
+        every = int(np.isnan(lists.level).sum())
+        what = (
+            f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
+            f" below its weakest, in lists shorter than {lists.length}: below {floor.min():.4g} dB"
+        )
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
-    every = int(np.isnan(lists.level).sum())
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
     check.notes.append(
-        f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
-        f" below its weakest, in lists shorter than {lists.length}: below {floor.min():.4g} dB; beside"
-        f" {len(heard)} listed, {used} {every} unlisted are used (dataset.absent=unknown takes none)"
+        f"{what}; beside {len(heard)} listed, {used} {every} unlisted are used "
+        "(dataset.absent=unknown takes none)"
     )
 
 

@@ -17,7 +17,6 @@ from gsparc.data.schema import Links
 from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
-NOT_HEARD = "powers were not heard: they lie below sensitivity_db, or the weakest of their list"
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 
 
@@ -93,7 +92,10 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         none = " or without any power" if measured == "spectrum" else ""
-        for flags, what in ((~keep, f"values are missing{none}"), (censored, NOT_HEARD)):
+        below = np.zeros(1) if floor is None or not censored.any() else floor[censored]
+        limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
+        unheard = f"powers were not heard: below {limits} dB"
+        for flags, what in ((~keep, f"values are missing{none}"), (censored, unheard)):
             check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
         arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]
         check.raw = replace(check.raw, arrays=arrays)
@@ -158,7 +160,8 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     for mark in marks if given is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
         said = f"{share}, apart from all others: taken as not heard, below {floor}"
-        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db gives another limit"
+        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db gives another limit (of a table "
+        say += "dataset.columns.sensitivity_db=LEVEL)"
         check.notes.append(Caution(f"{said}; {say}"))
     return silent
 

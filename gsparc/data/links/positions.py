@@ -121,7 +121,7 @@ def _in_metres(check: Checker) -> Georeference | None:
                 arrays[f"{name}_height"] = np.array(0.0)
                 check.notes.append(f"no {name}_height: taken as 0 m")
             del arrays[f"{prefix}latitude"], arrays[f"{prefix}longitude"]
-    check.notes += degree_warnings(*places[""])
+    check.notes += map(Caution, degree_warnings(*places[""]))
     where = f"{origin.latitude:g}, {origin.longitude:g} degrees"
     check.notes.append(f"positions are metres east and north of {where}")
     return origin

@@ -2,6 +2,9 @@
 
 A station that a full list leaves out is at most as strong as the weakest that it holds: a level of its own
 row. In a list that is not full it is below what the receiver hears.
+
+Where all that is heard is listed, levels end at a floor: they are missing beside weak ones alone. Levels that
+were lost, in outages or at random, are missing beside strong ones, too.
 """
 
 from __future__ import annotations
@@ -21,6 +24,12 @@ RUN = 3  # such moments in a row: how alike neighbours are
 FALL_DB = 35.0  # a decade: what a level far from its station is expected below one near it
 NEAREST_M = 20.0  # to a station: nearer, levels rise no more
 SHADOWING_DB, ALIKE_M = 10.0, 100.0  # deviation of levels far apart, and what is not far
+FLOOR = 2.0  # per cent of a station's levels that may lie below its floor
+STRONG_DB, SPREADS = 10.0, 3.0  # above the floor, at least; and in deviations between neighbouring places
+LEAST_LINKS = 30  # of those missing beside levels, and of strong levels
+# Share missing beside strong levels, and of strong ones among levels beside missing ones: with a floor up to
+# .013 and .04 (simulated drives), of outages and random losses .01 to .5 and .3 to .85 (also POWDER).
+LOST, BESIDE_STRONG = 0.02, 0.1
 
 
 def number_lists(place: np.ndarray, station: np.ndarray) -> np.ndarray:
@@ -92,7 +101,37 @@ class StrongestLists:
         above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
 
-    def bound_unlisted(self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int) -> Silent:
+    def below_floor(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return floors (T,) [dB] and which links (M, T) lie below; None where missing ones look lost.
+
+        A link beside a strong one, and a station with several of these, are taken as lost in any case.
+        """
+        known = np.flatnonzero(np.isfinite(self.place).all(1))
+        places, first, which = np.unique(self.place[known], axis=0, return_index=True, return_inverse=True)
+        if len(places) < 2:
+            return None
+        near = cKDTree(places).query(places, k=2)[1][:, 1]
+        beside = np.full(self.level.shape, np.nan)
+        beside[known] = self.level[known[first[near[which.reshape(-1)]]]]
+        missing, pairs = np.isnan(self.level), np.isfinite(self.level) & np.isfinite(beside)
+        if not pairs.any():
+            return None
+        floor = np.full(self.level.shape[1], np.nan)
+        heard = ~missing.all(0)
+        floor[heard] = np.nanpercentile(self.level[:, heard], FLOOR, axis=0)
+        spread = 1.4826 * float(np.median(np.abs(self.level - beside)[pairs]))
+        strong = beside > floor + max(STRONG_DB, SPREADS * spread)
+        edges, lost = missing & np.isfinite(beside), missing & strong
+        if min(edges.sum(), strong.sum()) < LEAST_LINKS:
+            return None
+        if lost.sum() > min(LOST * strong.sum(), BESIDE_STRONG * edges.sum()):
+            return None
+        several = (lost.sum(0) > 1) & (lost.sum(0) > BESIDE_STRONG / 2 * edges.sum(0))
+        return floor, missing & ~strong & heard & ~several
+
+    def bound_unlisted(
+        self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int, may: np.ndarray | None = None
+    ) -> Silent:
         """Return moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong
@@ -103,9 +142,11 @@ class StrongestLists:
             sensitivity: () or (T,) level of lists that are not full [dB].
             stations: (T, 3) places [m], NaN where unknown.
             most: of all.
+            may: (M, T) which links; None: all without a level.
         """
+        may = np.isnan(self.level) if may is None else may
         weakest = np.nanmin(self.level, 1)[:, None]
-        below = np.where(self.full[:, None], weakest, np.minimum(weakest, sensitivity))
+        below = np.where(self.full[:, None], weakest, sensitivity)
         known = np.isfinite(self.place).all(1)
         square = np.floor(np.where(known[:, None], self.place, 0)[:, :2] / ALIKE_M)
         square = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
@@ -115,7 +156,7 @@ class StrongestLists:
         parts = []
         for t in range(self.level.shape[1]):
             listed = np.isfinite(self.level[:, t])
-            own, heard = np.flatnonzero(~listed & known), np.flatnonzero(listed & known)
+            own, heard = np.flatnonzero(may[:, t] & known), np.flatnonzero(listed & known)
             expected = np.full(len(own), -FALL_DB)
             if len(heard):
                 far, near = cKDTree(self.place[heard]).query(self.place[own])

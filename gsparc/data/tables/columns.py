@@ -26,6 +26,7 @@ LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
 _STATIONS = "|".join(sorted(heads.STATION_WORDS))
 # A letter or a number that remains of a head names a station; a whole word says another quantity.
 STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
+MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -61,7 +62,7 @@ Chosen = dict[str, tuple[Column, ...]]
 def choose_columns(
     sheet: Sheet,
     settings: Mapping[str, object],
-    labelled: Iterable[str] = (),
+    labelled: Mapping[str, str] = {},
     only: Container[str] | None = None,
 ) -> tuple[Chosen, list[str]]:
     """Choose the columns of each quantity, with a note for each that was guessed.
@@ -69,11 +70,10 @@ def choose_columns(
     Args:
         sheet: the table.
         settings: heads, patterns with a `*` or numbers by quantity, as in `dataset.columns`.
-        labelled: names of stations; columns called so are taken as their levels.
+        labelled: names of stations by heads of columns that are taken as their levels.
         only: quantities that are guessed; None: all.
     """
     chosen: Chosen = {}
-    labelled = set(labelled)
     for key, value in settings.items():
         columns = () if value is None else _by_setting(sheet, key, value)
         if columns:
@@ -86,7 +86,8 @@ def choose_columns(
     for head in sheet.heads:
         meaning = heads.parse_head(head) if head not in used_heads else Head()
         if head not in used_heads and head in labelled:
-            meaning = Head("rssi_db", label=head, word="station")
+            power = "rssi" if meaning.role == "rssi" else "rssi_db"
+            meaning = Head(power, labelled[head], meaning.unit, "station", meaning.strange)
         role = meaning.role
         areas = heads.TOGETHER[meaning.word] if meaning.word in LISTS["beside"] else set()
         # `ci` is a cell identity only beside an area code: alone it may be a confidence interval.
@@ -119,7 +120,7 @@ def choose_columns(
             _ambiguous(sheet, role, candidates)
             continue
         # `rssi_delta` or `predicted_rssi` are levels by their words and not what was received.
-        if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled):
+        if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled.values()):
             fault = "a received level or power, or something else? if it is one, say "
             sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
             continue
@@ -128,7 +129,7 @@ def choose_columns(
             notes.append(_note(chosen[role]))
     for column in (columns[0] for columns in chosen.values()):
         if not column.word and column.unit is not None and column.unit.changes:
-            notes.append(f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}")
+            notes.append(_turned(column, column.unit))
     _one_unit(sheet, chosen)
     # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
@@ -203,7 +204,21 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
             joined = "+".join([*(column.head or "" for column in stations), head])
             how = heads.SHEET["remedies"][topic].format(head=head, joined=joined)
             notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
-    return notes
+    return notes + _more_levels(sheet, chosen.get("rssi_db", ()), used)
+
+
+def _more_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> list[str]:
+    """Warn of columns that are not used, with values like those of several `columns` of levels."""
+    if len(columns) < 2:
+        return []
+    rest = [h for h in sheet.heads if h not in used and not LISTS["no_level"] & set(words_of(h))]
+    numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
+    levels = numbers[[column.head for column in columns]].stack()
+    low, high = levels.min(), min(levels.max(), 0)
+    alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
+    said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and " if alike else ""
+    advice = f"are not used: of stations, too? call them as {columns[0].head!r} is called"
+    return [Caution(said + advice)] if alike else []
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
@@ -282,7 +297,7 @@ def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
             guesses.pop(role, None)
 
 
-def _is_plain(column: Column, stations: Container[str]) -> bool:
+def _is_plain(column: Column, stations: Iterable[str]) -> bool:
     """Whether the head of a guessed column says a level and nothing beyond that it may be of a station."""
     absolute = column.unit is not None and column.unit.name != "dB"
     named = column.label in stations or re.fullmatch(r"\W*", column.label)
@@ -339,13 +354,32 @@ def _note(columns: tuple[Column, ...]) -> str:
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
 
 
+def _factor_of(unit: Unit | None) -> tuple[str, str]:
+    """The factor that a setting gives, "" for none, and the unit of the head, "" for none."""
+    name = "" if unit is None else unit.name
+    return (name.split()[1], " ".join(name.split()[2:])) if name.startswith("x ") else ("", name)
+
+
+def _turned(column: Column, unit: Unit) -> str:
+    """What becomes of a column that a setting chose; with a caution where its unit is counted twice."""
+    (factor, bare), wanted = _factor_of(unit), schema_unit(column)
+    if not factor:
+        return f"column {column.head!r}: {bare} turned into {wanted}"
+    then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
+    value = float(unit.convert(np.array(100.0)))
+    said = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
+    if then and math.isclose(float(factor), UNITS[bare.lower()].factor):
+        return Caution(f"{said}; twice? dataset.columns.{column.role}={column.head} turns {bare} alone")
+    return said
+
+
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
-    unit = SCHEMA.get(KINDS[column.role], "deg")
-    if column.unit is None and "rsrp" in heads.words_of(column.head or ""):
+    unit, bare = SCHEMA.get(KINDS[column.role], "deg"), _factor_of(column.unit)[1]
+    if not bare and "rsrp" in heads.words_of(column.head or ""):
         return unit  # dBm by definition (3GPP TS 36.214)
     # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
-    return "dB" if unit == "dBm" and (column.unit is None or column.unit.name == "dB") else unit
+    return "dB" if unit == "dBm" and bare in ("", "dB") else unit
 
 
 def rename_for_stations(column: Column) -> Column:

@@ -90,6 +90,18 @@ def parse_head(text: str) -> Head:
     return replace(head, unit=unit, strange=strange)
 
 
+def station_in_head(text: str) -> str:
+    """Return what is left of a head without its unit and what says a level or a station.
+
+    >>> [station_in_head(head) for head in ("PCI 101", "101_RSRP", "101 [dBm]", "RSRP")]
+    ['101', '101', '101', '']
+    """
+    head = parse_head(text)
+    if head.role in ("rssi_db", "rssi"):
+        return head.label
+    return re.sub(rf"(?i)^[\W_]*(?:{'|'.join(STATION_WORDS)})[\W_]+", "", unit_of(text)[0]).strip()
+
+
 def unit_suits(role: str, unit: Unit) -> bool:
     """Tell whether a column of `role` can be in `unit`."""
     return KINDS[role] == unit.kind or (KINDS[role], unit.kind) == ("phase", "angle")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -180,6 +180,13 @@ class StationList:
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
         return replace(self, names=names, label=None if names == self.names else self.names)
+
+    def match_heads(self, parts: Mapping[str, str]) -> tuple[StationList, dict[str, str]]:
+        """Return the same under the names that heads, or their `parts`, hold, and that of each such head."""
+        renamed = self.use_names_of(np.array([*parts, *parts.values()]))
+        found = {head: one for head, part in parts.items() for one in (part, head) if one in renamed.names}
+        # One head alone may be called like a station by chance, unless by its own name.
+        return (renamed, found) if len(found) > 1 or renamed.label is None else (self, {})
 
     def add_missing(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
         """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""

@@ -28,7 +28,7 @@ from gsparc.data.tables.columns import (
     choose_columns,
     schema_unit,
 )
-from gsparc.data.tables.heads import LISTS, PERCENT, words_of
+from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
 from gsparc.data.tables.opening import read_parquet, read_sheet
 from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
@@ -72,8 +72,12 @@ def parse_table(
         listed, list_notes = read_stations(second)
         notes += list_notes
         sheet.problems.raise_if_any()
-    # The list of stations comes before the columns: heads that equal its names are levels of stations.
-    chosen, guessed = choose_columns(sheet, columns, () if listed is None else listed.names)
+    # The list of stations comes before the columns: heads that hold its names are levels of stations.
+    labelled: dict[str, str] = {}
+    if listed is not None:
+        parts = {head: station_in_head(head) for head in sheet.heads}
+        listed, labelled = listed.match_heads(parts)
+    chosen, guessed = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
     if cell_m is not None:
@@ -92,6 +96,7 @@ def parse_table(
     return Raw(arrays, about, notes=(*notes, *guessed, *builder.notes))
 
 
+MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
 TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
 
 
@@ -202,11 +207,12 @@ class Builder:
         """Add positions and stations."""
         by_end = {end: read_places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
         ends = {end: where for end, where in by_end.items() if where is not None}
-        if self.sheet.problems:
-            return
-        if not ends:
+        # Said beside what is wrong with levels: one look at the file mends both.
+        if {f"{end}{axis}" for end in by_end for axis in AXES if axis != "z"}.isdisjoint(self.chosen):
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
             return self.refuse(f"{fault}, or .latitude, .longitude")
+        if self.sheet.problems:
+            return
         # Two named ends and one without a name: nothing says which of the named ones it would replace.
         if len(ends) == 3:
             fault = "coordinates of rx, of tx and of an end without a name"
@@ -320,7 +326,8 @@ class Builder:
         if self.listed is None:
             return self._nowhere(labels, degrees)
         self._all_listed(np.array(labels), None)
-        silent = [name for name in self.listed.names if name not in labels]
+        names = self.listed.label or self.listed.names
+        silent = [own for own, name in zip(names, self.listed.names, strict=True) if name not in labels]
         used = {column.head for columns in self.chosen.values() for column in columns}
         for name in silent:
             # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
@@ -334,7 +341,8 @@ class Builder:
         for role in PER_STATION:
             if role in self.listed.extra:
                 self.arrays[role] = self.listed.extra[role][order]
-        return StationList(labels, self.listed.places.take(order))
+        label = None if self.listed.label is None else tuple(self.listed.label[i] for i in order)
+        return StationList(labels, self.listed.places.take(order), label=label)
 
     def _all_listed(self, words: np.ndarray, head: str | None) -> None:
         """Refuse names that the list of stations does not have."""
@@ -346,7 +354,13 @@ class Builder:
             self.listed, lacking, said = self.listed.add_missing(words)
             self.notes += said
         known = {"", *self.listed.names, *lacking}
-        for word in [word for word in dict.fromkeys(words.tolist()) if word not in known]:
+        unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in known]
+        if len(unlisted) > MOST_NAMED:
+            place = "the heads" if head is None else f"column {head!r}"
+            fault = f"{list_first([*map(repr, unlisted)])} are no listed stations; the list has "
+            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault + list_first(self.listed.names))
+            return
+        for word in unlisted:
             row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
             place = "the heads" if head is None else f"column {head!r}, {row}"
             fault = f"{word!r} is no listed station{suggest_name(word, self.listed.names)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import logging
+import math
 import os
 import re
 import time
@@ -21,7 +22,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.assemble import content_hash, identity_hash
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import SUMMARY, set_aside, whole_file
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
@@ -38,6 +39,7 @@ WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its setti
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
 NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
+OURS = ("gsparc/", "ops/", "callbacks/", "conf/", "hydra_plugins/")  # of gsparc's; the rest is somebody's
 STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
 REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
 DOCSTRING = re.compile(rf'(:\n\s+|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
@@ -86,6 +88,21 @@ class State:
         """Return whether a record is of this state; `reuse`: whatever the program was."""
         names = set(asdict(self)) - ({"program"} if reuse else set())
         return all(record.get(name) == getattr(self, name) for name in names)
+
+    def changes(self, record: Mapping[str, Any]) -> str:
+        """Return in what a record is of another state: `settings changed (effort); program changed`."""
+        said = []
+        for name, value in asdict(self).items():
+            before = record.get(name)
+            if before == value:
+                continue
+            names = []
+            if isinstance(value, dict) and isinstance(before, dict):
+                names = [key for key in {**before, **value} if before.get(key) != value.get(key)]
+            elif name == "program":
+                names = _edited_since(float(record.get("began", math.inf)))
+            said.append(f"{name} changed" + (f" ({list_first(names, 3)})" if names else ""))
+        return "; ".join(said)
 
 
 def measurements_hash(data: Measurements) -> str:
@@ -154,6 +171,8 @@ def recorded(folder: Path, state: State, unread: State | None = None) -> Iterato
     record = read_summary(folder / RECORD)
     left = None
     if record is None or record.get("ended") or not state.same(record):
+        if record is not None and not state.same(record):
+            log.info("%s: begun anew: %s", folder, state.changes(record))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "unread": unread and asdict(unread), "began": time.time(), "ended": False}
         _write(folder / RECORD, record)
@@ -181,9 +200,9 @@ def _program(packages: tuple[str, ...]) -> str:
 def package_hash(package: str) -> str:
     """Return the hash of a package's text.
 
-    In a checkout it is of what git tracks and of new files, as they are: commits that change pages, tests,
-    comments or docstrings alone change nothing. Of an installed distribution it is of its record, else of all
-    modules in its folder.
+    In a checkout it is of what git tracks and of new files, as they are, of gsparc's in its own folders:
+    commits that change pages, tests, comments or docstrings alone change nothing. Of an installed
+    distribution it is of its record, else of all modules in its folder.
     """
     spec = find_spec(package)
     if spec is None:
@@ -222,7 +241,16 @@ def _checkout(folder: Path) -> tuple[Path, list[str]] | None:
     files = run_git(Path(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard") or ""
     texts = [one for one in files.split("\0") if one.endswith(PROGRAM)]
     own = str(folder.relative_to(root))  # of a plugin among the examples, too
+    if (Path(root) / "gsparc" / "models").is_dir():
+        return Path(root), [one for one in texts if one.startswith((f"{own}/", *OURS))]
     return Path(root), [one for one in texts if not one.startswith(NO_PROGRAM) or one.startswith(own)]
+
+
+def _edited_since(began: float) -> list[str]:
+    """Files of gsparc's checkout that are newer [s since 1970]; none of an installed copy."""
+    root, files = _checkout(Path(__file__).parents[2]) or (Path(), [])
+    texts = [root / one for one in files if (root / one).is_file()]
+    return [str(one.relative_to(root)) for one in texts if one.stat().st_mtime > began]
 
 
 def _of_files(root: Path, files: Iterable[str]) -> str:

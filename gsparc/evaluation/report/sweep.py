@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
@@ -13,12 +15,17 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
+from gsparc.data.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.evaluation.experiment.done import FAILURE
 
+if TYPE_CHECKING:
+    from gsparc.evaluation.report.runs import Run
+
 log = logging.getLogger(__name__)
 
+SCORED = ("test/", "val/", "train/")  # figures that settings are compared by
 WIDE = ("SSIM (uniform 7)", "MSE", "p95")  # left to the files
 
 
@@ -69,7 +76,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import make_sections, write_report
     from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again
-    from gsparc.evaluation.report.tables import has_draws, table_of_leads, table_of_seeds
+    from gsparc.evaluation.report.tables import group_by_setting, has_draws, table_of_leads, table_of_seeds
 
     runs = find_runs([folder])
     if settings.retime:
@@ -88,5 +95,16 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         console.print(table.without(*WIDE))
         if has_draws(group):
             console.print(table_of_leads(group))
+        for same in equal_settings(group_by_setting(group)):
+            console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
     summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})
     console.print(f"written to {folder}", highlight=False)
+
+
+def equal_settings(groups: Mapping[str, Iterable[Run]]) -> list[str]:
+    """Return settings, each with its runs, whose runs have equal figures, one line for those that agree."""
+    alike: dict[str, list[str]] = defaultdict(list)
+    for setting, runs in groups.items():
+        figures = (sorted(one for one in run.facts.items() if one[0].startswith(SCORED)) for run in runs)
+        alike[repr(sorted(map(repr, figures)))].append(setting)
+    return [list_first(names) for names in alike.values() if len(names) > 1]

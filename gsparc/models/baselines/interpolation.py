@@ -55,7 +55,7 @@ class Interpolator(Method):
             notes = self._learn_powers(power_rows(data, rows))
         else:
             own = self._learn(data.moving[rows], training_targets(data, rows))
-            notes = (*own, *unheard_note(data, known))
+            notes = (*own, *unheard_note(data, known, self.name))
         lost = sorted(set(vars(self)) - before - set(self.stored))
         if lost and type(self)._relearn is Interpolator._relearn:
             raise ValueError(

@@ -320,4 +320,4 @@ def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: float = ma
     Groups of as many rows keep the same ones.
     """
     chosen = np.unique(np.linspace(0, len(groups) - 1, min(max_groups, len(groups))).round().astype(int))
-    return tuple(groups[number].thin(max_rows) for number in chosen)
+    return tuple(groups[number].thin_rows(max_rows) for number in chosen)

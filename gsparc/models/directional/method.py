@@ -42,15 +42,16 @@ class DirectionalGP(SourcesInFrame):
     Args:
         rows: largest number of receivers times tones in the regression.
         seed: of the subsample.
+        visibility: whether receivers see the sources that their rays point at; else every one sees all.
     """
 
     name = "directional_gp"
     posterior: SightedSources
 
-    def __init__(self, rows: int = SearchSettings.rows, seed: int = 0) -> None:
+    def __init__(self, rows: int = SearchSettings.rows, seed: int = 0, visibility: bool = True) -> None:
         if rows < LEAST_ROWS:
             raise ValueError(f"directional_gp: rows must be at least {LEAST_ROWS}, got {rows}")
-        self.row_limit, self.seed = rows, seed
+        self.row_limit, self.seed, self.visibility = rows, seed, visibility
 
     # ---- the search ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -81,22 +82,25 @@ class DirectionalGP(SourcesInFrame):
         self.frame = Frame.from_rows(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         at = {int(row): k for k, row in enumerate(known)}
+        seen = seen[:, sources] if self.visibility else torch.ones_like(seen[:, sources])
         self.posterior = SightedSources(
             self.frame.normalise(everything),
             torch.tensor([at[int(row)] for row in everything.receiver]),
             UncertainPositions(points - self.frame.middle, covariance),
-            VisibilityGP.from_visibility(torch.from_numpy(places) - self.frame.middle, seen[:, sources]),
+            VisibilityGP.from_visibility(torch.from_numpy(places) - self.frame.middle, seen),
             torch.ones(len(sources)),
             REFINEMENT_KERNEL,
         )
         self.site = data.site
         self._refine_positions()
         self._refit_powers_and_kernel()
-        changed = self._update_visibility()
+        changed = ""
+        if self.visibility:
+            changed = f"{self._update_visibility()} visibility entries changed by channels; "
         self.posterior.precompute()
         note = (
             f"directional_gp: {self.count_components()} triangulated sources, direction error "
-            f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
+            f"{math.degrees(clusters.error):.2g} degrees; {changed}"
             f"constant share of the gains' variance {self.posterior.kernel.constant:.1%}"
         )
         return FitReport(started.spent, (note,))
@@ -184,8 +188,8 @@ class DirectionalGP(SourcesInFrame):
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Of sources whose receivers are measured, too."""
-        return ("phase", "visibility")
+        """`visibility` where some receiver does not see a source."""
+        return ("phase",) if bool(self.posterior.visibility.seen.all()) else ("phase", "visibility")
 
     def count_components(self) -> int:
         """Return the number of sources."""

@@ -109,6 +109,7 @@ class SourcesInFrame(ClosedForm):
 
     frame: Frame
     factors = torch.ones(1, dtype=torch.complex64)
+    asks_visibility = True
 
     @abstractmethod
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:

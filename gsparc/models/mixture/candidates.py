@@ -60,9 +60,10 @@ def make_joint_powers(init: InitSettings, clutter: bool, context: FitContext) ->
     return JointPowerField(clutter and init.name != "diffuse", context.seed)
 
 
-def make_bearings(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
-    """Return sources where bearings cross."""
-    return MovingArrayField(replace(BearingSearchSettings(), sources=init.max_sources), seed=context.seed)
+def make_bearings(init: InitSettings, clutter: bool, context: FitContext, **more: Any) -> ClosedForm:
+    """Return sources where bearings cross; `more` is of `MovingArrayField`."""
+    search = replace(BearingSearchSettings(), sources=init.max_sources)
+    return MovingArrayField(search, seed=context.seed, **more)
 
 
 def _search_arguments(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def _search_arguments(init: InitSettings, clutter: bool, context: FitContext) ->
 CANDIDATES: dict[str, Candidate] = {
     "sources": make_sources,
     "scene": make_scene,
-    "rays": lambda init, clutter, context: DirectionalGP(init.rows, context.seed),
+    "rays": lambda init, clutter, context: DirectionalGP(init.rows, context.seed, clutter),
     "diffuse": lambda *unused: ChannelField(),
     "powers": make_powers,
     "joint_powers": make_joint_powers,

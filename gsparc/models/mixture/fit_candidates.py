@@ -34,7 +34,6 @@ log = logging.getLogger(__name__)
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 GROUPS = 3  # of training rows, that solutions are weighed by
 OPEN_ENDED = ("sources", "bearings", "scene")  # candidates that take what effort they are given
-CLUTTERED = ("sources", "scene", "joint_powers")  # candidates to which `clutter` means something
 SEARCHES = ("sources",)  # of them, those that race
 NEAR = 0.1  # share of the energy that another solution misses, below which few searches are enough beside it
 BESIDE = 2  # searches then, of the usual effort
@@ -81,9 +80,10 @@ def fit_candidates(
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
             within = replace(within, leave_out=leave_out, race=race, beside=fields)
             with heeded.set_apart() as read[name], end_when(budget.is_spent):
-                clutter = name not in CLUTTERED or effects.visibility is not False
-                field = parts[name](settings, clutter, within)
+                field = parts[name](settings, effects.visibility is not False, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
+            if not field.asks_visibility:
+                read[name].discard("model.effects.visibility")
             fields[name] = field
             # Every group costs a fit: when the seconds are over, validation rows alone weigh solutions.
             if name not in OPEN_ENDED and not budget.is_spent():

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar
 
 from gsparc.data import heeded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.mixture.candidates import CANDIDATES, Candidate
+from gsparc.models.mixture.candidates import CANDIDATES, Candidate, make_bearings
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.powers.own_terms import to_terms
 from gsparc.models.terms import array_obstacle, phase_obstacle
@@ -32,7 +33,7 @@ class ImageSources(Mixture):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
         # Offsets are known to sources alone.
-        return _candidates(*placed, *["diffuse"] * (self.adds_process and self.init.snapshot == "none"))
+        return _candidates(*placed, *["diffuse"] * (self.init.snapshot == "none" and self.adds_process))
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
@@ -96,7 +97,9 @@ class Bearings(Mixture):
 
     def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`."""
-        return _candidates("bearings", *["process"] * (self.adds_process and len(data) <= PROCESS_ROWS))
+        if not self.adds_process:
+            return {"bearings": partial(make_bearings, components=0)}
+        return _candidates("bearings", *["process"] * (len(data) <= PROCESS_ROWS))
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""

@@ -98,12 +98,13 @@ class Mixture(LearnsTogether, ClosedForm):
         with heeded.set_apart():
             if (why := self.why_not(data)) is not None:
                 raise ValueError(f"{self.name}: {why}")
-            parts = self.list_candidates(data)
+            with heeded.set_apart() as read:
+                parts = self.list_candidates(data)
             named = self.init.name in ("auto", "diffuse", *parts)
             # An initialiser of another kind of site means nothing here: what this kind has is tried.
             name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
             init = replace(self.init, name=name)
-        heeded.count_reads(*["init.name"] * named, *["model.effects.residual"] * (data.site.kind != "rssi"))
+        heeded.count_reads(*["init.name"] * named, *read & {"model.effects.residual"})
         if "scene" in parts:
             read_walls(self.init.file)  # its errors come before anything is computed
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
@@ -165,13 +166,13 @@ class Mixture(LearnsTogether, ClosedForm):
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
         self.site, self.init_s = data.site, budget.by_clock.wall
+        self.explained = self._explained_share(data, fold, several)
+        if several or self.explained is not None:  # else it is of these rows already
+            self.condition(data, known)
         log.info(
             "%s of %d Gaussians from init=%s, terms %s", type(self).__name__, self.count_gaussians,
             self.started, ", ".join(self.terms) or "none",
         )  # fmt: skip
-        self.explained = self._explained_share(data, fold, several)
-        if several or self.explained is not None:  # else it is of these rows already
-            self.condition(data, known)
         seconds = budget.by_clock.wall
         if several:
             context.log_curve(seconds, "final")

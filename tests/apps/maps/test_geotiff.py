@@ -9,7 +9,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps import predict_map
-from gsparc.apps.maps.field_map import check_geotiff, write_geotiff
+from gsparc.apps.maps.field_map import check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
@@ -41,6 +41,29 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
         outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
     assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
     np.testing.assert_array_equal(np.flipud(power), found.at_best_server(found.power_db))
+
+
+def test_a_file_for_other_programs_said_neither_unit_nor_colours(tmp_path):
+    """Servers were float32 without a table of colours; unit, threshold and height stood nowhere."""
+    pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
+    import rasterio
+
+    found = predict_map(gsparc.load(town_model()), step_m=4.0, threshold_db=-70)
+    colours = np.linspace(0, 1, 3 * len(found.stations)).reshape(-1, 3)
+    number = found.layer("best_server")
+    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
+    write_classes(tmp_path / "best.tif", found, ORIGIN, number, found.stations, colours)
+    with rasterio.open(tmp_path / "map.tif") as file:
+        tags = file.tags()
+        assert (tags["unit"], tags["threshold_db"], tags["coverage"]) == (
+            "dB",
+            "-70.0",
+            "the mean of 1 - outage",
+        )
+    with rasterio.open(tmp_path / "best.tif") as file:
+        assert file.dtypes == ("uint8",) and file.colormap(1)[1][:3] == tuple((255 * colours[1]).astype(int))
+        assert file.tags(1)["0"] == found.stations[0]
+        np.testing.assert_array_equal(np.flipud(file.read(1)), np.nan_to_num(number, nan=255))
 
 
 def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):

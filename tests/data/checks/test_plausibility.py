@@ -94,7 +94,7 @@ def test_sound_degrees():
     (lambda v: -v + 40, "is below 0: losses, per cent"),
     (lambda v: np.round((v + 100) / 2), "an index, or linear"),
     (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-    (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
+    (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? then say dataset.not_heard=[-48]"),
     (lambda v: v * 0 - 3, "all levels are -3 dB"),
 ])  # fmt: skip
 def test_levels(level, said):
@@ -157,9 +157,11 @@ def test_outages_and_what_was_not_heard():
     level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
     level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
     found = plausibility.gap_warnings(as_links(place, level, ["a", "b", "c"]))
-    assert found[0].startswith("no level in the 60 rows from row 100 to row 159 of station a: an outage;")
-    assert "of station b, beside the weakest ones: not heard? then give sensitivity_db (" in found[1]
-    advised = float(found[1].partition("(at most ")[2].split()[0])  # was rounded to one that is refused
+    # What to do comes first: it was the third of three warnings, in words that no command took.
+    assert found[0].startswith("not heard? then say dataset.absent=silent (")
+    assert "180 levels are missing of station b, beside the weakest ones" in found[0]
+    advised = float(found[0].partition("dataset.columns.sensitivity_db=")[2].split()[0])  # was refused
+    assert found[1].startswith("no level in the 60 rows from row 100 to row 159 of station a: an outage;")
     assert advised <= np.nanmin(level[:, 1])
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
     assert plausibility.gap_warnings(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == [

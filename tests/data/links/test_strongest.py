@@ -58,3 +58,38 @@ def test_moments_of_one_place():
     assert number_lists(place, station).tolist() == [0, 0, 1, 1, 2, 2]
     apart = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
     assert number_lists(apart, np.repeat([1, 2, 3], 3)).tolist() == apart.tolist()
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_cells_below_a_floor_were_taken_for_lost(wide):
+    """Of a row for each heard cell `check` said good, and weak cells were predicted 10 dB too high."""
+    one = network(0)
+    heard = one.measured > np.quantile(one.measured, 0.6)
+    moment, cell = np.nonzero(heard)
+    arrays = {"rx_position": one.moment, "station_position": one.place}
+    arrays |= {"rssi_db": np.where(heard, one.measured, np.nan)}
+    if not wide:
+        arrays |= {"rx_position": one.moment[moment], "station": cell, "rssi_db": one.measured[heard]}
+    reading = interpret(Raw(arrays), "drive")
+    silent, station = reading.data.censored > 0, reading.data.station
+    assert [note.startswith("levels are missing beside weak ones alone") for note in reading.notes].count(
+        True
+    )
+    assert heard.sum() < silent.sum() <= 2 * heard.sum()
+    level = 10 * np.log10(reading.data.target[:, 0] * reading.data.site.target_scale)
+    place = {tuple(at): i for i, at in enumerate(one.moment.round(3))}
+    of = [place[tuple(at)] for at in (reading.data.moving + reading.data.site.origin).round(3)]
+    assert (one.measured[of, station] < level + 1e-3)[silent].all()
+    assert interpret(Raw(arrays, {"absent": "unknown"}), "drive").data.censored is None
+
+
+@pytest.mark.parametrize("share", [0.005, 0.1, 0.5])
+def test_lost_levels_are_below_no_floor(share):
+    """At random, and of cells that were off."""
+    one, rng = network(1), np.random.default_rng(0)
+    off = one.measured.copy()
+    for cell, first in enumerate(rng.integers(0, 500, off.shape[1])):
+        off[first : first + int(400 * share), cell] = np.nan
+    for level in (off, np.where(rng.random(off.shape) < share, np.nan, one.measured)):
+        arrays = {"rx_position": one.moment, "station_position": one.place, "rssi_db": level}
+        assert interpret(Raw(arrays), "drive").data.censored is None

@@ -212,3 +212,27 @@ def test_cells_were_current_whose_method_s_own_files_had_changed(tmp_path, monke
     module.write_text('"""Of another."""\nVALUE = 2\n')
     assert package_hash("toy_program") == commented
     sys.modules.pop("toy_program", None)
+
+
+def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path):
+    clone, package = tmp_path / "clone", tmp_path / "clone" / "gsparc"
+    (package / "models").mkdir(parents=True)
+    (package / "__init__.py").touch()
+    for words in (["init", "-q"], ["add", "gsparc/__init__.py"]):
+        subprocess.run(["git", *words], cwd=clone, check=True)
+    (clone / "mine").mkdir()
+    for name in ("mine/own.py", "own.py", "gsparc/models/new.py"):
+        (clone / name).touch()
+    assert sorted(_checkout(package)[1]) == ["gsparc/__init__.py", "gsparc/models/new.py"]
+
+
+def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
+    caplog.set_level("INFO", "gsparc")
+    run_once(tmp_path, state(), ends(tmp_path, 1))
+    assert not caplog.messages
+    run_once(tmp_path, state(settings={"seed": 0, "effort": 2}, program="q"), ends(tmp_path, 1))
+    assert caplog.messages == [f"{tmp_path}: begun anew: settings changed (effort); program changed"]
+    module = Path(gsparc.__file__).parent / "models" / "gsparc.py"
+    began = module.stat().st_mtime - 1e-3
+    said = state(program="q").changes({**vars(state()), "began": began})
+    assert said.startswith("program changed") and (_checkout(module.parent) is None or "(" in said)

@@ -20,6 +20,7 @@ from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.folds import fit_context, fit_folds
 from gsparc.models.registry import build, fill_defaults
+from gsparc.models.terms import EffectSettings
 
 WORLDS = {
     "array": World("array", 1, 1, "tx", "metres", "none", "random", 30),
@@ -198,6 +199,7 @@ def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
     ("array", "model=gsparc init=vectors model.steps=0", set(), ""),
     ("array", "model=gsparc init=auto model.effects.array=true model.steps=0", set(), ""),
     ("power", "model=gsparc model.effects.phase=false", {"model.effects.phase"}, ""),
+    ("tone", "model=gsparc model.effects.image=true effort=.1", {"model.effects.image"}, ""),
     ("image", "model=gsparc model.effects.residual=false trainer.max_steps=1", set(), ""),
     ("tone", "model=splat model.field.count=20 model.steps=3", set(), ""),
     ("tone", "model=splat model.field.count=20 model.steps=3 trainer.max_steps=2", {"model.steps"}, ""),
@@ -230,6 +232,29 @@ def test_phases_of_snapshots_mean_nothing_to_powers():
     given = "model=splat", "model.field.count=20", "trainer.max_steps=1", "model.loss.snapshot=phase"
     assert fitted("power", *given)[0] == {"model.loss.snapshot"}
     assert not fitted("tone", *given)[0]
+
+
+# Where nothing that hides is found, or no station that was never heard is asked about.
+FOUND_NOTHING = {("tone", "visibility"), ("antennas", "visibility"), ("stations", "visibility")}
+ALONE = {("power", "power")}  # a plain process answers the same, which a warning says
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("switch", EffectSettings.__dataclass_fields__)
+def test_a_term_switched_off_changes_answers_or_is_named_or_refused(world, switch):
+    """Of `image` and `residual` some were counted as heeded that decide nothing."""
+    if world in ("array", "image", "moving") and switch == "visibility":
+        pytest.skip("refused or named, see test_terms.py")
+    unused, answers = fitted(world, "model=gsparc", "effort=.3", f"model.effects.{switch}=false")
+    same = torch.equal(answers, fitted(world, "model=gsparc", "effort=.3")[1])
+    assert same == bool(unused) or (world, switch) in FOUND_NOTHING | ALONE
+
+
+def test_residual_false_left_a_moving_array_its_residual():
+    given = "model=gsparc", "model.effects.residual=false"
+    unused, answers = fitted("moving", *given)
+    assert not unused and not torch.equal(answers, fitted("moving", "model=gsparc")[1])
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from campaigns import brief, spectra
@@ -15,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from gsparc.evaluation.console import ConsoleHandler
-from gsparc.evaluation.report.sweep import FAILURE, SweepReport
+from gsparc.evaluation.report.sweep import FAILURE, SweepReport, equal_settings
 
 ROOT = Path(__file__).parents[3]
 
@@ -111,3 +112,11 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
     timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
     assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stdout)
     assert (sweep / "sweep.csv").read_text().count("\n") == 3  # heads, the run, its baseline
+
+
+def test_settings_that_change_nothing_were_tabled_as_if_they_were_compared():
+    def of(seed, value, hidden):
+        return SimpleNamespace(facts={"seed": seed, "test/nmse": value, "time/train_s": hidden})
+
+    groups = {"a": [of(0, 0.1, 1), of(1, 0.2, 1)], "b": [of(1, 0.2, 2), of(0, 0.1, 2)], "c": [of(0, 0.1, 3)]}
+    assert equal_settings(groups) == ["a, b"]

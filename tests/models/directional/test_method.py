@@ -23,6 +23,8 @@ from gsparc.models.image_sources.rows import draw_rows
 from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
+from gsparc.models.mixture.methods import ImageSources
+from gsparc.models.terms import EffectSettings
 from gsparc.processes.kernel import matern32_of_squares
 from gsparc.training.context import FitContext
 
@@ -250,3 +252,30 @@ def test_the_conference_room_from_43_receivers():
     searched = ImageSourceGP(searches=1, clutter=False)
     searched.fit(data, fold, FitContext(budget_s=5))
     assert error(searched, data, fold.test) > 0.5
+
+
+def test_visibility_that_was_switched_off_was_learned_all_the_same(pillar):
+    """An ablation of `visibility` compared two equal fits wherever directions were measured."""
+    data, fold, _, method = pillar
+    alone = EffectSettings(visibility=False, residual=False), None, InitSettings("rays")
+    blind = ImageSources(*alone)
+    notes = blind.fit(data, fold, FitContext()).notes
+    assert method.terms == ("phase", "visibility") and blind.effects == "phase"
+    assert "visibility" not in notes[0] and error(blind, data, fold.test) > 2 * error(method, data, fold.test)
+
+
+def test_the_log_counted_the_sources_of_a_fit_before_the_last(pillar, caplog, monkeypatch):
+    """46 Gaussians where the summary had 47: sources are found again in all rows."""
+    caplog.set_level("INFO", "gsparc")
+    data, fold, _, _ = pillar
+    found = ImageSources(EffectSettings(residual=False), None, InitSettings("rays"))
+    said_before = []
+    condition = ImageSources.condition
+
+    def counted(self, *given):
+        said_before.append("Gaussians from" in caplog.text)
+        condition(self, *given)
+
+    monkeypatch.setattr(ImageSources, "condition", counted)
+    found.fit(data, fold, FitContext())
+    assert said_before and not any(said_before) and f"{found.count} Gaussians from init=rays" in caplog.text

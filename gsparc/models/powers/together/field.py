@@ -25,6 +25,7 @@ from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import JointLevels, Prediction
 from gsparc.models.powers.together.learning import (
+    LEAST_STATIONS,
     TRIED_EACH,
     StationPriors,
     learn_shared_terms,
@@ -101,8 +102,9 @@ class JointPowerField(ClosedForm):
             self.own, remarks = learn_station_priors(used, self.seed, budget)
         else:
             used = relabel_by_site(used, network)
-            prior, remarks = learn_network(used, network, data.site.stations.name, self.seed, budget)
+            prior, remarks = learn_network(used, network, data.site.stations.shown, self.seed, budget)
             self.own = StationPriors(prior, {})
+        self.asks_visibility = network is None and len(used.stations) >= LEAST_STATIONS
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
