@@ -344,7 +344,7 @@ class OneStationView(View):
 
     def joint_method(self) -> HasJoint | None:
         """Return what knows how levels of stations go together; None where nothing does."""
-        method = getattr(self.inner, "single", None)
+        method = getattr(self.inner, "member", None)
         return method if isinstance(method, HasJoint) else None
 
     def gradient_problem(self) -> str | None:

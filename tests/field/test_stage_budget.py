@@ -42,7 +42,7 @@ def test_validations_were_not_counted_and_a_resumed_run_has_the_rest(monkeypatch
 
 def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
     """Fit where preparing a stage takes so long [s], and every step a second by both clocks."""
-    clocks, prepare = wound(monkeypatch), splatting.initialise
+    clocks, prepare = wound(monkeypatch), splatting.start_in_closed_form
 
     def slow(task):
         clocks.monotonic.wind(wall_s)
@@ -54,7 +54,7 @@ def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
             clocks.monotonic.wind(1.0)
             clocks.process_time.wind(1.0)
 
-    monkeypatch.setattr(splatting, "initialise", slow)
+    monkeypatch.setattr(splatting, "start_in_closed_form", slow)
     file = spectra(tmp_path / "own.npz")
     data, fold = loaded(file)
     method = build(compose(*brief(file)).model).create_for(data)

@@ -100,7 +100,7 @@ def test_no_wall_is_kept_where_there_is_none():
     field, _ = fitted_to(
         ChannelField(ChannelSettings(mirrors=2, directions=False)), data, np.arange(len(data))
     )
-    assert field.prior.get(Images) is None and not len(field.objects().planes)
+    assert field.prior.find_term(Images) is None and not len(field.objects().planes)
 
 
 def test_a_plane_between_an_end_and_the_places_mirrors_nothing():

@@ -85,7 +85,7 @@ def test_isotropic_term_alone_is_the_plain_process():
     plain = ComplexGP()
     plain.fit(data, fold, FitContext())
     field, notes = fitted_to(ChannelField(PLAIN), data, np.concatenate([fold.train, fold.val]))
-    assert field.terms == ("residual",) and field.count == 0
+    assert field.terms == ("residual",) and field.count_gaussians == 0
     if "kept" in notes[1]:  # powers beside the grid's
         powers = torch.tensor([[1.0], [plain.kernel.noise]]).double()
         terms = zip(field.prior.terms, powers, strict=True)
@@ -98,7 +98,7 @@ def test_isotropic_term_alone_is_the_plain_process():
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
     torch.testing.assert_close(after.variance, before.variance * level, rtol=2e-3, atol=1e-6)
     torch.testing.assert_close(1 - after.unknown, before.confidence, rtol=2e-3, atol=1e-4)
-    left, _ = plain._require_fitted().left_out_residuals()
+    left, _ = plain._posterior().left_out_residual()
     own = torch.from_numpy(data.target[field.rows]) - field.left_out().mean
     torch.testing.assert_close(own.flatten(), left.flatten().to(own.dtype), rtol=1e-3, atol=1e-4)
 

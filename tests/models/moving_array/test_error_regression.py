@@ -59,7 +59,7 @@ def test_the_error_grows_far_away_to_that_of_an_image_drawn_at_random(half_bad):
     away = np.array([[5.0, 4, 1.3], [1e2, 4, 1.3]])
     model, places = half_bad
     observed = torch.from_numpy(features(2)).float()
-    unknown, variance = model.expected(far(away, places), observed, torch.tensor([0.01, 0.01]))
+    unknown, variance = model.unknown_and_variance(far(away, places), observed, torch.tensor([0.01, 0.01]))
     assert unknown[0] < 0.6 and unknown[1] == 1
     assert variance[0] < 0.01 and float(variance[1]) == pytest.approx(PRIOR)
 

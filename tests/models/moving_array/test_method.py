@@ -69,7 +69,7 @@ def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
     np.testing.assert_array_equal(field.found.sources[0], np.float32(data.site.static_position))
     batch = data.batch(np.arange(1, 31, 2))
     posterior = field.predict(batch)
-    explained, mean, energy, _ = field.query()(batch.places(data.site))
+    explained, mean, energy, _ = field.renderer()(batch.places(data.site))
     torch.testing.assert_close(posterior.explained, explained.clamp(0, 1))
     added = field.basis.project(mean - explained)
     torch.testing.assert_close(added.square().sum(1), energy, rtol=1e-3, atol=1e-6)

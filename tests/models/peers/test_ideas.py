@@ -114,7 +114,7 @@ def test_newrf_asks_the_neighbours_how_many_paths_there_are(tmp_path):
     votes[:3, 0] = votes[3:, 1:] = votes[0, 1] = 1  # one of the first three sees another
     places = torch.eye(3)[:1] * torch.tensor([0.0, 0.1, 0.2, 9.0, 9.1, 9.2])[:, None]
     net.precomputed = {"places": places, "virtual": torch.rand(6, 3), "votes": votes}
-    assert net.search(places[[1, 4]], False)[1].sum(1).tolist() == [1, 5]
+    assert net.transmitters_and_likely(places[[1, 4]], False)[1].sum(1).tolist() == [1, 5]
 
 
 def test_newrf_opaque_samples_give_no_nan(tmp_path):

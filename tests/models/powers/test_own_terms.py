@@ -106,7 +106,7 @@ def test_a_prior_in_decibels_is_a_setting_of_the_term(trees):
     data = town(12)
     known = {"rx": data["rx"], "tx": STILL, "rssi": data["rssi"], "model": "powers"}
     told = gsparc.fit(**known, terms=[trees(GROVE, (-0.4, 1e-4))]).method.member.trend.more[0]
-    assert told.prior[0] == -0.4 and told.prior[1] * told.unit == pytest.approx(1e-4)
+    assert told.weight_prior[0] == -0.4 and told.weight_prior[1] * told.unit == pytest.approx(1e-4)
     with pytest.raises(ValueError, match=r"Trees\.prior_db=3: say \[mean, deviation\]"):
         gsparc.fit(**known, terms=[trees(GROVE, 3)])
 
