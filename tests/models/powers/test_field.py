@@ -73,7 +73,7 @@ def test_of_few_rows_it_is_the_plain_process(share):
     plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
     said = plain.fit(data, Fold(rows, rows[:0], np.arange(120, 160)), FitContext()).notes
     told, found = plain.predict(batch), field.predict(batch)
-    assert field.count_gaussians == 0 and found.explained is None and field.terms == ("residual",)
+    assert field.count_components() == 0 and found.explained is None and field.terms == ("residual",)
     assert torch.allclose(found.mean, told.mean, rtol=1e-5)
     assert torch.allclose(found.variance, told.variance, rtol=1e-4)
     assert torch.allclose(found.unknown, 1 - told.confidence, atol=1e-5)
