@@ -18,6 +18,7 @@ from gsparc.data.limits import finite_array
 from gsparc.data.links.georeference import Georeference
 
 REFUSED = -1  # of `best_server`
+NO_CLASS = 65535  # in a file of classes
 OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
 NODES = 16  # levels of the strongest that its rivals are weighed against
 OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
@@ -289,21 +290,14 @@ def write_classes(
     path: str | Path, raster: FieldMap, origin: Georeference | None, number: np.ndarray,
     names: Sequence[str], colours: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write numbers (ny, nx) of classes as whole numbers with a table of colours (k, 3), names as tags.
-
-    Beyond 255 classes they have 16 bits, and no table: GeoTIFF has none of that size.
-    """
+    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), names as tags."""
     import rasterio
 
-    small = len(names) < 255
-    kind, none = ("uint8", 255) if small else ("uint16", 65535)
-    values = np.flipud(np.where(np.isfinite(number), number, none)).astype(kind)
-    with (
-        whole_file(path) as partial,
-        rasterio.open(partial, "w", **_profile(raster, origin, 1, kind, none)) as file,
-    ):
-        if small:  # before the values, which fix what colours mean
-            file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
+    values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
+    profile = _profile(raster, origin, 1, "uint16", NO_CLASS)
+    with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
+        # Before the values, which fix what colours mean.
+        file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
         file.write(values, 1)
         file.set_band_description(1, "best_server")
         file.update_tags(1, **{str(i): one for i, one in enumerate(names)})

@@ -9,7 +9,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps import predict_map
-from gsparc.apps.maps.field_map import check_geotiff, write_classes, write_geotiff
+from gsparc.apps.maps.field_map import NO_CLASS, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
@@ -61,9 +61,9 @@ def test_a_file_for_other_programs_said_neither_unit_nor_colours(tmp_path):
             "the mean of 1 - outage",
         )
     with rasterio.open(tmp_path / "best.tif") as file:
-        assert file.dtypes == ("uint8",) and file.colormap(1)[1][:3] == tuple((255 * colours[1]).astype(int))
+        assert file.dtypes == ("uint16",) and file.colormap(1)[1][:3] == tuple((255 * colours[1]).astype(int))
         assert file.tags(1)["0"] == found.stations[0]
-        np.testing.assert_array_equal(np.flipud(file.read(1)), np.nan_to_num(number, nan=255))
+        np.testing.assert_array_equal(np.flipud(file.read(1)), np.nan_to_num(number, nan=NO_CLASS))
 
 
 def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
