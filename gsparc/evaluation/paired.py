@@ -60,20 +60,18 @@ class Lead:
 
     def __str__(self) -> str:
         error = "" if np.isnan(self.error_db) else f" ± {self.error_db:.2f}"
-        return f"{self.ahead_db:+.2f}{error} dB over {self.pairs}"
+        return f"{self.ahead_db:.2f}{error} dB better over {self.pairs}"
 
     def no_difference(self, one: str, other: str, figure: str) -> str:
         """Return the sentence for two methods, `one` having the lead, of which neither is surely better.
 
         >>> Lead(0.22, 0.14, "32 test rows").no_difference("gp", "gsparc", "psnr_db")
-        'gp and gsparc do not differ in psnr_db (gp +0.22 ± 0.14 dB over 32 test rows)'
+        'gp and gsparc are not told apart in psnr_db: gp is 0.22 ± 0.14 dB better over 32 test rows'
         """
         if self.same:
             return f"{one} and {other} have the same {figure} over {self.pairs}"
-        better = (
-            f"{one} {self}" if self.ahead_db >= 0 else f"{other} {replace(self, ahead_db=-self.ahead_db)}"
-        )
-        return f"{one} and {other} do not differ in {figure} ({better})"
+        better, lead = (one, self) if self.ahead_db >= 0 else (other, replace(self, ahead_db=-self.ahead_db))
+        return f"{one} and {other} are not told apart in {figure}: {better} is {lead}"
 
 
 def lead_over_rows(

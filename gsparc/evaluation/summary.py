@@ -10,6 +10,7 @@ import re
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -233,11 +234,13 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
 
 
 def judge_baseline(baseline: str, method: str, figure: str, lead: Lead) -> list[str]:
-    """Return whether a baseline, which has `lead` over a method, is better or no different; [] if worse."""
+    """Return whether a baseline, which has `lead` over a method, is better, worse or not told apart."""
     if not lead.sure:
         return [f"the baseline {lead.no_difference(baseline, method, figure)}"]
-    better = f"the baseline {baseline} has the better {figure} here ({lead}): "
-    return [f"{better}the better choice for this data and split"] * (lead.ahead_db > 0)
+    if lead.ahead_db < 0:
+        ahead = replace(lead, ahead_db=-lead.ahead_db)
+        return [f"{method} is {ahead} in {figure} than {baseline}, the best baseline"]
+    return [f"the baseline {baseline} is {lead} in {figure}: the better choice for this data and split"]
 
 
 def _value(key: str, value: Any) -> int | float | str | None:

@@ -236,7 +236,7 @@ class ConfidenceMixin:
         return match_input(*self._query_confidence(tx, rx, uplink))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """Tell whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
+        """Tell whether predictions (B,) bool are among those of which at most `alpha` are promised to be bad.
 
         False beyond the places learned from and calibrated on (their box, grown by a tenth of its longest
         side), and where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).

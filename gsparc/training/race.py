@@ -67,13 +67,11 @@ class Race:
         gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
         if now <= STALLED * last_error:
             return now
-        known = f"what misses {self.error:.3f} of the energy of rows held out"
+        known = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
         if now > FAR * mean_square(best):
             raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {known}")
         if gain + SURE * error < LEAST_GAIN:
-            raise FellBehind(
-                f"{name}: a mean with {known} gains {gain:.0%} at most, give or take {error:.0%}"
-            )
+            raise FellBehind(f"{name}: averaging it with {known} gains {gain:.0%} ± {error:.0%}")
         return now
 
 

@@ -232,7 +232,7 @@ SPOILT = {
     ),
     "no place in a row": ("x,y,rssi\n1,2,-80\n,3,-81\n", {}, "column 'x', line 3: no value; x is needed"),
     "no place at all": ("rssi,speed\n-80,1\n-81,2\n", {}, "no coordinates among 'rssi', 'speed'"),
-    "no y": ("x,rssi\n1,-80\n2,-81\n", {}, "x is there but no y; say dataset.columns.y=COLUMN"),
+    "no y": ("x,rssi\n1,-80\n2,-81\n", {}, "column 'x' is x, and none is y; say dataset.columns.y=COLUMN"),
     "dBW beside dB": (
         "x,y,rssi_a [dBW],rssi_b [dB]\n1,2,-110,-80\n", {}, "in dBW, 'rssi_b [dB]' in dB of nothing; rename",
     ),

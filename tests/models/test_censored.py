@@ -104,7 +104,9 @@ def test_baselines_take_saturated_rows_as_measured_and_say_so():
     rows, above = np.arange(60), replace(data, censored=-silent.astype(np.int8))
     fold = Fold(rows, rows[:0], rows[:5])
     notes = build({"_target_": "gsparc.models.baselines.mean.Mean"}).fit(above, fold, FitContext()).notes
-    assert notes == (f"mean: {silent.sum()} rows in saturation are learned from as if measured at that level",)
+    assert notes == (
+        f"mean: {silent.sum()} rows in saturation are learned from as if measured at that level",
+    )
 
 
 @pytest.mark.parametrize(

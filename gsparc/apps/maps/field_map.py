@@ -38,7 +38,7 @@ class FieldMap:
         best_server: (ny, nx) int16, number of the strongest station; `REFUSED`.
         server_chance: (ny, nx) probability that it is, and is above its floor; see `server_chance`.
         sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
-        outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
+        outage: (ny, nx) probability that all powers lie below `threshold_db`.
         share: of measurements that the intervals hold; the field alone lies in them more often.
         calibrated: whether held-out blocks say so; else the model's own deviations alone.
         threshold_db: of `outage`.
@@ -184,6 +184,29 @@ def server_chance(
         # A station that nothing is known of anywhere is left out: it counts as beaten.
         total += np.nan_to_num(beats, nan=1.0).prod(axis=0)
     return np.where(number == REFUSED, np.nan, above * total / NODES).astype(np.float32)
+
+
+def outage_probability(
+    power_db: np.ndarray, error_db: np.ndarray, threshold_db: float, alike: np.ndarray, below: np.ndarray
+) -> np.ndarray:
+    """Probability (n,) that all of (T, n) powers lie below a threshold: who misses one may hear another.
+
+    Errors are normal; given the strongest's level its rivals are independent, as in `server_chance`. What is
+    unknown counts as below.
+
+    Args:
+        power_db, error_db, alike: see `server_chance`.
+        threshold_db: in the unit of the powers.
+        below: (n,) probability that the strongest lies below it.
+    """
+    first, cell = np.maximum(best_server(power_db), 0), np.arange(power_db.shape[1])
+    left, total = error_db * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), np.zeros(len(cell))
+    for share in (np.arange(NODES) + 0.5) / NODES:
+        z = ndtri(np.clip(below, 1e-12, 1) * share)  # equally likely levels of the strongest below it
+        missed = ndtr((threshold_db - power_db - alike * error_db * z) / left)
+        missed[first, cell] = 1.0
+        total += np.nan_to_num(missed, nan=1.0).prod(axis=0)
+    return (below * total / NODES).astype(np.float32)
 
 
 def sinr(

@@ -177,7 +177,7 @@ def place_station(
         for k, shift in enumerate((0.0, -reach, reach)):
             wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
             outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
-            goals[k] = np.mean(1 - np.minimum(old_outage, outage))
+            goals[k] = np.mean(1 - old_outage * outage)  # its errors are its own
         return goals
 
     scores = np.full((len(candidates), 3), np.nan)

@@ -73,11 +73,10 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
         notes.append(f"best_server: in {share:.1%} of squares (hatched) it is more likely another, or none")
     known = np.isfinite(field.outage)
     if known.any():
-        above = np.mean(field.layer("power_db")[known] >= field.threshold_db)
-        level = f"{field.threshold_db:g} {field.unit} or more"
+        share = 1 - field.outage[known].mean()
         notes.append(
-            f"{1 - field.outage[known].mean():.1%} of the squares with {level} (the mean of 1 - outage); "
-            f"predicted levels, without their errors, say {above:.1%}"
+            f"{share:.1%} of the predicted squares with {field.threshold_db:g} {field.unit} or more of some "
+            "station (the mean of 1 - outage)"
         )
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")

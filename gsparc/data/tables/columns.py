@@ -368,7 +368,7 @@ def _turned(column: Column, unit: Unit) -> str:
     then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
     value = float(unit.convert(np.array(100.0)))
     said = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
-    if then and math.isclose(float(factor), UNITS[bare.lower()].factor):
+    if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
         return Caution(f"{said}; twice? dataset.columns.{column.role}={column.head} turns {bare} alone")
     return said
 

@@ -54,7 +54,8 @@ def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -
             continue
         if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
-            fault = f"{present[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
+            found = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
+            fault = f"{found}; say dataset.columns.{missing}=COLUMN"
             return sheet.refuse(fault)
         absent = np.zeros(len(sheet), bool)
         if unknown:

@@ -189,7 +189,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if len(rows) > 1 and (lead := leads[rows[1].method]):
         before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
-        lines[0] += "" if lead.sure or lead.same else ": they do not differ"
+        lines[0] += "" if lead.sure or lead.same else ": they are not told apart"
     own = next((row for row in rows if row.method == ours), None)
     lead = None if own is None else leads.get(own.method)
     figure = heading_of(first.figure)

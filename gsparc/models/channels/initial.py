@@ -190,7 +190,7 @@ def _fit_isotropic(
     reach, none = BEYOND * max(extent, wavelength), ORIGIN
     frame = Frame(everywhere.mean(0), reach, length, GAINS[0] * wavelength, none)
     one = torch.ones(1, dtype=torch.float64)
-    note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
+    note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.2g} of its power"
     return ChannelPrior((Isotropic(frame, one), Noise(frame, noise * one))), factors, note
 
 

@@ -217,8 +217,11 @@ def test_a_simple_baseline_won_by_chance():
     cells += [filled("nearest", 30.0 + gain / 2, draw, drawn=True) for draw, gain in enumerate(gains)]
     (block,) = split_by_problem(average_cells(cells, {}))
     said = " | ".join(remarks(block, "gsparc"))
-    assert "gp and gsparc do not differ in PSNR dB (gp +0.30 ± 1.01 dB over 3 draws)" in said
-    assert "0.15 ± 0.51 dB before nearest (standard error over the same 3 draws): they do not differ" in said
+    assert "gp and gsparc are not told apart in PSNR dB: gp is 0.30 ± 1.01 dB better over 3 draws" in said
+    assert (
+        "0.15 ± 0.51 dB before nearest (standard error over the same 3 draws): they are not told apart"
+        in said
+    )
     assert "wins" not in said and "beats" not in said
 
 

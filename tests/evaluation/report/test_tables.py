@@ -152,7 +152,8 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
     results = tables.table_of_results(runs)
     assert [row[0] for row in results.rows].count("gp (baseline)") == 3
     assert warnings(runs) == [
-        "the baseline gp and gsparc do not differ in psnr_db (gsparc +0.17 ± 0.23 dB over 3 draws)"
+        "the baseline gp and gsparc are not told apart in psnr_db: "
+        "gsparc is 0.17 ± 0.23 dB better over 3 draws"
     ]
 
 
