@@ -26,7 +26,7 @@ from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
-from gsparc.models.reduced import list_settings, reduce_method
+from gsparc.models.reduced import list_settings, with_reduction
 from gsparc.prediction import operating_point
 from gsparc.prediction.pareto import Point, pareto_front
 from gsparc.prediction.predictor import Predictor
@@ -53,12 +53,12 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     rows = rows_to_score(fold, config.eval_on)
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
     learned = np.sort(np.concatenate([fold.train, fold.val]))
-    measured = method.reduction_inputs(data, learned)
+    inputs = method.reduction_inputs(data, learned)
     settings = list(list_settings(method, to_dict(config.grid)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
-    candidates = [(some, reduce_method(method, some, measured)) for some in settings]
+    candidates = [(some, with_reduction(method, some, inputs)) for some in settings]
     others = tradeoff.fit_others(run, config.baselines, config.eval_on)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows]
@@ -71,7 +71,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     # Stored points are chosen by closeness to the full model, which uses no measured value of tested rows.
     chosen = pareto_front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
-        operating_point.store_points(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
+        operating_point.store_points(Path(config.ckpt), [points[i] for i in chosen], figure, inputs)
     beside = {
         name: Point(name, {}, 1, pool_figures(one.scores, data, run.split), np.nan, other_ms[name], 0)
         for name, one in others.items()

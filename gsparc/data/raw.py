@@ -75,8 +75,8 @@ def read_raw(path: str | Path) -> Raw:
     readers = {".npz": _read_npz, ".mat": _read_mat}
     readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(NETCDF_SUFFIXES, _read_netcdf)
     if path.suffix.lower() not in readers:
-        suffix = path.suffix or "no ending"
-        raise DataError(f"{path}: expected a name ending in .npz, .h5, .hdf5 or .mat, found {suffix}")
+        suffix, known = path.suffix or "no ending", ", ".join(readers)
+        raise DataError(f"{path}: expected a name ending in one of {known}; found {suffix}")
     return readers[path.suffix.lower()](path)
 
 
@@ -88,7 +88,7 @@ def write_raw(path: str | Path, raw: Raw) -> None:
     """
     path = Path(path)
     if path.suffix.lower() not in (".npz", *HDF5_SUFFIXES):
-        raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5")
+        raise DataError(f"{path}: cannot be written as {path.suffix!r}; name it *.npz, *.h5 or *.hdf5")
     write = _write_npz if path.suffix.lower() == ".npz" else _write_hdf5
     try:
         with whole_file(path) as partial:

@@ -11,7 +11,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.models.method import Method
-from gsparc.models.per_station import known_and_unheard
+from gsparc.models.per_station import stations_of_fold
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext, FitReport
 
@@ -34,7 +34,7 @@ def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     if site.kind != "csi" or not carrier:
         return names
     folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
-    few = (known_and_unheard(method_class("complex_gp")(), data, fold)[1].any() for fold in folds)
+    few = (stations_of_fold(method_class("complex_gp")(), data, fold).only_tested.any() for fold in folds)
     return names if any(few) else (*names, "complex_gp")
 
 

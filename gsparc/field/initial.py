@@ -84,24 +84,21 @@ class InitTask:
         return self.settings.emission.encoding.anchors
 
 
-def keep_random_weights(model: GaussianModel) -> None:
-    """Leave random weights as they are."""
-
-
 @dataclass(frozen=True)
 class Start:
     """Where training begins.
 
     Attributes:
         prior: features of the encodings, or None.
-        solve: sets the parameters of a fresh model; may return what `left_out` holds.
+        solve: sets the parameters of a fresh model, and may return what `left_out` holds; None: they stay
+            random.
         billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
             the processor [s].
         left_out: training targets that it predicted without their neighbours, for whoever asks; not stored.
     """
 
     prior: Prior | None
-    solve: Callable[[GaussianModel], Any] = keep_random_weights
+    solve: Callable[[GaussianModel], Any] | None = None
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
     left_out: Any = None

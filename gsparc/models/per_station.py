@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import reduce
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -57,14 +57,21 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
     return factory
 
 
-def known_and_unheard(method: MethodFactory, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Return stations (T,) bool with training rows enough for `method`, and those of test rows without."""
+class StationsOfFold(NamedTuple):
+    """Stations (T,) bool: with training rows enough for a method, and with test rows but without those."""
+
+    learnable: np.ndarray
+    only_tested: np.ndarray
+
+
+def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> StationsOfFold:
+    """Return which stations `method` can learn, and which it is tested on without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
     # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
-    known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
-    return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
+    learnable = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
+    return StationsOfFold(learnable, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~learnable)
 
 
 def station_site(site: Site, number: int) -> Site:
@@ -87,11 +94,7 @@ def station_site(site: Site, number: int) -> Site:
 
 
 class PerStation(Method):
-    """Copies of a method by station.
-
-    Args:
-        factory: makes the method of each.
-    """
+    """Copies of a method by station, each made by `factory`."""
 
     has_parts = True
 
@@ -199,10 +202,10 @@ class PerStation(Method):
         self._shared = together and joint
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
-        known, unheard = known_and_unheard(self.factory, data, fold)
-        names = list_first([stations.name[t] for t in np.flatnonzero(unheard)])
-        numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(known)]
-        if not together and unheard.any():
+        learnable, only_tested = stations_of_fold(self.factory, data, fold)
+        names = list_first([stations.name[t] for t in np.flatnonzero(only_tested)])
+        numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(learnable)]
+        if not together and only_tested.any():
             if not self.factory.both_ends and not joint:
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)

@@ -20,12 +20,12 @@ log = logging.getLogger(__name__)
 
 Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as trained
 AS_TRAINED = {"keep": 1.0, "stride": 1, "confidence": True}  # else: None
-Measured = dict[str, Tensor]
+ReductionInputs = dict[str, Tensor]  # see `Method.reduction_inputs`
 
 
-def reduce_method(method: Method, settings: Settings, measured: Measured) -> Method:
+def with_reduction(method: Method, settings: Settings, inputs: ReductionInputs) -> Method:
     """Return the method with `settings`; itself when there are none."""
-    return method.reduce(settings, measured) if settings else method
+    return method.reduce(settings, inputs) if settings else method
 
 
 def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> Iterator[dict[str, Any]]:
@@ -188,7 +188,7 @@ class Blended(View):
 
 def without_variance(process: Method, settings: Settings | None = None) -> Method:
     """Return the process without its variance, most of its cost, which the field has of its own."""
-    return reduce_method(process, {"confidence": False, **(settings or {})}, {})
+    return with_reduction(process, {"confidence": False, **(settings or {})}, {})
 
 
 def average_with_process(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:

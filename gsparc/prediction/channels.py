@@ -190,7 +190,8 @@ def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: in
 
 def _require_paths(method: Method) -> SeparatesPaths:
     if not isinstance(method, SeparatesPaths):
-        raise ValueError(f"uplink=: {method.name} knows only the measured tones, no paths (model=uplink)")
+        fault = f"{method.name} answers uplinks at the measured tones alone"
+        raise ValueError(f"frequency_hz= and paths: {fault}; leave them out, or train model=uplink")
     return method
 
 

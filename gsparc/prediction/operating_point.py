@@ -15,7 +15,7 @@ import torch
 
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
-from gsparc.models.reduced import Measured, reduce_method
+from gsparc.models.reduced import ReductionInputs, with_reduction
 from gsparc.prediction.confidence import read_trusted
 from gsparc.prediction.pareto import Point, Settings
 from gsparc.prediction.predictor import Predictor
@@ -46,16 +46,16 @@ class Operating(Stored):
     p50_ms: float
 
 
-def store_points(path: Path, points: Sequence[Point], figure: str, measured: Measured) -> None:
+def store_points(path: Path, points: Sequence[Point], figure: str, inputs: ReductionInputs) -> None:
     """Store points in a checkpoint, replacing earlier ones; the file is rewritten whole or not at all."""
     found = [
         Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
         for p in points
     ]
-    checkpoint.update_extra(path, {KEY: {"points": to_plain(found), "measured": measured}})
+    checkpoint.update_extra(path, {KEY: {"points": to_plain(found), "measured": inputs}})
 
 
-def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:
+def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], ReductionInputs]:
     """Return the points in a checkpoint's `extra`, none when it was never swept."""
     sweep = extra.get(KEY) or {"points": [], "measured": {}}
     return [*from_plain(sweep["points"])], dict(sweep["measured"])
@@ -80,14 +80,14 @@ def choose_within_budget(
     """
     if not (isinstance(budget_ms, (int, float)) and math.isfinite(budget_ms) and budget_ms > 0):
         raise ValueError(f"budget_ms={budget_ms!r}: a positive number of milliseconds is needed")
-    points, measured = stored_points(stored.extra)
+    points, inputs = stored_points(stored.extra)
     advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
     if not points:
         # A model that was never swept has one point, itself.
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
     # More threads than cores wait for each other: such points are of another machine.
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
-    ways = [reduce_method(method, point.settings, measured) for point in points]
+    ways = [with_reduction(method, point.settings, inputs) for point in points]
     site, draw = stored.site, np.random.default_rng(0)
     ends = 2 if site.static_end is None else 1
     places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)

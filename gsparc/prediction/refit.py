@@ -13,7 +13,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
 from gsparc.models.method import Method, MethodFactory, Reconditions
-from gsparc.models.per_station import PerStation, known_and_unheard, wrap_per_station
+from gsparc.models.per_station import PerStation, stations_of_fold, wrap_per_station
 from gsparc.training.context import FitContext
 
 
@@ -67,6 +67,6 @@ class Learned:
         if not isinstance(self.method, PerStation):
             return fold
         # A station that was fitted on all rows may have too few of them in a fold.
-        known, _ = known_and_unheard(self.method.factory, self.data, fold)
+        learnable = stations_of_fold(self.method.factory, self.data, fold).learnable
         assert self.data.station is not None
-        return replace(fold, test=fold.test[known[self.data.station[fold.test]]])
+        return replace(fold, test=fold.test[learnable[self.data.station[fold.test]]])

@@ -79,12 +79,12 @@ class LeftOutDensity(torch.autograd.Function):
         return slopes[0] * (lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T)), None, None, None
 
 
-class LogEvidence(torch.autograd.Function):
+class NegativeLogEvidence(torch.autograd.Function):
     """Negative logarithm of the probability of values, some of them only beyond a level."""
 
     @staticmethod
     def forward(ctx: Any, gram: Tensor, values: Tensor, side: Tensor, last: list[PseudoValues]) -> Tensor:
-        """See `log_evidence`."""
+        """Return minus what `log_evidence` does, ()."""
         value, slope, weights = log_evidence(gram.detach(), values.detach(), side, last)
         ctx.save_for_backward(slope, weights)
         return gram.new_tensor(-value)

@@ -310,7 +310,7 @@ class NeighbourSample:
     counts: Tensor
 
     @classmethod
-    def from_rows(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
+    def from_row_then_neighbours(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
         """Split (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
         between = distances(places, places)
         return cls(
@@ -371,7 +371,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         row = covering_rows(values.places[own], LOOKED_AT // len(sets), seed)
         parts.append(own[rows_with_nearest(values.places[own], row, LOOKED_BY)])
     rows = np.concatenate(parts)
-    sample = NeighbourSample.from_rows(every[rows], rest[rows], values.count[rows])
+    sample = NeighbourSample.from_row_then_neighbours(every[rows], rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
     starts = [Kernel.from_lengths((long * share, long), shares, start.noise) for share in SHORTER]

@@ -77,21 +77,21 @@ class PowerRows:
 
     def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
-        return self.subset(draw_rows(self.silent, count, seed))
+        return self.subset(draw_rows_half_heard(self.silent, count, seed))
 
 
-def draw_rows(silent: np.ndarray, count: int, seed: int) -> np.ndarray:
+def draw_rows_half_heard(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
     """Draw at most so many rows, sorted; at least half of them were heard where as many were.
 
-    >>> len(draw_rows(np.arange(100) >= 10, count=8, seed=0))  # ten were heard, 90 were not
+    >>> len(draw_rows_half_heard(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
     8
     """
     rng = np.random.default_rng(seed)
     loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
-    if len(loud) + len(quiet) > count:
-        share = round(count * len(loud) / (len(loud) + len(quiet)))
-        first = max(share, min(len(loud), count // 2))
-        loud, quiet = loud[:first], quiet[: count - first]
+    if len(loud) + len(quiet) > most:
+        share = round(most * len(loud) / (len(loud) + len(quiet)))
+        first = max(share, min(len(loud), most // 2))
+        loud, quiet = loud[:first], quiet[: most - first]
     return np.sort(np.concatenate([loud, quiet]))
 
 

@@ -122,7 +122,7 @@ class SharedTermsPosterior:
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
         own = self.never.columns(flat)
         asked = flat[None], (number,), own[None], self.columns(flat)[None]
-        prior, more, white, shared = self._condition(*asked, rounded=False)
+        prior, more, white, shared = self._condition(*asked, may_round=False)
         terms, kernel = own.unflatten(0, groups), prior.kernel
         left = kernel.correlations(queries, queries) + terms @ terms.mT
         left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
@@ -145,20 +145,20 @@ class SharedTermsPosterior:
             yield from (((one,), part[None]) for part in own.split(QUERIES))
 
     def _condition(
-        self, queries: Tensor, asked: tuple[int, ...], own: Tensor, columns: Tensor, rounded: bool
+        self, queries: Tensor, numbers: tuple[int, ...], own_terms: Tensor, columns: Tensor, may_round: bool
     ) -> Conditioning:
-        """At (S, k, D) with terms `own` (S, k, Q), `columns` (S, k, P); roots are float32 if `rounded`."""
+        """Of processes `numbers` at (S, k, D), own terms (S, k, Q), columns (S, k, P); may be in float32."""
         more, shared = columns @ self.mean, columns.flatten(0, 1)
         prior, white = self.never, list[Tensor]()
-        if asked[0] in self.processes:
-            prior = self.processes[asked[0]].prior
+        if numbers[0] in self.processes:
+            prior = self.processes[numbers[0]].prior
             # With less noise float32's rounding would show in the variance.
-            rounded &= prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
-            places, terms, weights = self._stack(asked, torch.float32 if rounded else torch.float64)
+            rounded = may_round and prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
+            places, terms, weights = self._stack(numbers, torch.float32 if rounded else torch.float64)
             near = prior.kernel.correlations(queries.to(places), places)
-            cross = process_deviation(prior) * near.baddbmm(own.to(places), terms.mT)
+            cross = process_deviation(prior) * near.baddbmm(own_terms.to(places), terms.mT)
             more = more + (cross @ weights)[..., 0]
-            blocks = [self.block(one) for one in asked]
+            blocks = [self.block(one) for one in numbers]
             factors = [block.process.factor for block in blocks]
             parts = [part[:, : len(one.lower)].T for one, part in zip(factors, cross, strict=True)]
             if rounded:
@@ -172,19 +172,19 @@ class SharedTermsPosterior:
             shared = self.factor.whiten(shared.T).T
         return Conditioning(prior, more, white, shared.unflatten(0, queries.shape[:2]))
 
-    def _stack(self, asked: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
+    def _stack(self, numbers: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
         """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes; 0 beyond the rows of one."""
-        if (asked, dtype) not in self._stacks:
+        if (numbers, dtype) not in self._stacks:
             parts = []
-            for one in asked:
+            for one in numbers:
                 block, process = self.block(one), self.processes[one]
                 rest = (block.values - block.columns @ self.mean)[:, None]
                 # The rest is whitened: K^-1 L rest = L^-T rest.
                 weights = process.factor.solve(process.factor.lower @ rest)
                 parts.append((process.rows, process.prior.columns(process.rows), weights))
             padded = (pad_sequence(list(part), batch_first=True) for part in zip(*parts, strict=True))
-            self._stacks[asked, dtype] = tuple(part.to(dtype) for part in padded)
-        return self._stacks[asked, dtype]
+            self._stacks[numbers, dtype] = tuple(part.to(dtype) for part in padded)
+        return self._stacks[numbers, dtype]
 
     @torch.no_grad()
     def left_out(self, number: int) -> LeftOutErrors:

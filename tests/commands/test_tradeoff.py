@@ -38,7 +38,7 @@ def swept(field, tmp_path_factory):
         patch.setattr(tracking, "log_table", lambda loggers, *table: said.append((len(loggers), *table)))
         config.logger = {"any": {"_target_": "lightning.pytorch.loggers.logger.DummyLogger"}}
         facts = task(config)
-        monkey = {"in_multirun": lambda: True, "_sweep_factors": None}  # which is not called
+        monkey = {"in_multirun": lambda: True, "_swept": None}  # which is not called
         with pytest.MonkeyPatch.context() as second:
             for name, value in monkey.items():
                 second.setattr(f"gsparc.commands.tradeoff.{name}", value)

@@ -176,7 +176,7 @@ def _array_twice(whole: bytes) -> bytes:
 NO_FILES = {  # name of the file, what becomes of a sound archive, and what is said
     "absent.npz": (None, "no such file"),
     "half.npz": (lambda whole: whole[: len(whole) // 2], "damaged or not an npz"),
-    "mine.csv": (lambda whole: b"x", "expected a name ending in .npz, .h5, .hdf5 or .mat, found .csv"),
+    "mine.csv": (lambda whole: b"x", r"expected .* \.hdf5, \.nc, \.nc3, \.nc4, \.cdf; found \.csv"),
     "empty.hdf5": (lambda whole: b"", "damaged or not an HDF5"),
     "flipped.npz": (_flipped, "csi: damaged"),
     "locked.npz": (_encrypted, "damaged or not an npz file.*encrypted"),
@@ -195,6 +195,10 @@ def test_files_that_are_no_files(tmp_path, csi_arrays, refused, name):
     if change is not None:
         (tmp_path / name).write_bytes(change(_archive(csi_arrays)))
     refused(says, load_own, tmp_path / name)
+
+
+def test_a_name_that_cannot_be_written_is_said_with_those_that_can(tmp_path, csi_arrays, refused):
+    refused(r"cannot be written as '\.mat'; name it \*\.npz, ", write_own, tmp_path / "mine.mat", csi_arrays)
 
 
 def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, refused, monkeypatch):

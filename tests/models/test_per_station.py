@@ -22,7 +22,7 @@ from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint, loading
 from gsparc.models.fitting import fit_or_resume
-from gsparc.models.per_station import PerStation, known_and_unheard, station_site, wrap_per_station
+from gsparc.models.per_station import PerStation, station_site, stations_of_fold, wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext
@@ -129,7 +129,7 @@ def test_rows_where_nothing_was_heard_did_not_count_for_gsparc():
     """It learns from them, as the processes do that it is compared with, of which a station had none."""
     data = heard(rssi_db=lambda far: free_space(far) - [40, 40, np.nan, 40], sensitivity_db=-80.0)
     for name in ("gsparc", "powers", "gp"):
-        assert known_and_unheard(method_class(name)(), data, fold_of(data))[0].all()
+        assert stations_of_fold(method_class(name)(), data, fold_of(data)).learnable.all()
     context = FitContext(stations="each", effort=0.1)
     method, _ = fit_or_resume(wrap_per_station(method_class("gsparc")(), data), data, fold_of(data), context)
     assert method.predict(data.batch(fold_of(data).test)).mean.isfinite().all()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.reduced import reduce_method
+from gsparc.models.reduced import with_reduction
 from gsparc.processes import neighbourhood, powers
 from gsparc.processes.kernel import Kernel, SmoothRough
 from gsparc.processes.nearest import Nearest, PlaceValues
@@ -155,7 +155,7 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     assert torch.equal(again.predict(batch).mean, said.mean)
     assert torch.allclose(near.mean_at(batch), said.mean)
-    lean = reduce_method(near, {"confidence": False}, {}).predict(batch)
+    lean = with_reduction(near, {"confidence": False}, {}).predict(batch)
     assert lean.variance is None and torch.allclose(lean.mean, said.mean)
 
 

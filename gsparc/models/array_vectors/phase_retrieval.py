@@ -93,7 +93,8 @@ def recover_vectors(
         if not len(unsolved):
             break
         for rows in unsolved.split(max(1, AT_ONCE // starts)):
-            keep_better(rows, _minimise(problem, rows, problem.draw_starts(rows, starts, generator), enough))
+            drawn = problem.draw_flat_starts(rows, starts, generator)
+            keep_better(rows, _minimise(problem, rows, drawn, enough))
         while len(rows := every[cost > enough]):
             solved = (cost <= enough).numpy()
             near = _nearest_solved(positions, rows.numpy(), solved)
@@ -168,7 +169,7 @@ class _Problem:
     def dimension(self) -> int:
         return len(self.forms) + (1 if self.offsets else 0)
 
-    def draw_starts(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
+    def draw_flat_starts(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
         """Starting points (len(rows) * starts, unknowns) of about the spectra's power."""
         start = torch.randn(len(rows), starts, self.dimension, generator=generator, dtype=torch.float64)
         # z2[0] is the mean square of the image up to sign: the first whitened column is the constant.

@@ -29,7 +29,13 @@ from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, fit_kernel_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows, rows_with_nearest
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, draw_rows
+from gsparc.processes.powers import (
+    MOST_ROWS,
+    PowerProcess,
+    PowerRows,
+    condition_on_powers,
+    draw_rows_half_heard,
+)
 from gsparc.processes.prior import Prior
 
 LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
@@ -140,7 +146,7 @@ class GaussianProcess(Differentiable, ClosedForm):
             return self._learn_many(positions, targets)
         self.powers = None
         parts = principal_components(targets, self.kind, self.limit)
-        looked_at = draw_rows(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        looked_at = draw_rows_half_heard(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
         self.scores = Exact.from_values(Prior(kernel), at, scores)
@@ -275,7 +281,7 @@ def choose_nearest_kernel(
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
     values = torch.from_numpy(scores[rows][..., strong]).double()
     once = torch.ones(rows.shape, dtype=torch.float64)
-    sample = NeighbourSample.from_rows(torch.from_numpy(places[rows]), values, once)
+    sample = NeighbourSample.from_row_then_neighbours(torch.from_numpy(places[rows]), values, once)
     result = fit_kernel_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -235,12 +235,24 @@ def station_carrier(site: Site, station: int) -> float:
     return float(site.carrier_hz)
 
 
-def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return moving and static places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
+class QueryEnds(NamedTuple):
+    """Where queries ask.
 
-    Where both ends move, the moving places are (B, 6).
-    A static end that is not where any station stands is of station `NOBODY`.
+    Attributes:
+        moving: (B, 3) float64 places [m]; (B, 6) of both ends where both move.
+        static: (B, 3) float64 places [m].
+        turned: (B, 3, 3) float64, the receiver's turns.
+        station: (B,) int64; `NOBODY` of a static end that is not where any station stands.
     """
+
+    moving: Tensor
+    static: Tensor
+    turned: Tensor
+    station: Tensor
+
+
+def query_ends(site: Site, tx: Tensor, rx: Pose) -> QueryEnds:
+    """Return the ends of queries in a site's terms."""
     count = len(tx)
     receiver = rx.position.expand(count, -1).cpu().double()
     turned = rx.rotation.expand(count, -1, -1).cpu().double()
@@ -249,14 +261,14 @@ def query_ends(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor
     if site.static_end is None:
         moving = torch.cat([sender, receiver], 1)
     if site.stations is None:
-        return moving, static, turned, torch.zeros(count, dtype=torch.long)
+        return QueryEnds(moving, static, turned, torch.zeros(count, dtype=torch.long))
     known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
     # NaN would be the minimum: stations at unknown places are infinitely far instead.
     away, nearest = torch.cdist(static, known).nan_to_num(math.inf).min(1)
     lost = known.isnan().any(1)  # an end at an unknown place is the first station at one
     here = static.isnan().any(1) & lost.any()
     away, nearest = away.masked_fill(here, 0), nearest.masked_fill(here, int(lost.int().argmax()))
-    return moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY)
+    return QueryEnds(moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY))
 
 
 def count_static_ends(groups: tuple[Group, ...]) -> int:

@@ -115,7 +115,7 @@ def compress_groups(
         key = group.displacement_key, group.slot.wavenumber, prior.frame.envelope, noise
         alike = partial(prior[Isotropic].correlation, group, group)
         basis = get_or_make(cache, key, partial(Basis.from_matrix, key, group.places, alike, noise, cache))
-        pieces = tuple(piece for term in prior.signals for piece in term.covariances_in_basis(group, basis))
+        pieces = tuple(one for term in prior.signals for one in term.unit_covariances_in_basis(group, basis))
         design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
         parts.append(BasisGroup.from_group(group, basis.columns, pieces, design))
     return tuple(parts)

@@ -17,6 +17,7 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import (
     Group,
+    QueryEnds,
     Slot,
     SlotPlaces,
     fit_run_factors,
@@ -173,13 +174,13 @@ class ChannelField(ClosedForm):
         """
         # The longest group's covariance with a chunk is the largest matrix of an answer.
         longest = max(len(each.group) for each in self._require_weights())
-        moving, static, turned, station = query_ends(self.site, query.tx, query.rx)
+        ends = query_ends(self.site, query.tx, query.rx)
         if query.station is not None and self.site.stations is not None:
-            station = query.station.cpu()
+            ends = ends._replace(station=query.station.cpu())
         dtype, device = query.tx.dtype, query.tx.device
         parts = [
-            self._predict_part(moving[part], static[part], turned[part], station[part], dtype)
-            for part in torch.arange(len(moving)).split(max(ENTRIES // longest, 1))
+            self._predict_part(QueryEnds(*(each[part] for each in ends)), dtype)
+            for part in torch.arange(len(ends.moving)).split(max(ENTRIES // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         told = Prediction(
@@ -190,15 +191,13 @@ class ChannelField(ClosedForm):
         )
         return self.runs.apply_factors(told, query.run)
 
-    def _predict_part(
-        self, moving: Tensor, static: Tensor, rotation: Tensor, station: Tensor, dtype: torch.dtype
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _predict_part(self, ends: QueryEnds, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
         prior, images, size = self.prior, self.prior.find_term(Images), math.prod(self.channel)
-        mean = torch.zeros(len(moving), *self.channel, dtype=dtype.to_complex())
+        mean = torch.zeros(len(ends.moving), *self.channel, dtype=dtype.to_complex())
         # Without images it is not told, and needs no memory of its own.
         share = mean if images is None else torch.zeros_like(mean)
-        after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
+        after, before = (torch.zeros(len(ends.moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
 
         def add_slot(slot: Slot, rows: Tensor, values: Tensor, variance: Tensor, power: Tensor) -> None:
@@ -207,7 +206,7 @@ class ChannelField(ClosedForm):
                 # Variances are means over all A K entries, of which this slot has so many.
                 total.index_add_(0, rows, part * (values.shape[1] / size))
 
-        for alike in self._group_by_places(moving, rotation, station):
+        for alike in self._group_by_places(ends):
             asked = [SlotPlaces(known.group.slot, places) for known, _, places in alike]
             crosses = prior.end_covariances(asked, [known.group for known, _, _ in alike])
             for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
@@ -218,30 +217,28 @@ class ChannelField(ClosedForm):
                 whole = prior.variance(at) + prior.disturbance_variance
                 left = known.scale * (whole - removed).clamp_min(0)
                 add_slot(at.slot, here, known.given.mean(cross), left, known.scale * whole)
-        unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
-        for place in static[unheard].detach().unique(dim=0):
-            here = torch.nonzero(unheard & (static == place).all(1)).flatten()
+        unheard = torch.tensor([one not in self.stations for one in ends.station.tolist()], dtype=torch.bool)
+        for place in ends.static[unheard].detach().unique(dim=0):
+            here = torch.nonzero(unheard & (ends.static == place).all(1)).flatten()
             if self.common is None:
                 raise ValueError("waves: one static end was learned from, which tells nothing of another")
             for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
                 slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
-                at = SlotPlaces(slot, slot.antenna_places(moving[here], rotation[here]))
+                at = SlotPlaces(slot, slot.antenna_places(ends.moving[here], ends.turned[here]))
                 common, left, whole = self.common.predict(prior, at)
                 add_slot(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
 
-    def _group_by_places(
-        self, moving: Tensor, rotation: Tensor, station: Tensor
-    ) -> list[list[tuple[Weights, Tensor, Tensor]]]:
+    def _group_by_places(self, ends: QueryEnds) -> list[list[tuple[Weights, Tensor, Tensor]]]:
         """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
         alike: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
-        for number in station.unique().tolist():
-            here = torch.nonzero(station == number).flatten()
+        for number in ends.station.unique().tolist():
+            here = torch.nonzero(ends.station == number).flatten()
             for known in self.stations.get(number, ()):
                 slot, learned = known.group.slot, known.group
-                places = slot.antenna_places(moving[here], rotation[here])
+                places = slot.antenna_places(ends.moving[here], ends.turned[here])
                 here_and_there = (to_numpy(one).tobytes() for one in (places, learned.places[:1]))
                 key = slot.wavenumber, learned.displacement_key, *here_and_there
                 alike.setdefault(key, []).append((known, here, places))

@@ -86,12 +86,12 @@ def run_searches(
         """Sources, their phases, and the clutter that the noise does not hide."""
         rows, ended = row_sets[number], is_share_spent(ROUNDS_SHARE)
 
-        def is_last_round() -> bool:
+        def look_then_has_ended() -> bool:
             if look is not None and number == 0:
                 look(rows, estimate_phases(rows, search.scene, QUADRATURE, noise_floor))
             return ended()
 
-        search = Search(rows, transmitter, settings, number, is_last_round, start)
+        search = Search(rows, transmitter, settings, number, look_then_has_ended, start)
         scene = estimate_phases(rows, search.run(), QUADRATURE, noise_floor)
         scene = refine_scene(rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS)
         if look is not None and number == 0:

@@ -181,7 +181,7 @@ def require_static_phase(site: Site, name: str) -> None:
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
-        raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
+        raise ValueError(f"{name}: {site.name} lacks its static place: give it, or take model=complex_gp")
 
 
 def require_fixed_rotation(data: Measurements) -> None:

@@ -56,9 +56,8 @@ class CircularGains:
         self._real.addcmul_(correlation, pair @ pair.T)
         self._imag.addcmul_(correlation, turned @ pair.T)
 
-    def condition(self, noise: Tensor | float) -> Conditioned:
-        """Return the rows' targets given the covariance with noise of this variance."""
-        # In place and for good: `Posterior.conditioned` calls it once.
+    def add_noise_and_condition(self, noise: Tensor | float) -> Conditioned:
+        """Add noise of this variance to `matrix`, for good, and return the rows' targets given it."""
         self._real.diagonal().add_(noise)
         return Conditioned.from_gram(self.matrix, self.target)
 
@@ -109,8 +108,8 @@ class PhasedGains(CircularGains):
         product = (pair * quadrature_variances(self.quadrature)) @ pair.T
         self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
 
-    def condition(self, noise: Tensor | float) -> Conditioned:
-        """Return the rows' targets, half of the noise in either part."""
+    def add_noise_and_condition(self, noise: Tensor | float) -> Conditioned:
+        """Add half of the noise to either part of `matrix`, for good; return the (2 n,) targets given it."""
         self.matrix.diagonal().add_(noise / 2)
         return Conditioned.from_gram(self.matrix, stack_real_imag(self.target)[0])
 
@@ -168,7 +167,8 @@ class Posterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        return self.source_gram.condition(torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor)
+        noise = torch.tensor(self.scene.log_noise).exp() + self.scene.noise_floor
+        return self.source_gram.add_noise_and_condition(noise)
 
     @property
     def covariance(self) -> Tensor:

@@ -83,7 +83,7 @@ def _cost_and_gradient(
     scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).empty_covariance()
     for k, one in enumerate(correlation):
         gains.add_source(scaled[:, k], one)
-    conditioned = gains.condition(noise + scene.noise_floor)
+    conditioned = gains.add_noise_and_condition(noise + scene.noise_floor)
     by_waves = gains.grad_waves(conditioned.nll_gradient, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real
     slopes = torch.autograd.grad(waves, leaves, by_waves * amplitude, materialize_grads=True)

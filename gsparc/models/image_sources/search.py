@@ -85,15 +85,15 @@ class Search:
         transmitter: (3,) float64 [m].
         settings: how.
         number: of the search, added to the seed of the candidates.
-        last_round: asked after every round; no other starts when it says so.
+        after_round: called after every round; no other starts when it says so.
         found: places (K, 3) float64 [m] of sources to start from, and their amplitudes (K,).
     """
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
-        is_last_round: Callable[[], bool], found: Found | None = None,
+        after_round: Callable[[], bool], found: Found | None = None,
     ) -> None:  # fmt: skip
-        self.rows, self.settings, self.last_round = rows, settings, is_last_round
+        self.rows, self.settings, self.after_round = rows, settings, after_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         measured = torch.cat([rows.position, transmitter[None]])
@@ -117,7 +117,7 @@ class Search:
             free = not added
             if free:
                 added = self._add_free_sources()
-            if not added or self.last_round():
+            if not added or self.after_round():
                 break
             self._refine(ROUND_STEPS)
             if free or number % 2:

@@ -66,7 +66,7 @@ def fit_candidates(
     read: dict[str, set[str]] = {}
     race: Race | None = None
 
-    def log_error(what: str, error: float) -> None:
+    def add_to_curve(what: str, error: float) -> None:
         context.log_curve(budget.by_clock.wall, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
@@ -91,9 +91,9 @@ def fit_candidates(
             if field.held is not None:
                 target = in_error_unit(data.batch(field.held.rows).target, data.site)
                 one = Race.from_mean(
-                    field.held.rows, in_error_unit(field.held.mean, data.site), target, log_error
+                    field.held.rows, in_error_unit(field.held.mean, data.site), target, add_to_curve
                 )
-                log_error(name, mean_square(one.missed))
+                add_to_curve(name, mean_square(one.missed))
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:
             if isinstance(error, FellBehind):  # a `ValueError`, too

@@ -64,7 +64,7 @@ class PlanarGaussians(GaussianNetwork):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return spectra (B, H, W)."""
-        move, stretch, turn, light = self._deform(tx, rx)
+        move, stretch, turn, light = self._changes_at(tx, rx)
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
@@ -83,12 +83,12 @@ class PlanarGaussians(GaussianNetwork):
         )
         return image.squeeze(1)
 
-    def _deform(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
+    def _changes_at(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
         return self.deformation(self.base, self.scene.site.moving(tx, rx)).split(CHANGES, -1)
 
     def emit(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `GaussianNetwork`."""
-        return self.strengths + self._deform(tx, rx)[-1][0, :, 0]
+        return self.strengths + self._changes_at(tx, rx)[-1][0, :, 0]
 
     def to_cloud(self, strengths: Tensor) -> GaussianCloud:
         """Return them a metre from the receiver, not yet moved; opacities are strengths: nothing is hidden.

@@ -48,7 +48,7 @@ class DeformedGaussians(GaussianNetwork):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return spectra (B, H, W)."""
         field = self.field
-        place, turn, stretch, fade, light = self._deform(tx, rx)
+        place, turn, stretch, fade, light = self._changes_at(tx, rx)
         stretch = stretch.clamp(-MOST_STRETCH, MOST_STRETCH)
         geometry = (
             field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch).exp(),
@@ -57,13 +57,13 @@ class DeformedGaussians(GaussianNetwork):
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
         return render_each(geometry, signal, rx, self.grid, **self.options).squeeze(1)
 
-    def _deform(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
+    def _changes_at(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
         changes = self.deformation(self.field.means, self.scene.site.moving(tx, rx))
         return changes.split(CHANGES, -1)
 
     def emit(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `GaussianNetwork`; these are drawn where they lie before they are moved."""
-        return torch.sigmoid(self.signals + self._deform(tx, rx)[-1][0, :, 0])
+        return torch.sigmoid(self.signals + self._changes_at(tx, rx)[-1][0, :, 0])
 
 
 @dataclass(eq=False, kw_only=True)

@@ -21,8 +21,8 @@ from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
+from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.density import LOOKS, LogEvidence, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
@@ -238,15 +238,16 @@ def _fit_one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str
         amplitude = max(float(values.square().mean()), 1e-12)
         return Candidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
     starts = [Kernel.from_length(scale * share, 0.1) for share in SHARES]
-    value, kernel = fit_kernel_by_left_out(starts, distance, terms, values)
+    value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values)
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
 def _search_kernel(
-    rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = LOOKS
+    rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = density.LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    value, kernel = fit_kernel_by_left_out(starts, *rows.distances_terms_values(base.trend), looks=limit)
+    known = rows.distances_terms_values(base.trend)
+    value, kernel = density.fit_kernel_by_left_out(starts, *known, looks=limit)
     return replace(base, score=-value - base.cost - cost, kernel=kernel, cost=base.cost + cost)
 
 
@@ -263,7 +264,7 @@ def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
 def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
     distance, terms, values = rows.distances_terms_values(base.trend)
-    gram = base.kernel.amplitude * covariance_of(base.kernel, distance, terms)
+    gram = base.kernel.amplitude * density.covariance_of(base.kernel, distance, terms)
     silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
@@ -283,12 +284,12 @@ def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
     last: list[PseudoValues] = []
 
     def negative_log_evidence(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * covariance_of(base.kernel.with_values(at[:-1]), distance, terms)
-        return LogEvidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
+        gram = at[-1].exp() * density.covariance_of(base.kernel.with_values(at[:-1]), distance, terms)
+        return density.NegativeLogEvidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
 
     start = np.append(base.kernel.parameters().numpy(), math.log(base.kernel.amplitude))
     best, value = start, float(negative_log_evidence(torch.from_numpy(start)))
     if limit:
-        best, value = minimise(negative_log_evidence, [start], bounds, limit, EVIDENCE_SETTLED)
+        best, value = density.minimise(negative_log_evidence, [start], bounds, limit, EVIDENCE_SETTLED)
     kernel = replace(base.kernel.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
     return replace(base, score=-value * len(values) - base.cost, kernel=kernel)

@@ -19,7 +19,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_level_and_power
 from gsparc.field.encoding import Prior
-from gsparc.field.initial import InitTask, Start, keep_random_weights
+from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
 from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
@@ -212,4 +212,4 @@ def start_in_closed_form(task: InitTask) -> Start:
         return Start(process.prior, solve)
     kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
     prior = learn_prior(task.data, task.rows, task.most_anchors, task.seed) if kernel else None
-    return Start(prior, keep_random_weights)
+    return Start(prior)

@@ -269,7 +269,7 @@ class LearnedField(Method):
             )  # fmt: skip
             self._prior = start.prior
             self.model = self._new_model(data.site)
-            solved = start.solve(self.model)
+            solved = None if start.solve is None else start.solve(self.model)
             self._left_out = solved or start.left_out
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
             budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)

@@ -10,6 +10,7 @@ import zlib
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import campaigns
 import field_files
@@ -133,6 +134,9 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
         make.compile_model(waves)
     with pytest.raises(ValueError, match=r"^gp: of spectra only rendered Gaussians can be compiled"):
         make.compile_model(of_images("gp"))
+    moving = SimpleNamespace(method=waves.method, site=replace(waves.site, static_end=None))
+    with pytest.raises(ValueError, match=r"^to=c: channels and spectra of two moving ends .* stands still$"):
+        make.compile_model(moving)
 
 
 MODELS = {

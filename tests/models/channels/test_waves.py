@@ -299,8 +299,8 @@ def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
     here = np.array([[1.0, 2, 3], [np.nan] * 3])
     site = replace(campaign("csi", 8, "tx").site, stations=Stations(here, ("known", "unknown")))
     asked = torch.from_numpy(np.concatenate([here[::-1], here[:1] + 1]))
-    *_, nearest = query_ends(site, asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
-    assert nearest.tolist() == [1, 0, NOBODY]
+    ends = query_ends(site, asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
+    assert ends.station.tolist() == [1, 0, NOBODY]
 
 
 CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"

@@ -85,7 +85,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
     term, slots = field.prior[Directions], [one.group.slot for one in field.weights]
     places = field.weights[0].group.places[:10]
     ends = [SlotPlaces(slot, places) for slot in slots]
-    powers, together = term.powers_at_ends(slots), list(term.end_covariances(ends, ends))
+    powers, together = term.direction_powers(slots), list(term.end_covariances(ends, ends))
     for number in (0, 3):
         alone = term.covariance(ends[number], ends[number])
         torch.testing.assert_close(together[number], alone)

@@ -16,7 +16,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.models.powers.settings import LEAST_SILENT, Candidate, _select_doubtful, process_and_notes
-from gsparc.models.reduced import reduce_method
+from gsparc.models.reduced import with_reduction
 from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
@@ -108,7 +108,7 @@ def test_intervals_cover_what_they_promise():
 def test_a_mean_alone_has_no_variance():
     data, method = town(120), GaussianProcess()
     batch, _ = fit(method, data, 100)
-    lean = reduce_method(method, {"confidence": False}, {}).predict(batch)
+    lean = with_reduction(method, {"confidence": False}, {}).predict(batch)
     assert lean.variance is None and method.reduction_settings() == ("confidence",)
     assert torch.allclose(lean.mean, method.predict(batch).mean, rtol=1e-5)
 

@@ -53,7 +53,7 @@ class Case(NamedTuple):
         return cls.of(found.methods[0], found.data, found.split.folds[0])
 
     def less(self, measured: dict[str, Any] | None = None, **settings: Any) -> Any:
-        return reduced.reduce_method(self.method, settings, measured or self.measured)
+        return reduced.with_reduction(self.method, settings, measured or self.measured)
 
     def answer(self, method: Method | None = None, rows: np.ndarray | None = None) -> Prediction:
         batch = self.data.batch(self.fold.test if rows is None else rows)
@@ -164,7 +164,7 @@ def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.fold, FitContext(Path()))
     assert list(reduced.list_settings(method, {"keep": [1.0, 0.5]})) == [{}]
-    assert reduced.reduce_method(method, {"keep": 0.5}, {}) is method
+    assert reduced.with_reduction(method, {"keep": 0.5}, {}) is method
 
 
 def test_rendered_channels_spare_directions(tmp_path):

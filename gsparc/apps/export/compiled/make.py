@@ -68,7 +68,8 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
         assert site.stations is not None
         raise ValueError(f"station= is needed, one of {', '.join(site.stations.name)}")
     if site.static_end is None and site.kind != "rssi":
-        raise ValueError(f"{method.name} of two moving ends has no compiled form; only powers have")
+        advice = "take a model of powers, or one end that stands still"
+        raise ValueError(f"to=c: channels and spectra of two moving ends have no compiled form; {advice}")
     # An exact form is not measured: its error is that of rounding to float32.
     exact = compile_exactly(method, site)
     if exact is not None:

@@ -41,7 +41,7 @@ class Directions(ChannelTerm):
     concentration: float
     towards: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
 
-    def powers_at_ends(self, slots: Sequence[Slot]) -> Tensor:
+    def direction_powers(self, slots: Sequence[Slot]) -> Tensor:
         """Return powers (T, M) as ends have them; (1, M) where all have the same."""
         if not len(self.towards):
             return self.power[None]
@@ -76,7 +76,7 @@ class Directions(ChannelTerm):
 
     def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances of ends whose correlations are computed once, see `ChannelTerm`."""
-        powers = self.powers_at_ends([one.slot for one in a]).to(torch.complex128)
+        powers = self.direction_powers([one.slot for one in a]).to(torch.complex128)
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
         for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
             each = torch.tensordot(powers, self.correlations(self.angles, wavenumber, part, other), 1)
@@ -86,9 +86,9 @@ class Directions(ChannelTerm):
 
     def variance(self, a: SlotPlaces) -> Tensor:
         """Return the sum of powers (n,), see `ChannelTerm`."""
-        return self.powers_at_ends([a.slot])[0].sum().expand(len(a.places))
+        return self.direction_powers([a.slot])[0].sum().expand(len(a.places))
 
-    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return one of M covariances, see `ChannelTerm`."""
         places, wavenumber = at.places, at.slot.wavenumber
 

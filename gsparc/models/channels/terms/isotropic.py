@@ -33,6 +33,6 @@ class Isotropic(ChannelTerm):
         """Return the same for each, see `ChannelTerm`."""
         return repeat(self.covariance(a[0], b[0]), len(a))
 
-    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
         return basis.dense_piece("isotropic", lambda: [self.correlation(at, at)])

@@ -25,6 +25,6 @@ class Leakage(ChannelTerm):
         """Return `R p` (n, m) float64, see `Term`."""
         return self.power * squared_exponential(distances(a.places, b.places), self.frame.reach)
 
-    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return the one, see `ChannelTerm`."""
         return basis.wave_pieces(self.frame.reach, torch.ones(1, len(at.places), dtype=torch.complex128))

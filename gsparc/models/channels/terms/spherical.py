@@ -39,7 +39,7 @@ class Spherical(ChannelTerm):
     @property
     def split_powers(self) -> tuple[Tensor, Tensor]:
         """Powers (W,) of fixed gains, and of those that vary."""
-        # In the order of `covariances_in_basis`: fixed gains of all waves, then varying ones.
+        # In the order of `unit_covariances_in_basis`: fixed gains of all waves, then varying ones.
         fixed, varying = self.power.view(2, -1)
         return fixed, varying
 
@@ -55,7 +55,7 @@ class Spherical(ChannelTerm):
         """Return that of all waves (n,), see `ChannelTerm`."""
         return self.power.view(2, -1).sum(0) @ self.waves(a).abs().square()
 
-    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return those of fixed gains, then of those that vary, see `ChannelTerm`."""
         waves, frame = self.waves(at), self.frame
         return basis.wave_pieces(frame.reach, waves) + basis.wave_pieces(frame.gain, waves)

@@ -65,7 +65,7 @@ class ChannelTerm(Term[SlotPlaces]):
         """Return the variance (n,) of values at `a`."""
         return self.power.sum().expand(len(a.places))
 
-    def covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
         """Return covariances of unit power in a basis, as many in all as there are powers; here one."""
         # A logarithm of 0 is unit power.
         unit = self.with_values(self.power[:0].new_zeros(1))

@@ -238,7 +238,7 @@ def _drop_doubles(sequences: list[Reflections], transmitter: Tensor, planes: Ten
     return [sequences[i] for i in sorted(distinct)]
 
 
-def log_amplitudes(sequences: tuple[Reflections, ...], direct: float) -> Tensor:
-    """Log amplitudes (K,) float32 to start from, given the direct wave's amplitude."""
+def starting_log_amplitudes(sequences: tuple[Reflections, ...], direct_amplitude: float) -> Tensor:
+    """Return log amplitudes (K,) float32 to start from, given the direct wave's amplitude."""
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
-    return math.log(direct) + order * math.log(REFLECTED)
+    return math.log(direct_amplitude) + order * math.log(REFLECTED)

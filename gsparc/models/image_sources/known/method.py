@@ -15,7 +15,7 @@ from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.clutter.search import INITIAL_KERNEL
 from gsparc.models.image_sources.ensemble import Look, Member, left_out_nmse, occludes_antennas_alike
 from gsparc.models.image_sources.gp_likelihood import estimate_phases
-from gsparc.models.image_sources.known.images import MOST_PATCHES, Mirrors, limit_mirrors, log_amplitudes
+from gsparc.models.image_sources.known import images
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
@@ -86,15 +86,14 @@ class KnownWallsGP(ImageSourceGP):
         """The static end and its images that some receiver sees, with amplitudes to start from."""
         assert self.site is not None
         transmitter = self._transmitter_in_frame()
-        mirrors = Mirrors.from_walls(self.walls, self.site.origin + self.frame.middle.numpy())
+        mirrors = images.Mirrors.from_walls(self.walls, self.site.origin + self.frame.middle.numpy())
         if mirrors.left_out:
-            log.info(
-                "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
-            )
+            most = images.MOST_PATCHES
+            log.info("the %d smallest of the walls are left out: more than %d", mirrors.left_out, most)
         indices = mirrors.large_planes(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
         order = settings.order
-        if order > 1 and limit_mirrors(len(indices), order) < len(indices):
-            few = limit_mirrors(len(indices), order)
+        if order > 1 and images.limit_mirrors(len(indices), order) < len(indices):
+            few = images.limit_mirrors(len(indices), order)
             log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(indices))
         hidden = settings.clutter and occludes_antennas_alike(rows)
         ends = transmitter, rows.position
@@ -102,7 +101,7 @@ class KnownWallsGP(ImageSourceGP):
         obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.empty()
         direct = float(direct_amplitude(rows, transmitter))
         bare = Scene(
-            transmitter, mirrors.planes, sequences, log_amplitudes(sequences, direct),
+            transmitter, mirrors.planes, sequences, images.starting_log_amplitudes(sequences, direct),
             math.log(NOISE), self.kernel, noise_floor=self.noise_floor,
         )  # fmt: skip
         # without planes that neither mirror nor hide

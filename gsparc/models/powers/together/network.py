@@ -23,7 +23,7 @@ from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows
 from gsparc.processes.censored import PseudoValues
-from gsparc.processes.density import LogEvidence, minimise
+from gsparc.processes.density import NegativeLogEvidence, minimise
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import horizontal, moving_end, other_end
@@ -251,7 +251,7 @@ def _fit_by_evidence(
         )
         for i, at_ in enumerate(places):
             gram, rest = own[i] + kernel.gram(at_), values[i] - rough.powers_at(at_, shared, levels)
-            total = total + LogEvidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
+            total = total + NegativeLogEvidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
         return total / count
 
     *bounds, noise = start.terms[0].bounds(middle)
