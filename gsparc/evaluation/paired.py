@@ -70,10 +70,8 @@ class Lead:
         """
         if self.same:
             return f"{one} and {other} have the same {figure} over {self.pairs}"
-        better = (
-            f"{one} {self}" if self.ahead_db >= 0 else f"{other} {replace(self, ahead_db=-self.ahead_db)}"
-        )
-        return f"{one} and {other} do not differ in {figure} ({better})"
+        name, lead = (one, self) if self.ahead_db >= 0 else (other, replace(self, ahead_db=-self.ahead_db))
+        return f"{one} and {other} do not differ in {figure} ({name} {lead})"
 
 
 def lead_over_rows(

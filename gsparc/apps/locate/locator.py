@@ -19,7 +19,7 @@ from gsparc.apps.locate.posterior import Posterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
 from gsparc.apps.locate.site_field import Moments, SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
@@ -111,8 +111,7 @@ class Locator:
             located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
             return replace(located, seconds=time.perf_counter() - started)
 
-        found = dict(run_each(one, range(len(heard)), "snapshots"))
-        return [found[number] for number in range(len(heard))]
+        return run_all(one, range(len(heard)), "snapshots")
 
 
 def learn_trust(
@@ -140,8 +139,7 @@ def learn_trust(
 
     def looks(trust: Trust) -> list[Search]:
         asked = [partial(without.search_cells, heard, trust) for without, heard in pairs]
-        found = dict(run_each(lambda ask: ask(), asked, "snapshots that were left out"))
-        return [found[number] for number in range(len(pairs))]
+        return run_all(lambda ask: ask(), asked, "snapshots that were left out")
 
     trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.

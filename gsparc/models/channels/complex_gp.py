@@ -110,9 +110,8 @@ class ComplexGP(ClosedForm):
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
-        names, run = np.unique(
-            np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
-        )
+        runs = np.zeros(len(known)) if data.run is None else data.run[known]
+        names, run = np.unique(runs, return_inverse=True)
         rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
         few = rows.thin_rows(CHOSEN_ON)
         if len(few) < len(rows):

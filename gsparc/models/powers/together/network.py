@@ -245,10 +245,8 @@ def _fit_by_evidence(
 
     def negative_log_evidence(at: Tensor) -> Tensor:
         shared, levels, logs = at.split((len(SHARED), bands, len(usual)))
-        total, kernel = (
-            _penalty(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(),
-            start.with_values(logs),
-        )
+        total = _penalty(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum()
+        kernel = start.with_values(logs)
         for i, at_ in enumerate(places):
             gram, rest = own[i] + kernel.gram(at_), values[i] - rough.powers_at(at_, shared, levels)
             total = total + LogEvidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
