@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -138,8 +138,9 @@ def learn_trust(
     places = np.concatenate([heard.place for _, heard in pairs])
 
     def looks(trust: Trust) -> list[Search]:
-        asked = [partial(without.search_cells, heard, trust) for without, heard in pairs]
-        return run_all(lambda ask: ask(), asked, "snapshots that were left out")
+        return run_all(
+            lambda pair: pair[0].search_cells(pair[1], trust), pairs, "snapshots that were left out"
+        )
 
     trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.

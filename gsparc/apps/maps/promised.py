@@ -55,9 +55,8 @@ def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
         run = open_files([path], dataset)
         learned = run.retraining()
     except (ValueError, OSError) as error:
-        raise DataError(
-            f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
-        ) from None
+        why = f"{error}; held-out blocks need the training data"
+        raise DataError(f"{why}: dataset.file=..., or promised=false") from None
     # Rows of other data are no evidence of what this model has not seen.
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
@@ -74,11 +73,9 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     known = np.isfinite(field.outage)
     if known.any():
         above = np.mean(field.layer("power_db")[known] >= field.threshold_db)
-        level = f"{field.threshold_db:g} {field.unit} or more"
-        notes.append(
-            f"{1 - field.outage[known].mean():.1%} of the squares with {level} (the mean of 1 - outage); "
-            f"predicted levels, without their errors, say {above:.1%}"
-        )
+        level = f"{field.threshold_db:g} {field.unit} or more (the mean of 1 - outage)"
+        plain = f"predicted levels, without their errors, say {above:.1%}"
+        notes.append(f"{1 - field.outage[known].mean():.1%} of the squares with {level}; {plain}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:

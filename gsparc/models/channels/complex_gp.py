@@ -181,11 +181,7 @@ class ComplexGP(ClosedForm):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {
-            "posterior": to_plain(self._posterior()),
-            "runs": to_plain(self.runs),
-            "shape": list(self.shape),
-        }
+        return {"posterior": to_plain(self._posterior()), "runs": to_plain(self.runs), "shape": [*self.shape]}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

@@ -184,11 +184,8 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
     def negative_log_posterior(at: Tensor) -> Tensor:
         shared, levels, scale, gains = at.split((len(SHARED), bands, 1, count))
         mean = start.powers_at(places, shared, levels) + gains[number]
-        return (
-            _misfits(mean, rows, scale.exp()).sum()
-            + _penalty(shared)
-            + 0.5 * (gains / GAIN_DB).square().sum()
-        )
+        likelihood = _misfits(mean, rows, scale.exp()).sum()
+        return likelihood + _penalty(shared) + 0.5 * (gains / GAIN_DB).square().sum()
 
     begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(2 * GAIN_DB), np.zeros(count)]
     free = [(-math.inf, math.inf)]
