@@ -196,9 +196,8 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
         placed = place in raw.arrays
         if not placed:  # anywhere: nothing is compared with it
             count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
-            low, high = site.moving_box + site.origin
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
-            raw.arrays[place] = np.linspace(low, high, count)
+            raw.arrays[place] = np.linspace(*(site.moving_box + site.origin), count)
         data = align_to_site(interpret_and_log(raw, config.data), site)
     heard = group_snapshots(data, rows if config.data is None else np.arange(len(data)))
     return heard.subset(sample_rows(config, len(heard))), placed

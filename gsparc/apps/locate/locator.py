@@ -138,9 +138,8 @@ def learn_trust(
     places = np.concatenate([heard.place for _, heard in pairs])
 
     def looks(trust: Trust) -> list[Search]:
-        return run_all(
-            lambda pair: pair[0].search_cells(pair[1], trust), pairs, "snapshots that were left out"
-        )
+        what = "snapshots that were left out"
+        return run_all(lambda pair: pair[0].search_cells(pair[1], trust), pairs, what)
 
     trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.
