@@ -104,7 +104,7 @@ def test_baselines_take_saturated_rows_as_measured_and_say_so():
     rows, above = np.arange(60), replace(data, censored=-silent.astype(np.int8))
     fold = Fold(rows, rows[:0], rows[:5])
     notes = build({"_target_": "gsparc.models.baselines.mean.Mean"}).fit(above, fold, FitContext()).notes
-    assert notes == (f"{silent.sum()} rows in saturation are learned from as if measured at that level",)
+    assert notes == (f"mean: {silent.sum()} rows in saturation are learned from as if measured at that level",)
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
     asked = rows[:10]
     found = build({"_target_": model})
     notes = found.fit(data, Fold(rows, rows[:0], asked), FitContext()).notes
-    assert notes == (f"{silent.sum()} rows where nothing was heard are not learned from",)
+    assert notes == (f"{found.name}: {silent.sum()} rows where nothing was heard are not learned from",)
     assert found.count_components() == (~silent).sum()
     again = build({"_target_": model})
     assert not again.fit(data, Fold(heard_rows(data, rows), rows[:0], asked), FitContext()).notes
