@@ -162,8 +162,7 @@ def locate_by_model(
     pairs = zip(located, heard.place, strict=True)
     inside = np.array([one.posterior.mass_above(at) <= level for one, at in pairs]) if placed else None
     places = np.array([one.place for one in located])
-    about: dict[str, list[Any]]
-    about = {"area_m2": [one.area for one in located], "modes": [one.modes for one in located]}
+    about = dict[str, list[Any]](area_m2=[at.area for at in located], modes=[at.modes for at in located])
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count}
     known = method.name, places, heard, trained, origin, placed, about
@@ -196,8 +195,9 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
         placed = place in raw.arrays
         if not placed:  # anywhere: nothing is compared with it
             count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
+            low, high = site.moving_box + site.origin
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
-            raw.arrays[place] = np.linspace(*(site.moving_box + site.origin), count)
+            raw.arrays[place] = np.linspace(low, high, count)
         data = align_to_site(interpret_and_log(raw, config.data), site)
     heard = group_snapshots(data, rows if config.data is None else np.arange(len(data)))
     return heard.subset(sample_rows(config, len(heard))), placed

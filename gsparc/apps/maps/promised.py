@@ -70,11 +70,11 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     share = figures["map/server_unsure"]
     if share and len(field.stations) > 1:
         notes.append(f"best_server: in {share:.1%} of squares (hatched) it is more likely another, or none")
-    if (outage := figures["map/outage"]) is not None:
-        above = np.mean(field.layer("power_db")[np.isfinite(field.outage)] >= field.threshold_db)
+    if (known := np.isfinite(field.outage)).any():
+        above = np.mean(field.layer("power_db")[known] >= field.threshold_db)
         level = f"{field.threshold_db:g} {field.unit} or more (the mean of 1 - outage)"
         plain = f"predicted levels, without their errors, say {above:.1%}"
-        notes.append(f"{1 - outage:.1%} of the squares with {level}; {plain}")
+        notes.append(f"{1 - field.outage[known].mean():.1%} of the squares with {level}; {plain}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
