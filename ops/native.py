@@ -69,13 +69,10 @@ def rasterize(
     means2d, radii = means.new_empty(poses, n, 2), means.new_empty(poses, n)
     visible = means.new_empty(poses, n, dtype=torch.bool)
     inputs = contiguous((*gaussians, pose.position, pose.rotation, features))
-    tensors = (*NO_PLAN, *inputs, image, transmittance, *contiguous((ids,)))
+    tensors = (*NO_PLAN, *inputs, image, transmittance, *contiguous((ids,)), means2d, radii, visible)
     # The kernel counts the entries, and refuses more than the bound before it allocates them.
     sizes, bound = (poses, n, samples, channels), (operators.MEMORY_BOUND,)
-    screen = means2d, radii, visible
-    status = calls.launch(
-        "rasterize", means, *tensors, *screen, sizes=sizes, numbers=bound, settings=settings
-    )
+    status = calls.launch("rasterize", means, *tensors, sizes=sizes, numbers=bound, settings=settings)
     if status <= _native.REFUSED:
         check_memory(_native.REFUSED - status, 4)
     if status == _native.UNSOUND_FEATURES:

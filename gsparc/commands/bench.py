@@ -26,10 +26,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
     every = [case for of in product(config.counts, config.projections) for case in kernel_cases(*of)]
     # Emission and channels are the same under every projection: a dictionary keeps one of each.
-    chosen = {
-        (case.name, case.size): case
-        for case in [*every, loss_case(), *map(training_step_case, config.projections)]
-    }
+    every += [loss_case(), *map(training_step_case, config.projections)]
+    chosen = {(case.name, case.size): case for case in every}
     rows, facts = [], {}
     for (name, size), case in chosen.items():
         seconds = median_s(case.kernel, clock)

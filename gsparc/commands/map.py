@@ -74,7 +74,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     first = predict_map(predictor, dry=True, **query)
     wanted = _pictures(config, first)
     # Refused before evidence is gathered, which takes minutes.
-    check_geotiff(config.geotiff)
+    tiff = check_geotiff(config.geotiff)
     promise = read_or_gather(str(config.ckpt), settings)
     field = predict_map(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
@@ -82,7 +82,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    tiff = check_geotiff(config.geotiff)
     for layer in list_layers(field):
         for suffix in SUFFIXES:
             name = file_name(layer, suffix)

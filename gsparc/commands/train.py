@@ -203,10 +203,8 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
         given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
         if given:
             several = OmegaConf.is_list(given)
-            whole = [
-                one if is_address(one) else str(Path(one).resolve())
-                for one in (given if several else [given])
-            ]
+            paths = given if several else [given]
+            whole = [one if is_address(one) else str(Path(one).resolve()) for one in paths]
             config.dataset[key] = whole if several else whole[0]
     if start is not None:
         try:
@@ -330,11 +328,8 @@ def _draw(
 ) -> None:
     """Draw predictions and what was found; give loggers the pictures, figures and the table."""
     # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
-    own = {
-        f"final/{name}": value
-        for name, value in facts.items()
-        if isinstance(value, (int, float)) and not name.startswith("baseline/")
-    }
+    numbers = {name: value for name, value in facts.items() if isinstance(value, (int, float))}
+    own = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
     tracking.log_final(loggers, own)
     method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
     if len(fold.test):

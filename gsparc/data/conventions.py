@@ -47,13 +47,8 @@ def traits(data: Measurements) -> set[str]:
     """Return what channels or spectra are, as far as conventions ask for it."""
     grid, shape = data.site.grid, data.target.shape[1:]
     if grid is None:
-        tones, square = shape[1] > 1, 1 < shape[0] == shape[1]
-        holds = {
-            "channels": True,
-            "tones": tones,
-            "square": square,
-            "antennas": known_array(data) is not None,
-        }
+        tones, square, antennas = shape[1] > 1, 1 < shape[0] == shape[1], known_array(data) is not None
+        holds = {"channels": True, "tones": tones, "square": square, "antennas": antennas}
     else:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))

@@ -122,6 +122,12 @@ def run_each(
             yield number, heeded.take_result(result) if uses_other_processes() else result
 
 
+def run_all(work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = "") -> list[_Result]:
+    """Return what `work` makes of pieces in their order, whichever ends first; see `run_each`."""
+    found = dict(run_each(work, pieces, what))
+    return [found[number] for number in range(len(pieces))]
+
+
 def _time_left(left: Mapping[float, int], spent: Mapping[float, Sequence[float]]) -> float:
     """Seconds that pieces `left` by cost take, as those of the same cost took, else in proportion to it."""
     # Costs are guesses: methods without a budget take a hundredth of theirs, others several times theirs.

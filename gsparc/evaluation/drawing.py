@@ -88,10 +88,8 @@ def style_of(method: str) -> MethodStyle:
 
 def numbered_style(number: int) -> dict[str, Any]:
     """Colour and line style of the setting with this number, where settings are drawn and not methods."""
-    return {
-        "color": PALETTE[number % len(PALETTE)],
-        "linestyle": STROKES[number // len(PALETTE) % len(STROKES)],
-    }
+    turn, colour = divmod(number, len(PALETTE))
+    return {"color": PALETTE[colour], "linestyle": STROKES[turn % len(STROKES)]}
 
 
 def panels(

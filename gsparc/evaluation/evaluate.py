@@ -135,11 +135,8 @@ def _about(
     Steps are means over folds, the rest of `model/*` is of the first.
     """
     first, every = methods[0], [method.facts() for method in methods]
-    own = every[0] | {
-        key: np.mean([facts[key] for facts in every])
-        for key in ("model/steps", "model/steps_taken")
-        if len(every) > 1 and every[0].get(key) is not None
-    }
+    told = [k for k in ("model/steps", "model/steps_taken") if len(every) > 1 and every[0].get(k) is not None]
+    own = every[0] | {key: np.mean([facts[key] for facts in every]) for key in told}
     return {
         "model/name": first.name, "model/label": common_label(first.name, methods),
         "model/effects": first.effects, **own,
@@ -176,11 +173,8 @@ def time_methods(
     for name in methods:
         room = {OWN: "time", FIELD: FIELD}.get(name, f"baseline/{name}")
         p50, p95 = p50_p95(one[name])
-        facts |= {
-            f"{room}/render_ms_p50": p50,
-            f"{room}/render_ms_p95": p95,
-            f"{room}/ratio_to_copy": p50 / copy_ms,
-        }
+        times = {"render_ms_p50": p50, "render_ms_p95": p95, "ratio_to_copy": p50 / copy_ms}
+        facts |= {f"{room}/{key}": value for key, value in times.items()}
         together = float(np.median(many[name])) / BATCH if name in quick else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
     return facts

@@ -410,9 +410,7 @@ def calibrate_and_store(
     if few := explain_too_few(len(evidence), guarantee, bad, effect):
         return stored, f"{kind_changed}no threshold keeps the bound: {few}"
     other = relax_guarantee(evidence, guarantee, *how)
-    hint = (
-        f"no limit_db= up to {MOST_LAX_DB} is" if other is None else f"limit_db={other.limit_db:g} would be"
-    )
+    hint = f"limit_db={other.limit_db:g} would be" if other else f"no limit_db= up to {MOST_LAX_DB} is"
     reason = "the others are not told from them surely enough"
     if bad < guarantee.alpha:
         reason = f"so few do not show that at most alpha={guarantee.alpha:g} are"

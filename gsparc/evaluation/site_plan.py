@@ -76,9 +76,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
         return None, ""
     power = np.abs(data.target.reshape(len(data), -1)).astype(np.float64)
     # Targets of powers are linear already, those of channels are amplitudes.
-    power = (
-        power * data.site.target_scale if data.site.kind == "rssi" else (power * data.site.target_scale) ** 2
-    )
+    power = (power * data.site.target_scale) ** (1 if data.site.kind == "rssi" else 2)
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))

@@ -164,7 +164,7 @@ class Table:
         """
         heads, rows = self.texts()
         shown = [i for i in range(len(heads)) if not rows or any(row[i] != "-" for row in rows)]
-        least = {i: _longest([*HEAD_PART.findall(heads[i]), *_words(row[i] for row in rows)]) for i in shown}
+        least = {i: _longest_word(heads[i], (row[i] for row in rows)) for i in shown}
         fits = sum(least.values()) + RULE * len(shown) < options.max_width
         natural = sum(max(map(cell_len, (heads[i], *(row[i] for row in rows)))) for i in shown)
         narrow = fits and natural + RULE * len(shown) >= options.max_width
@@ -186,12 +186,8 @@ HEAD_PART = re.compile(r"[^ _]+_?")
 RULE = 3  # characters beside each cell: two spaces and a line
 
 
-def _words(cells: Iterable[str]) -> list[str]:
-    return [word for cell in cells for word in cell.split()]
-
-
-def _longest(words: Iterable[str]) -> int:
-    return max(map(cell_len, words), default=0)
+def _longest_word(head: str, cells: Iterable[str]) -> int:
+    return max(map(cell_len, [*HEAD_PART.findall(head), *" ".join(cells).split()]), default=0)
 
 
 def wrap_head(head: str, width: int) -> str:

@@ -188,11 +188,8 @@ def make_trainer(
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    callbacks = [
-        StageBudget(budget),
-        *watch,
-        *_drop_unusable(context.callbacks(), len(fold.val), module.count is not None),
-    ]
+    usable = _drop_unusable(context.callbacks(), len(fold.val), module.count is not None)
+    callbacks = [StageBudget(budget), *watch, *usable]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)

@@ -199,11 +199,8 @@ class _Rows:
         kernel, found = initial_kernel(self.length, median_spacing(self.places)), []
         for _ in range(ROUNDS):
             factors = self._sweep_factors(factors, self._neighbour_weights(kernel), SWEEPS)
-            found.append(
-                Alignment(
-                    factors, self._left_out_error(factors, self._neighbour_weights(kernel)), "neighbours"
-                )
-            )
+            error = self._left_out_error(factors, self._neighbour_weights(kernel))
+            found.append(Alignment(factors, error, "neighbours"))
             turned = (self.values * factors[:, None]).reshape(len(factors), -1)
             kernel = fit_two_lengths(self.places, turned, self.length, kernel)
         return min(found, key=lambda each: each.error)

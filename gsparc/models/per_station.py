@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.errors import list_first
-from gsparc.data.executor import run_each, uses_other_processes
+from gsparc.data.executor import run_all, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -170,8 +170,8 @@ class PerStation(Method):
             budget.charge(Spent(earlier, earlier))
             return copy, report
 
-        fits = dict(run_each(fit_station, range(len(numbers)), f"stations of {self.name}"))
-        reports = [fits[turn][1] for turn in range(len(numbers))]
+        fits = run_all(fit_station, range(len(numbers)), f"stations of {self.name}")
+        reports = [report for _, report in fits]
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = combine_stations([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
@@ -180,9 +180,8 @@ class PerStation(Method):
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
         limited = worst_clock(*(one.limited_by for one in reports))
-        return FitReport(
-            budget.by_clock.wall, tuple(notes), limited, sum((one.cost for one in reports), Cost())
-        )
+        cost = sum((one.cost for one in reports), Cost())
+        return FitReport(budget.by_clock.wall, tuple(notes), limited, cost)
 
     def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.

@@ -147,9 +147,8 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
     if site.kind == "rssi":
         # From linear powers to decibels, to first order.
         variance = variance * (DECIBELS_PER_NAT / left.mean.flatten().double().clamp_min(TINY_POWER)).square()
-    residual = to_real_entries(in_error_unit(batch.target, site)) - to_real_entries(
-        in_error_unit(left.mean, site)
-    )
+    true, mean = (to_real_entries(in_error_unit(values, site)) for values in (batch.target, left.mean))
+    residual = true - mean
     parts = 2 if batch.target.is_complex() else 1
     # Half of a circular variance is in either part.
     spread = (variance / parts)[:, None].expand_as(residual)

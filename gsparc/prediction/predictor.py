@@ -111,10 +111,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         if number is None:
             raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
-        method, whole = (
-            one.station_method(number) if isinstance(one, PerStation) else one
-            for one in (self.method, self._whole)
-        )
+        both = self.method, self._whole
+        method, whole = (m.station_method(number) if isinstance(m, PerStation) else m for m in both)
         return self._copy_with(method, whole, station_site(self.site, number), self._unit)
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:

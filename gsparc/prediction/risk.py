@@ -401,9 +401,8 @@ def calibrate_threshold(
         ValueError: `kind` is no confidence of this evidence.
     """
     rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = split_choose_calibrate_test(
-        evidence, "spatial" if spatial else "random", rng
-    )
+    how: How = "spatial" if spatial else "random"
+    choose_on, calibrate, test = split_choose_calibrate_test(evidence, how, rng)
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
@@ -435,11 +434,10 @@ def run_trials(
         seed: of the draws.
     """
     realised, coverage, kinds = [], [], []
-    bad = guarantee.is_bad(evidence.error)
+    bad, spatial = guarantee.is_bad(evidence.error), how == "spatial"
     for draw in range(draws):
-        used, threshold, test, _ = calibrate_threshold(
-            evidence, guarantee, kind, how == "spatial", [seed, draw], apart_m
-        )
+        drawn = [seed, draw]
+        used, threshold, test, _ = calibrate_threshold(evidence, guarantee, kind, spatial, drawn, apart_m)
         accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
         realised.append(bad[accepted].mean() if len(accepted) else np.nan)

@@ -134,7 +134,7 @@ class Nearest(Posterior):
 
     def answer(self, queries: Tensor, float64: bool = False) -> Answer:
         """See `Posterior`."""
-        return self._answer_in_blocks(queries, None, float64)
+        return self._answer_blocks(queries, None, float64)
 
     def mean_at(self, queries: Tensor, float64: bool = False) -> Tensor:
         """See `Posterior`."""
@@ -142,12 +142,10 @@ class Nearest(Posterior):
 
     def left_out(self) -> MeanVariance:
         """See `Posterior`."""
-        result = self._answer_in_blocks(self.places, np.arange(len(self.places)))
+        result = self._answer_blocks(self.places, np.arange(len(self.places)))
         return MeanVariance(result.mean, result.variance)
 
-    def _answer_in_blocks(
-        self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False
-    ) -> Answer:
+    def _answer_blocks(self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False) -> Answer:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
         parts = (self._answer(queries[b], None if excluded is None else excluded[b], float64) for b in blocks)
@@ -172,9 +170,8 @@ class Nearest(Posterior):
         left = 1 + self.prior.kernel.noise - known
         if self.prior.trend is not None:
             # What the near rows leave open of the mean law's terms.
-            unsure = (
-                self.prior.columns(queries) - torch.bmm(weights[:, None], self._trend_columns[index])[:, 0]
-            )
+            explained = torch.bmm(weights[:, None], self._trend_columns[index])[:, 0]
+            unsure = self.prior.columns(queries) - explained
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
         return Answer(mean, left.clamp_min(0.0))

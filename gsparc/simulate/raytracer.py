@@ -449,7 +449,6 @@ def _add(scene: Any, solids: Sequence[Solid], scatters: Callable[[str], float]) 
         parameters["vertex_positions"] = np.ascontiguousarray(solid.vertices, dtype=np.float32).ravel()
         parameters["faces"] = np.ascontiguousarray(solid.faces, dtype=np.uint32).ravel()
         parameters.update()
-        objects.append(
-            rt.SceneObject(mi_mesh=mesh, name=solid.name, radio_material=materials[solid.material])
-        )
+        material = materials[solid.material]
+        objects.append(rt.SceneObject(mi_mesh=mesh, name=solid.name, radio_material=material))
     scene.add(objects)

@@ -85,9 +85,7 @@ class Adaptation:
         symbols_per_s: OFDM symbols a second (paper: 28,000).
     """
 
-    def __init__(
-        self, bler_target: float = 0.1, subcarriers: int = 624, symbols_per_s: float = 28_000
-    ) -> None:
+    def __init__(self, bler_target: float = 0.1, subcarriers: int = 624, symbols_per_s: float = 28e3) -> None:
         from sionna.phy.nr.utils import decode_mcs_index
         from sionna.sys import PHYAbstraction
 

@@ -76,16 +76,14 @@ def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) ->
     save(figure, path)
 
 
-def draw_acceptance(
-    acceptance: Mapping[str, tuple[float, pd.DataFrame]], threshold_share: float, path: Path
-) -> None:
+def draw_acceptance(acceptance: Mapping[str, tuple[float, pd.DataFrame]], share: float, path: Path) -> None:
     """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
     figure, grid = panels(5.5 * len(acceptance), 4, 1, len(acceptance))
     for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
         for name in filter(rates.__contains__, SHORT):
             label, colour, _ = STYLES[f"{name}@accepted"]
             axis.plot(rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted"))
-        axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
+        axis.axvline(share, color="grey", linestyle=":", label="accepted under the promise")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")
         axis.legend(fontsize=8)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.prediction.risk import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
@@ -102,9 +102,7 @@ def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Ra
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
     delivered = {c: sum(loop.rates(aside, n, c).chosen_bps.mean() for n in noises) for c in settings["care"]}
     care = max(delivered, key=lambda c: delivered[c])
-    return [
-        rates for _, rates in run_each(lambda noise: loop.rates(band, noise, care), noises, "noise levels")
-    ]
+    return run_all(lambda noise: loop.rates(band, noise, care), noises, "noise levels")
 
 
 def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
@@ -113,11 +111,8 @@ def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
     most; of all positions, of accepted ones, and of all where the others send pilots.
     """
-    return {
-        f"mcs/{one.snr_db:g}dB/{name}": value
-        for one in rates
-        for name, value in _rates_of(one, accepted).items()
-    }
+    parts = ((one.snr_db, _rates_of(one, accepted)) for one in rates)
+    return {f"mcs/{snr:g}dB/{name}": value for snr, own in parts for name, value in own.items()}
 
 
 def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
@@ -178,7 +173,7 @@ def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int,
         steep = fine > coarse and STEEP[0] < worst and rate["perfect"] < STEEP[1]
         return [few, pusch.run(band, level, order[coarse:fine], batch)] if steep else [few]
 
-    return pd.concat(chain(*(blocks for _, blocks in run_each(send_at, levels, "Eb/N0"))), ignore_index=True)
+    return pd.concat(chain(*run_all(send_at, levels, "Eb/N0")), ignore_index=True)
 
 
 def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:

@@ -162,8 +162,7 @@ def locate_by_model(
     pairs = zip(located, heard.place, strict=True)
     inside = np.array([one.posterior.mass_above(at) <= level for one, at in pairs]) if placed else None
     places = np.array([one.place for one in located])
-    about: dict[str, list[Any]]
-    about = {"area_m2": [one.area for one in located], "modes": [one.modes for one in located]}
+    about = dict[str, list[Any]](area_m2=[at.area for at in located], modes=[at.modes for at in located])
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count}
     known = method.name, places, heard, trained, origin, placed, about
@@ -188,10 +187,9 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, and whether their places are known."""
     site, placed = run.data.site, True
     if config.data is None:
-        heard = group_snapshots(run.data, rows_to_score(run.split.folds[0], config.eval_on))
+        data, rows = run.data, rows_to_score(run.split.folds[0], config.eval_on)
     elif is_table(config.data):
-        other = read_like_stored(run.stored[0], config.data)
-        heard = group_snapshots(other, np.arange(len(other)))
+        data = read_like_stored(run.stored[0], config.data)
     else:
         raw, place = read_raw(config.data), f"{site.moving_end}_position"
         placed = place in raw.arrays
@@ -200,8 +198,8 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             low, high = site.moving_box + site.origin
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
-        other = align_to_site(interpret_and_log(raw, config.data), site)
-        heard = group_snapshots(other, np.arange(len(other)))
+        data = align_to_site(interpret_and_log(raw, config.data), site)
+    heard = group_snapshots(data, rows if config.data is None else np.arange(len(data)))
     return heard.subset(sample_rows(config, len(heard))), placed
 
 
@@ -213,20 +211,18 @@ def sample_rows(config: DictConfig, count: int) -> np.ndarray:
     return np.sort(np.random.default_rng(int(config.seed)).permutation(count)[: config.rows])
 
 
-def draw_posteriors(
-    located: Sequence[Located], true: np.ndarray | None, trained: np.ndarray, path: Path
-) -> None:
+def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np.ndarray, path: Path) -> None:
     """Masses of the cells of a few snapshots from above, as one PNG.
 
-    `true` (n, 3) [m] in the coordinates of `located`, or None; `trained` (m, 3): places learned from.
+    `true` (n, 3) [m] in the coordinates of `found`, or None; `known` (m, 3): places learned from.
     """
-    some = np.unique(np.linspace(0, len(located) - 1, SHOWN).round().astype(int))
+    some = np.unique(np.linspace(0, len(found) - 1, SHOWN).round().astype(int))
     columns = min(len(some), 3)
     figure, axes = panels(9, 3.2 * -(-len(some) // columns), -(-len(some) // columns), columns, grid=False)
     for axis in axes.flat[len(some) :]:
         axis.axis("off")
     for axis, number in zip(axes.flat, some, strict=False):
-        one = located[number]
+        one = found[number]
         cells, density = one.posterior.cells, one.posterior.log_density
         order = np.argsort(density)  # cells above one another: the likeliest is seen
         corners = cells.centre[order, :2] - cells.edge[order, :2] / 2
@@ -235,7 +231,7 @@ def draw_posteriors(
         # 12 below the largest, a factor of 160,000: what is fainter is no different from white.
         patches.set_array(np.maximum(density[order], density.max() - 12))
         axis.add_collection(patches)
-        axis.plot(*trained[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
+        axis.plot(*known[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
         axis.plot(*one.place[:2], "x", color="#D55E00", label="located")
         if true is not None:
             axis.plot(*true[number, :2], "o", markerfacecolor="none", color="black", label="heard at")

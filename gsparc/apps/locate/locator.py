@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +19,7 @@ from gsparc.apps.locate.posterior import Posterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
 from gsparc.apps.locate.site_field import Moments, SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
@@ -111,8 +111,7 @@ class Locator:
             located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
             return replace(located, seconds=time.perf_counter() - started)
 
-        found = dict(run_each(one, range(len(heard)), "snapshots"))
-        return [found[number] for number in range(len(heard))]
+        return run_all(one, range(len(heard)), "snapshots")
 
 
 def learn_trust(
@@ -139,9 +138,8 @@ def learn_trust(
     places = np.concatenate([heard.place for _, heard in pairs])
 
     def looks(trust: Trust) -> list[Search]:
-        asked = [partial(without.search_cells, heard, trust) for without, heard in pairs]
-        found = dict(run_each(lambda ask: ask(), asked, "snapshots that were left out"))
-        return [found[number] for number in range(len(pairs))]
+        what = "snapshots that were left out"
+        return run_all(lambda pair: pair[0].search_cells(pair[1], trust), pairs, what)
 
     trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.

@@ -61,9 +61,7 @@ def feature_vectors(heard: Snapshots) -> np.ndarray:
     return np.hstack([turned.real, turned.imag])
 
 
-def _count(
-    nearest: KNeighborsRegressor, counts: tuple[int, ...], known: np.ndarray, places: np.ndarray
-) -> int:
+def _count(model: KNeighborsRegressor, counts: tuple[int, ...], known: np.ndarray, places: np.ndarray) -> int:
     """The number of neighbours of least median error at places left out, by fifths; else the first."""
     rows = np.random.default_rng(0).permutation(len(known))[:MAX_ROWS]
     group = np.unique(places[rows], axis=0, return_inverse=True)[1].reshape(-1)
@@ -75,5 +73,5 @@ def _count(
     def score(fitted: KNeighborsRegressor, asked: np.ndarray, true: np.ndarray) -> float:
         return -float(np.median(np.linalg.norm(fitted.predict(asked) - true, axis=1)))
 
-    search = GridSearchCV(nearest, {"n_neighbors": possible}, scoring=score, cv=GroupKFold(FOLDS))
+    search = GridSearchCV(model, {"n_neighbors": possible}, scoring=score, cv=GroupKFold(FOLDS))
     return int(search.fit(known[rows], places[rows], groups=group).best_params_["n_neighbors"])

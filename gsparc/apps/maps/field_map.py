@@ -294,7 +294,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
     bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
     if len(raster.stations) > 1:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
-    profile = _profile(raster, origin, len(bands), "float32", float("nan"))
+    profile = _profile(raster, origin, count=len(bands), dtype="float32", nodata=float("nan"))
     facts = {
         "unit": raster.unit, "threshold_db": raster.threshold_db, "height_m": raster.grid.height,
         "interval_share": raster.share, "coverage": "the mean of 1 - outage",
@@ -317,7 +317,7 @@ def write_classes(
     import rasterio
 
     values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
-    profile = _profile(raster, origin, 1, "uint16", NO_CLASS)
+    profile = _profile(raster, origin, count=1, dtype="uint16", nodata=NO_CLASS)
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         # Before the values, which fix what colours mean.
         file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
@@ -326,10 +326,8 @@ def write_classes(
         file.update_tags(1, **{str(i): one for i, one in enumerate(names)})
 
 
-def _profile(
-    raster: FieldMap, origin: Georeference | None, count: int, kind: str, none: float
-) -> dict[str, Any]:
-    """What rasterio is told of a file, in the projection of `Georeference`.
+def _profile(raster: FieldMap, origin: Georeference | None, **bands: Any) -> dict[str, Any]:
+    """What rasterio is told of a file and its `bands`, in the projection of `Georeference`.
 
     Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample them. Without
     an `origin` coordinates are metres.
@@ -340,7 +338,7 @@ def _profile(
     here = None if origin is None else f"+lat_0={origin.latitude!r} +lon_0={origin.longitude!r}"
     place = None if here is None else f"+proj=aeqd {here} +datum=WGS84 +units=m +no_defs"
     return {
-        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "count": count,
-        "dtype": kind, "crs": place, "nodata": none, "compress": "deflate", "tiled": True,
+        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "crs": place, **bands,
         "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
+        "compress": "deflate", "tiled": True,
     }  # fmt: skip

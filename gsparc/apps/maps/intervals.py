@@ -136,9 +136,8 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     rms = np.array([float(np.sqrt(mass @ error**2)) for error, mass in spreads])
     typical = np.array([float(np.median(one.spread_db)) for one in bins])
     weight = np.array([len(one) for one in bins], float)
-    isotonic, order = IsotonicRegression(), np.arange(count)
-    half = isotonic.fit_transform(order, half * typical, sample_weight=weight) / typical
-    rms = isotonic.fit_transform(order, rms * typical, sample_weight=weight) / typical
+    rising, order = IsotonicRegression().fit_transform, np.arange(count)
+    half, rms = (rising(order, one * typical, sample_weight=weight) / typical for one in (half, rms))
     tail = None
     if heard.all():
         tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)

@@ -13,7 +13,7 @@ from gsparc.apps.maps import intervals
 from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate
 from gsparc.apps.maps.levels import measured_levels, predicted_levels
 from gsparc.data.errors import DataError
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
@@ -125,9 +125,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         return held_out_evidence(less, data, replace(inner, test=tried), unit)
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
-    by_number = dict(run_each(evidence_without, folds, "fits without blocks of places"))
-    # In the order of folds, whichever ended first: evidence must not depend on it.
-    parts = [by_number[number] for number in folds]
+    parts = run_all(evidence_without, folds, "fits without blocks of places")
     evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
     return Promise(evidence, places, station_numbers(data, learned.rows), side)
 

@@ -55,9 +55,8 @@ def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
         run = open_files([path], dataset)
         learned = run.retraining()
     except (ValueError, OSError) as error:
-        raise DataError(
-            f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
-        ) from None
+        why = f"{error}; held-out blocks need the training data"
+        raise DataError(f"{why}: dataset.file=..., or promised=false") from None
     # Rows of other data are no evidence of what this model has not seen.
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
@@ -71,13 +70,9 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
     share = figures["map/server_unsure"]
     if share and len(field.stations) > 1:
         notes.append(f"best_server: in {share:.1%} of squares (hatched) it is more likely another, or none")
-    known = np.isfinite(field.outage)
-    if known.any():
-        share = 1 - field.outage[known].mean()
-        notes.append(
-            f"{share:.1%} of the predicted squares with {field.threshold_db:g} {field.unit} or more of some "
-            "station (the mean of 1 - outage)"
-        )
+    if (known := np.isfinite(field.outage)).any():
+        level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
+        notes.append(f"{1 - field.outage[known].mean():.1%} of the predicted squares with {level}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:

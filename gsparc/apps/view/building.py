@@ -40,9 +40,7 @@ PATHS = Legend(
 VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
 
-def build_scene(
-    viewed: Viewed, plan: FloorPlan | None, station: str | None, measured: Measured | None
-) -> Scene:
+def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
     points = [viewed.box()]  # where was measured, and the ends that stand
     points += [place[None] for name in viewed.stations if (place := viewed.static_place(name)) is not None]
@@ -58,8 +56,8 @@ def build_scene(
         corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
         parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
-    if measured is not None:
-        parts.append(_measured_part(measured, legends, extent))
+    if seen is not None:
+        parts.append(_measured_part(seen, legends, extent))
     for name in viewed.stations:
         place = viewed.static_place(name)
         if place is not None:
@@ -73,7 +71,7 @@ def build_scene(
         parts.append(_mesh(f"mirror {number}", [square], MIRROR, 0.12))
     for number, box in enumerate(objects.boxes + origin):
         parts.append(_mesh(f"box {number}", box_faces(*box), BOX, 0.35))
-    cloud = model_gaussians(viewed, station, measured)
+    cloud = model_gaussians(viewed, station, seen)
     if cloud is not None:
         parts.append(_cloud_part(cloud, legends, extent))
     faces = np.array(box_faces(*viewed.box()))

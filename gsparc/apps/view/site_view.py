@@ -84,9 +84,7 @@ class SiteView:
         measured = viewed.measured_at(name)
         scene = build_scene(viewed, self.plan, name, measured)
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        tree = None
-        if measured is not None and viewed.site.static_end is not None:
-            tree = cKDTree(measured.places)
+        tree = cKDTree(measured.places) if measured is not None and viewed.site.static_end else None
         return StationView(scene, measured, tree, power)
 
     def extent(self, name: str | None) -> float:

@@ -37,10 +37,7 @@ def offer_scenes() -> None:
     """Make every scene that comes with Sionna a choice of `scene=`, and `scene=help`, which lists them."""
     written = resources.files("gsparc.conf") / "scene"
     # Scenes that have a file of ours keep its settings.
-    nodes = {
-        name: shipped_scene_settings(name)
-        for name in list_shipped_scenes()
-        if not (written / f"{name}.yaml").is_file()
-    }
+    bare = [name for name in list_shipped_scenes() if not (written / f"{name}.yaml").is_file()]
+    nodes = {name: shipped_scene_settings(name) for name in bare}
     for name, node in {**nodes, "help": {"name": "help"}}.items():
         ConfigStore.instance().store(name=name, group="scene", node=node, provider="sionna")

@@ -17,12 +17,8 @@ from gsparc.ops import SphereGrid
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """Return (topic, sentence) pairs about a dataset; topics of what it has none of are left out."""
-    site, phases, own, error = (
-        data.site,
-        estimate_coherence(data),
-        data.release_split,
-        data.site.convergence_error,
-    )
+    site, own, error = data.site, data.release_split, data.site.convergence_error
+    phases = estimate_coherence(data)
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
     weak, strong = (int((data.censored_side(np.arange(len(data))) == side).sum()) for side in (1, -1))
     paths, scale = data.directions, site.target_scale

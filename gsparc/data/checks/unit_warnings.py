@@ -19,9 +19,8 @@ def unit_warnings(data: Measurements) -> list[str]:
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is None:  # degrees became metres: no unit to mistake
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
-        hints = _position_hints(ends[np.isfinite(ends).all(axis=1)]) or _position_hints(
-            data.moving[:, :3] + site.origin
-        )
+        places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + site.origin
+        hints = next(filter(None, map(_position_hints, places)), [])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:

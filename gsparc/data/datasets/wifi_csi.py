@@ -166,11 +166,8 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     if not (kept & right).any():
         raise DataError(f"{path}: no subcarrier has a level; is it a log of another card or chip?")
     if not (kept & right).all():
-        odd = (
-            f", and {list_first(list(tone[kept & ~right]))}: their level is none"
-            if (kept & ~right).any()
-            else ""
-        )
+        wrong = list(tone[kept & ~right])
+        odd = f", and {list_first(wrong)}: their level is none" if wrong else ""
         what = f"{(kept & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
         log.info("%s: %s%s", path, what, odd)
     return tone[kept & right], csi[..., kept & right]

@@ -45,7 +45,6 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
-    most = UNLISTED_EACH * len(heard)
     if not lists.are_strongest():
         # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
         said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
@@ -53,8 +52,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
         if found is None:
             return
         floor, may = found
-        lists, every = replace(lists, length=0), int(may.sum())
-        of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)
+        lists = replace(lists, length=0)
         what = (
             "levels are missing beside weak ones alone: not heard, below the weakest of each station "
             f"({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
@@ -62,19 +60,18 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
-        of_list, station, below = lists.bound_unlisted(floor, stations.position, most)
-        every = int(np.isnan(lists.level).sum())
+        may = np.isnan(lists.level)
         what = (
             f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
             f" below its weakest, in lists shorter than {lists.length}: below {floor.min():.4g} dB"
         )
+    most, every = UNLISTED_EACH * len(heard), int(may.sum())
+    of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
-    check.notes.append(
-        f"{what}; beside {len(heard)} listed, {used} {every} unlisted are used "
-        "(dataset.absent=unknown takes none)"
-    )
+    used = f"{used} {every} unlisted are used (dataset.absent=unknown takes none)"
+    check.notes.append(f"{what}; beside {len(heard)} listed, {used}")
 
 
 def _floors(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:

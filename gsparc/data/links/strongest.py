@@ -129,9 +129,7 @@ class StrongestLists:
         several = (lost.sum(0) > 1) & (lost.sum(0) > BESIDE_STRONG / 2 * edges.sum(0))
         return floor, missing & ~strong & heard & ~several
 
-    def bound_unlisted(
-        self, sensitivity: np.ndarray | float, stations: np.ndarray, most: int, may: np.ndarray | None = None
-    ) -> Silent:
+    def bound_unlisted(self, floor: np.ndarray, stations: np.ndarray, most: int, may: np.ndarray) -> Silent:
         """Return moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong
@@ -139,14 +137,13 @@ class StrongestLists:
         station lets expect it, by distances to the station, and less for each other row nearby that does.
 
         Args:
-            sensitivity: () or (T,) level of lists that are not full [dB].
+            floor: (T,) level of lists that are not full [dB].
             stations: (T, 3) places [m], NaN where unknown.
             most: of all.
-            may: (M, T) which links; None: all without a level.
+            may: (M, T) which links, none with a level.
         """
-        may = np.isnan(self.level) if may is None else may
         weakest = np.nanmin(self.level, 1)[:, None]
-        below = np.where(self.full[:, None], weakest, sensitivity)
+        below = np.where(self.full[:, None], weakest, floor)
         known = np.isfinite(self.place).all(1)
         square = np.floor(np.where(known[:, None], self.place, 0)[:, :2] / ALIKE_M)
         square = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)

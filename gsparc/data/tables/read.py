@@ -231,10 +231,8 @@ class Builder:
         self._add_places(moving, where)
         for name, other in others.items():
             if other.degrees != where.degrees:
-                units = ("degrees", "metres") if where.degrees else ("metres", "degrees")
-                fault = (
-                    f"{units[0]}, those of {ENDS.get(name, 'stations')} in {units[1]}; expected one of them"
-                )
+                rows, rest = ("degrees", "metres") if where.degrees else ("metres", "degrees")
+                fault = f"{rows}, those of {ENDS.get(name, 'stations')} in {rest}; expected one of them"
                 return self.refuse(f"the places of rows are in {fault}")
             still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
             self._add_places(name, other.take(np.array([0])) if still else other, still=still)

@@ -98,7 +98,7 @@ class Budget:
 
 
 def plan_cells(
-    problems: Sequence[Problem], built_in_methods: Mapping[str, Contender], budgets: Sequence[Budget],
+    problems: Sequence[Problem], methods: Mapping[str, Contender], budgets: Sequence[Budget],
     only: Sequence[str] = (),
 ) -> list[tuple[Problem, Cell]]:  # fmt: skip
     """All cells, the most useful first: every problem's table before further seeds and longer budgets.
@@ -112,14 +112,10 @@ def plan_cells(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    able = [(problem, [m for m in built_in_methods.values() if m.serves(problem)]) for problem in problems]
+    able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
     # Methods without a budget first: they stand in the tables of all budgets.
-    cells = [
-        (p, Cell(p.dataset, p.split, m.name, None, p.draw))
-        for p, those in able
-        for m in those
-        if not m.budget
-    ]
+    once = ((p, m) for p, those in able for m in those if not m.budget)
+    cells = [(p, Cell(p.dataset, p.split, m.name, None, p.draw)) for p, m in once]
     longest = max((b.seconds for b in budgets), default=0.0)
     # First seeds of all budgets before second ones.
     turns = ((n, b) for n in range(max((len(b.seeds) for b in budgets), default=0)) for b in budgets)
@@ -145,8 +141,4 @@ def plan_cells(
                 f"only: {pattern!r} matches no cell; they are dataset/split/method/budget/seed, "
                 f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
-    return [
-        one
-        for one, name in zip(cells, names, strict=True)
-        if not only or any(fnmatchcase(name, pattern) for pattern in only)
-    ]
+    return [one for one in cells if not only or any(fnmatchcase(str(one[1]), part) for part in only)]

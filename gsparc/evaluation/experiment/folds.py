@@ -124,9 +124,8 @@ def fit_folds(
         # process_time counts all threads of this process, waiting for others excluded.
         before = time.process_time()
         # Stations are counted in the data that are learned from, which `learned` may have changed.
-        method, report = fitting.fit_or_resume(
-            wrap_per_station(factory, there), there, rows, contexts[number]
-        )
+        unfitted = wrap_per_station(factory, there)
+        method, report = fitting.fit_or_resume(unfitted, there, rows, contexts[number])
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}

@@ -90,11 +90,8 @@ class Problem:
     @property
     def network(self) -> bool:
         """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
-        return (
-            self.kind == "rssi"
-            and self.data.site.stations is not None
-            and find_sectors(self.data) is not None
-        )
+        several = self.kind == "rssi" and self.data.site.stations is not None
+        return several and find_sectors(self.data) is not None
 
     @property
     def scene(self) -> bool:
@@ -173,11 +170,8 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     splits = read_entries("splits", SplitChoice, settings["splits"])
     problems, absent = list[Problem](), list[str]()
     for name, own in ((name, own or {}) for name, own in settings["datasets"].items()):
-        paths = [
-            path or fetched_path_or_none(own.get("dataset", name))
-            for key, path in own.items()
-            if key in ("root", "file")
-        ]
+        given = [path for key, path in own.items() if key in ("root", "file")]
+        paths = [path or fetched_path_or_none(own.get("dataset", name)) for path in given]
         if own and not any(paths):  # a plugin's dataset may need no path
             absent.append(name)
             continue

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
@@ -133,15 +133,14 @@ class Study:
         """
         cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
         work = partial(self._tried, data=data, split=split, context=context, state=state)
-        found = dict(run_each(work, cells, "rounds of variants, possible here or not"))
+        found = run_all(work, cells, "rounds of variants, possible here or not")
         rows = list[dict[str, Any]]()
-        for number, (variant, turn) in enumerate(cells):
-            facts, folder = found[number], context.run_dir / variant / str(turn)
+        for facts, (variant, turn) in zip(found, cells, strict=True):
+            folder = context.run_dir / variant / str(turn)
             if not isinstance(facts, str):
-                rows += [
-                    {"variant": variant, "turn": turn, **one.row(facts, folder)} for one in self.conditions
-                ]
-            elif not any(isinstance(one, dict) for one in found.values()):
+                who = {"variant": variant, "turn": turn}
+                rows += [{**who, **one.row(facts, folder)} for one in self.conditions]
+            elif not any(isinstance(one, dict) for one in found):
                 raise ValueError(facts)
             elif turn == 0:
                 log.info("%s is left out: %s", variant, facts)

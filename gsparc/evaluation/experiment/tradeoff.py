@@ -210,10 +210,8 @@ def facts_of(
         f"test/{figure}": full.value(figure),
     }
     for name, other in others.items():
-        facts |= {
-            f"baseline/{name}/{figure}": other.value(figure),
-            f"baseline/{name}/render_ms_p50": other.p50,
-        }
+        stem = f"baseline/{name}"
+        facts |= {f"{stem}/{figure}": other.value(figure), f"{stem}/render_ms_p50": other.p50}
     return facts
 
 

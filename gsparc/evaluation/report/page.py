@@ -66,9 +66,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         study.tables.append(tables.table_of_seeds(runs))
     if tables.has_draws(runs):
         study.tables.append(tables.table_of_leads(runs))
-    study.tables += [
-        table for table in (tables.table_of_results(runs), tables.table_of_worst(runs)) if table.rows
-    ]
+    last = tables.table_of_results(runs), tables.table_of_worst(runs)
+    study.tables += [table for table in last if table.rows]
     study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
     study.plots = [
         (str(figure.get_label()), _unique_ids(plots.to_svg(figure), number))
@@ -92,11 +91,9 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         groups = tables.group_by_setting(scored).values()
         group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
-        name, lead = max(
-            tables.lead_over_draws(group).items(), key=lambda one: one[1].ahead_db, default=(None, None)
-        )
-        if name and lead:
-            remarks += judge_baseline(name, group[0].setting, group[0].row["figure"], lead)
+        if leads := tables.lead_over_draws(group):
+            name = max(leads, key=lambda one: leads[one].ahead_db)
+            remarks += judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
     elif scored:  # a baseline must beat the best run of the page
         remarks += better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]

@@ -100,10 +100,8 @@ def lead_over_draws(group: Sequence[Run]) -> dict[str, Lead]:
         for base in run.baselines:
             gain = score_db(base) - score_db(run.row)
             gains.setdefault(base["method"], {}).setdefault(run.draw, []).append(gain)
-    return {
-        name: Lead.from_gains(np.array([np.mean(own) for own in draws.values()]), "draws")
-        for name, draws in gains.items()
-    }
+    means = {name: np.array([np.mean(own) for own in draws.values()]) for name, draws in gains.items()}
+    return {name: Lead.from_gains(own, "draws") for name, own in means.items()}
 
 
 def accuracy_column(figure: str, note: str = "") -> Column:
@@ -124,12 +122,15 @@ def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return groups
 
 
+def _run_columns(runs: Sequence[Run]) -> list[Column]:
+    return [SETTING, *([DRAW] * has_draws(runs)), SEED]
+
+
 def table_of_results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
     note = "95 % interval: bootstrap over test samples"
     columns = [
-        SETTING, *([DRAW] * has_draws(runs)), SEED,
-        *(accuracy_column(f, note) for f in _figures(runs[0].row)),
+        *_run_columns(runs), *(accuracy_column(f, note) for f in _figures(runs[0].row)),
         Column(heading_of(CALIBRATION), number_format(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
@@ -181,9 +182,8 @@ def _spread_columns(runs: Sequence[Run]) -> list[Column]:
     figures = [Column(heading_of(f), number_format(f), of=f) for f in _figures(runs[0].row)]
     if any(run.row["alone"] is not None for run in runs):
         deciding = runs[0].row["figure"]
-        figures.append(
-            Column(f"{heading_of(deciding)} of Gaussians alone", number_format(deciding), of="alone")
-        )
+        name = f"{heading_of(deciding)} of Gaussians alone"
+        figures.append(Column(name, number_format(deciding), of="alone"))
     return [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
 
 
@@ -209,9 +209,8 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
     rival = f"baseline/gp/{name}"
     beside = ("gp there",) if any(rival in run.samples for run in runs) else ()
     numbers = [Column(head, ".2f") for head in (heading_of(name), *beside, "confidence")]
-    several = has_draws(runs)
-    columns = [SETTING, *([DRAW] * several), SEED, Column("sample", ""), Column("where [m]", ""), *numbers]
-    rows = []
+    rows, who = [], _run_columns(runs)
+    columns = [*who, Column("sample", ""), Column("where [m]", ""), *numbers]
     for run in runs:
         own = run.samples
         if name not in own:
@@ -221,14 +220,8 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
         for i in np.argsort(-np.nan_to_num(error, nan=-np.inf))[:WORST]:
             place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
             there = [float(own[rival][i]) if rival in own else None for _ in beside]
-            head = [
-                run.setting,
-                *([DRAW.value(run.row)] * several),
-                run.row["seed"],
-                str(own["name"][i]),
-                place,
-            ]
-            rows.append([*head, float(own[name][i]), *there, float(own["confidence"][i])])
+            figures = float(own[name][i]), *there, float(own["confidence"][i])
+            rows.append([*(one.value(run.row) for one in who), str(own["name"][i]), place, *figures])
     hard = "; the Gaussian process there shows whether it is hard for all" if beside else ""
     note = f"The moving end's position{hard}."
     return Table("The three worst places", columns, rows, note)

@@ -71,10 +71,8 @@ def recover_vectors(
     problem = _Problem.from_images(site, images)
     generator = torch.Generator().manual_seed(seed)
     n = len(images)
-    state, cost = (
-        torch.zeros(n, problem.dimension, dtype=torch.float64),
-        torch.full((n,), torch.inf).double(),
-    )
+    state = torch.zeros(n, problem.dimension, dtype=torch.float64)
+    cost = torch.full((n,), torch.inf).double()
     enough = (ENOUGH * problem.expected) ** 2
 
     def keep_better(rows: Tensor, solutions: tuple[Tensor, Tensor]) -> None:

@@ -43,10 +43,8 @@ def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple
         rows: (n,) sorted.
         seed: of the random starts.
     """
-    known, names = (
-        _solved_rows(f"{identity_hash(data)} {seed}"),
-        [one.name for one in fields(RecoveredVectors)],
-    )
+    known = _solved_rows(f"{identity_hash(data)} {seed}")
+    names = [one.name for one in fields(RecoveredVectors)]
     missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
     if len(missing) < len(rows):
         log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))

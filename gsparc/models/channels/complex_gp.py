@@ -110,9 +110,8 @@ class ComplexGP(ClosedForm):
         """Rows (n,) with one factor, settings chosen on some; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
-        names, run = np.unique(
-            np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
-        )
+        runs = np.zeros(len(known)) if data.run is None else data.run[known]
+        names, run = np.unique(runs, return_inverse=True)
         rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
         few = rows.thin_rows(CHOSEN_ON)
         if len(few) < len(rows):
@@ -182,11 +181,7 @@ class ComplexGP(ClosedForm):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {
-            "posterior": to_plain(self._posterior()),
-            "runs": to_plain(self.runs),
-            "shape": list(self.shape),
-        }
+        return {"posterior": to_plain(self._posterior()), "runs": to_plain(self.runs), "shape": [*self.shape]}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

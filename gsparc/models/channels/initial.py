@@ -160,9 +160,7 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudge
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
     both = zip(prior.signal_covariances(groups), groups, strict=True)
     runs = np.unique(np.asarray(data.run)[rows])
-    factors, _ = fit_run_factors(
-        groups, [signal + prior.disturbance(group) for signal, group in both], len(runs)
-    )
+    factors, _ = fit_run_factors(groups, [a + prior.disturbance(group) for a, group in both], len(runs))
     return RunFactors(runs, factors)
 
 
@@ -341,10 +339,8 @@ class _Search:
         steps.append(wide._refit(steps[-1].prior))
         steps.append(wide._move_static_ends(steps[-1]))
         if known and self.settings.directions:
-            wanted = self.settings
-            tied = wide._refit(
-                self._set_directions(steps[-1].prior, wanted.tied, wanted.narrow, wanted.knots)
-            )
+            asked = self.settings
+            tied = wide._refit(self._set_directions(steps[-1].prior, asked.tied, asked.narrow, asked.knots))
             steps.append(wide._choose(steps[-1], tied, "directions by angles to ends", notes))
 
     def _set_directions(

@@ -201,10 +201,8 @@ class SightedSources:
     def predict_left_out(self) -> Tensor:
         """Return the rows (n, R), each receiver and its own visibility left out."""
         at = self.arrival_at_rows(self.visibility.left_out)
-        cross = (
-            self._cross_covariance(self.unobstructed_waves * at.probability, at.retained, self.power)
-            * at.correlation
-        )
+        waves = self.unobstructed_waves * at.probability
+        cross = self._cross_covariance(waves, at.retained, self.power) * at.correlation
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in rows_of_groups(self.observer.numpy()):
             own, _ = left_out_group(inverse, self.conditioned.weights, group)

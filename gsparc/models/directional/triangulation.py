@@ -215,9 +215,8 @@ def _refine_point(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarr
     """One point after `STEPS` Gauss-Newton steps, and its evidence [nats]."""
     points = point[None]
     for _ in range(STEPS):
-        points, covariance = _step_points(
-            rays, points, _responsibility(rays.squared_error(points), error), error
-        )
+        responsibility = _responsibility(rays.squared_error(points), error)
+        points, covariance = _step_points(rays, points, responsibility, error)
     return points[0], float(_evidence(_responsibility(rays.squared_error(points), error), covariance)[0])
 
 

@@ -95,11 +95,9 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
         moving = position[:, None].expand(-1, len(array), -1)
         return torch.cat([moving, torch.from_numpy(array).expand_as(moving)], 2)
     # Antennas of a static receiver without a known array are outputs at the transmitter's place.
-    return (
-        position[:, None]
-        if site.static_end == "rx"
-        else antenna_positions(site, position, rotation, antennas)
-    )
+    if site.static_end == "rx":
+        return position[:, None]
+    return antenna_positions(site, position, rotation, antennas)
 
 
 def draw_rows(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:

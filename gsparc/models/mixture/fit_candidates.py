@@ -90,9 +90,8 @@ def fit_candidates(
                 field.held = _predict_groups(field, data, rows, groups)
             if field.held is not None:
                 target = in_error_unit(data.batch(field.held.rows).target, data.site)
-                one = Race.from_mean(
-                    field.held.rows, in_error_unit(field.held.mean, data.site), target, add_to_curve
-                )
+                mean = in_error_unit(field.held.mean, data.site)
+                one = Race.from_mean(field.held.rows, mean, target, add_to_curve)
                 add_to_curve(name, mean_square(one.missed))
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:

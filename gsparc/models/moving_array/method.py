@@ -172,10 +172,8 @@ class MovingArrayField(Differentiable, ClosedForm):
     def _find_sources(self, spectra: Spectra) -> Tensor:
         """Sources (K, 3) [m]."""
         assert self.site is not None and self.site.grid is not None
-        few, still = (
-            spectra.subset(_spread_rows(len(spectra.places), self.search.rows)),
-            self.site.static_position,
-        )
+        few = spectra.subset(_spread_rows(len(spectra.places), self.search.rows))
+        still = self.site.static_position
         first = None if still is None else torch.from_numpy(np.asarray(still)).float()
         return find_sources(
             few.lags, few.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,

@@ -58,10 +58,8 @@ class Coder(Network):
         pick = torch.randint(own.shape[0] * own.shape[1], (len(own),), generator=generator)
         # Snapshots have arbitrary phase: rotating both ends augments the data.
         angle = 2 * math.pi * torch.rand(len(own), 1, generator=generator)
-        turn, noise = (
-            torch.polar(torch.ones_like(angle), angle),
-            torch.randn(len(own), self.code, generator=generator),
-        )
+        turn = torch.polar(torch.ones_like(angle), angle)
+        noise = torch.randn(len(own), self.code, generator=generator)
         guess, divergence = self.downlink_and_divergence(own.flatten(0, 1)[pick] * turn, noise)
         missed = guess - (batch.target / scale).flatten(0, 1)[pick] * turn
         return missed.abs().square().mean() + self.weight * divergence.mean()
@@ -98,6 +96,5 @@ class Fire(UplinkMethod, TrainedPeer):
         network, uplink = self.fitted(), self.query_uplinks(query)
         assert isinstance(network, Coder)
         own, scale = network.unit_uplink_and_level(uplink)
-        return Prediction(
-            network.downlink_and_divergence(own.flatten(0, 1))[0].view(*own.shape[:2], -1) * scale
-        )
+        downlink, _ = network.downlink_and_divergence(own.flatten(0, 1))
+        return Prediction(downlink.view(*own.shape[:2], -1) * scale)

@@ -115,9 +115,7 @@ def candidate_priors(
     trends = [MeanLaw(add_terms_to_trend(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
     if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
-    found = sorted(
-        (choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda one: -one.score
-    )
+    found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
     if rows.silent.any():
         return found
     return [*found, _fit_kriging(rows.draw_subset(max_rows, seed), trends[0].trend)]
@@ -198,11 +196,8 @@ def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows:
         scores = [_fit_by_evidence(weighed, one, 0).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
-        best = max(
-            best,
-            _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0),
-            key=lambda one: one.score,
-        )
+        two = _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0)
+        best = max(best, two, key=lambda one: one.score)
     if len(loud.places) > len(few.places) and not out_of_time():
         # A look at all rows costs several at few: what was found on these is near already.
         best = _search_kernel(loud, best, [best.kernel], limit=REFINED)
@@ -254,11 +249,9 @@ def _search_kernel(
 def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
     scale = float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
-    near = [
-        Kernel.from_lengths((kernel.length * a, kernel.length * b), (0.5, 0.5), kernel.noise)
-        for a, b in SPLITS
-    ]
-    return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), kernel.noise) for a, b in WIDE]
+    fit, noise = kernel.length, kernel.noise
+    near = [Kernel.from_lengths((fit * a, fit * b), (0.5, 0.5), noise) for a, b in SPLITS]
+    return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), noise) for a, b in WIDE]
 
 
 def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:

@@ -8,7 +8,7 @@ is not the one of least norm).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -187,9 +187,7 @@ def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: 
     gaps = np.array(GAPS) * spacing
     about = (seen.outputs - mean).numpy()
     means, _ = means_and_variances(inverse.numpy(), about, distance, centres, gaps)
-    some = ImageEmissions(
-        seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation
-    ).subset(centres)
+    some = replace(seen, weights=seen.weights[pixels], images=seen.images[:, pixels]).subset(centres)
     predicted = [some.render(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
     images = seen.images[:, pixels].double().numpy()
     return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())

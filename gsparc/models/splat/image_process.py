@@ -62,11 +62,8 @@ class ImageProcess(LearnedField):
         """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
         self._average, self._average_mean = None, None
         with heeded.set_apart():
-            why = (
-                array_obstacle(data.site, "rx", "the receiver moves")
-                if self.settings.response.array
-                else None
-            )
+            array = self.settings.response.array
+            why = array_obstacle(data.site, "rx", "the receiver moves") if array else None
             if why is not None:
                 raise ValueError(f"{self.name}: {why}")
             # Without Gaussians no step changes anything.

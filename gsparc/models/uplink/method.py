@@ -69,9 +69,8 @@ class UplinkField(UplinkMethod):
         self._set_search(self.site, replace(self.settings, leakage=best))
         # The search is not fitted to training rows: their errors are unbiased.
         rows = rng.permutation(fold.train)[: self.teachers]
-        self.error_model = RelativeErrorRegression.from_rows(
-            *self._features_and_errors(data, rows, rng, PIECES)
-        )
+        pairs = self._features_and_errors(data, rows, rng, PIECES)
+        self.error_model = RelativeErrorRegression.from_rows(*pairs)
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
         return FitReport(started.spent, (note,))
 

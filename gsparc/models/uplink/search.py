@@ -61,10 +61,8 @@ class Sources:
 
     def channels(self, aperture: Aperture) -> Tensor:
         """Return channels (B, A, K) complex64."""
-        over_antennas, over_tones = (
-            antenna_responses(self.direction, aperture),
-            tone_responses(self.delay, aperture),
-        )
+        over_antennas = antenna_responses(self.direction, aperture)
+        over_tones = tone_responses(self.delay, aperture)
         return (over_antennas * self.gain[..., None]).transpose(1, 2) @ over_tones
 
     def error_variance(self, aperture: Aperture) -> Tensor:

@@ -86,22 +86,20 @@ class TappedDelayLine:
         return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
 
 
-def write_taps(
-    predictor: Predictor, way: Trajectory, settings: Mapping[str, Any], file: Path
-) -> dict[str, Any]:
+def write_taps(predictor: Predictor, way: Trajectory, how: Mapping[str, Any], file: Path) -> dict[str, Any]:
     """Write taps, delays and Doppler to `file`, an npz.
 
     Args:
         predictor: of channels with one end that stands still.
         way: of the other end.
-        settings: see conf/export.yaml.
+        how: see conf/export.yaml.
         file: path of the npz.
 
     Returns:
         Facts: `taps/*`; decibels of what taps leave of the channels.
     """
     site = predictor.site
-    line = fit_taps(predictor, way, settings["taps"], settings["rate_hz"], settings["antennas"])
+    line = fit_taps(predictor, way, how["taps"], how["rate_hz"], how["antennas"])
     units = {"time_s": "s", f"{site.moving_end}_position": "m", "delay_s": "s", "doppler_hz": "Hz"}
     delay_s = (line.first + np.arange(line.gain.shape[2])) / line.rate_hz
     known = (line.time_s, way.places_at(line.time_s), delay_s, line.doppler_hz())

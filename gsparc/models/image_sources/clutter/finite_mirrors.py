@@ -97,11 +97,8 @@ def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMi
     Sites whose rasters have more than `MAX_CELLS` are not searched; cells of those with more than
     `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
     """
-    rows, room, known = (
-        unexplained.rows,
-        unexplained.room,
-        unexplained.scene.planes[unexplained.scene.walls],
-    )
+    rows, room = unexplained.rows, unexplained.room
+    known = unexplained.scene.planes[unexplained.scene.walls]
     wavelength = LIGHT / float(rows.frequency.mean())
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []

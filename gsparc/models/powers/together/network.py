@@ -184,11 +184,8 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
     def negative_log_posterior(at: Tensor) -> Tensor:
         shared, levels, scale, gains = at.split((len(SHARED), bands, 1, count))
         mean = start.powers_at(places, shared, levels) + gains[number]
-        return (
-            _misfits(mean, rows, scale.exp()).sum()
-            + _penalty(shared)
-            + 0.5 * (gains / GAIN_DB).square().sum()
-        )
+        likelihood = _misfits(mean, rows, scale.exp()).sum()
+        return likelihood + _penalty(shared) + 0.5 * (gains / GAIN_DB).square().sum()
 
     begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(2 * GAIN_DB), np.zeros(count)]
     free = [(-math.inf, math.inf)]
@@ -245,10 +242,8 @@ def _fit_by_evidence(
 
     def negative_log_evidence(at: Tensor) -> Tensor:
         shared, levels, logs = at.split((len(SHARED), bands, len(usual)))
-        total, kernel = (
-            _penalty(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum(),
-            start.with_values(logs),
-        )
+        total = _penalty(shared) + 0.5 * ((logs - usual) / LOOSE).square().sum()
+        kernel = start.with_values(logs)
         for i, at_ in enumerate(places):
             gram, rest = own[i] + kernel.gram(at_), values[i] - rough.powers_at(at_, shared, levels)
             total = total + NegativeLogEvidence.apply(gram, rest, side[i], last[i])  # type: ignore[no-untyped-call]
