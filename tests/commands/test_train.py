@@ -75,9 +75,9 @@ def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, 
     monkeypatch.setattr(Trainer, "fit", reached)
     with pytest.raises(ZeroDivisionError):
         train(short(spectra_file), tmp_path)
-    text = (root.parent / "ARCHITECTURE.md").read_text().partition("Calls down to the Trainer: ")[2]
+    text = (root.parent / "ARCHITECTURE.md").read_text().partition("To the Trainer: ")[2]
     named = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
-    down = iter(["task", *called])
+    down = iter(["run", "task", *called])
     assert named[-1] == called[-1] and all(
         name in down for name in named
     )  # in this order, helpers between them left out

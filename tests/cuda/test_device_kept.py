@@ -10,7 +10,7 @@ import torch
 from modules import module
 
 from gsparc.ops import Pose, backends, validation
-from gsparc.ops.results import Plan
+from gsparc.ops.results import Plan, Weights
 
 
 class Shapes:
@@ -32,7 +32,7 @@ class Shapes:
 
     @staticmethod
     def mean_weights(plan, gaussians):
-        return tuple(gaussians.opacities.expand(plan.num_poses, -1) for _ in range(2))
+        return Weights(*(gaussians.opacities.expand(plan.num_poses, -1) for _ in range(2)))
 
 
 def unlooked(pose: Pose, means: torch.Tensor) -> Pose:

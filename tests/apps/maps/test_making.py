@@ -11,6 +11,7 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
+from gsparc.apps.maps import field_map
 from gsparc.apps.maps.field_map import (
     REFUSED,
     best_server,
