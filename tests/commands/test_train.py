@@ -77,10 +77,11 @@ def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, 
         train(short(spectra_file), tmp_path)
     text = (root.parent / "ARCHITECTURE.md").read_text().partition("To the Trainer: ")[2]
     named = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
+    returned = {"by_station", "align_phases", "create_for", "choose"}  # have ended when steps begin
+    named = [name for name in named if name not in returned]
     down = iter(["run", "task", *called])
-    assert named[-1] == called[-1] and all(
-        name in down for name in named
-    )  # in this order, helpers between them left out
+    # In this order, helpers between them left out.
+    assert named[-1] == called[-1] and all(name in down for name in named)
 
 
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):

@@ -89,7 +89,8 @@ class ImageProcess(LearnedField):
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
-        log.info("%s: %s", self.name, self.description)
+        with heeded.set_apart():
+            log.info("%s: %s", self.name, self.description)
         # Steps that no look kept, or all of the field: paid for, and not in the answer.
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._is_process_alone:
