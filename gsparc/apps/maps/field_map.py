@@ -287,7 +287,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
     `outage`, `best_server` (number of the station; the band's tags name each), `server_chance`, and then the
-    power of each of several stations. Tags give unit, threshold, height and share.
+    power of each of several stations. Tags give unit, threshold and height.
     """
     import rasterio
 
@@ -295,12 +295,8 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
     if len(raster.stations) > 1:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
     profile = _profile(raster, origin, count=len(bands), dtype="float32", nodata=float("nan"))
-    facts = {
-        "unit": raster.unit, "threshold_db": raster.threshold_db, "height_m": raster.grid.height,
-        "interval_share": raster.share, "coverage": "the mean of 1 - outage",
-    }  # fmt: skip
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
-        file.update_tags(**facts)
+        file.update_tags(unit=raster.unit, threshold_db=raster.threshold_db, height_m=raster.grid.height)
         for number, (name, values) in enumerate(bands.items(), 1):
             # GeoTIFF rows go from north to south, ours from south to north.
             file.write(np.flipud(values).astype(np.float32), number)

@@ -123,15 +123,13 @@ def predict_map(
         power, error = mean.astype(np.float32), error.astype(np.float32)
         best = best_server(power)
         strongest = np.maximum(best, 0), np.arange(len(best))
+        below = calibration.probability_below(threshold_db, power[strongest], error[strongest])
         alike_here = np.where(first == best, errors_alike[:, cells], 0.0)
         part = {
             "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
             "best_server": best, "sinr_db": sinr(power, load_of, noise_db, carrier),
             "server_chance": server_chance(power, error, usual, floor, alike_here),
-            "outage": field_map.outage_probability(
-                power, error, threshold_db, alike_here,
-                calibration.probability_below(threshold_db, power[strongest], error[strongest]),
-            ),
+            "outage": field_map.outage_probability(power, error, threshold_db, alike_here, below),
         }  # fmt: skip
         for name, layer in part.items():
             flat[name][..., cells] = layer

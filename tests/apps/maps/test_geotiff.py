@@ -55,11 +55,7 @@ def test_a_file_for_other_programs_said_neither_unit_nor_colours(tmp_path):
     write_classes(tmp_path / "best.tif", found, ORIGIN, number, found.stations, colours)
     with rasterio.open(tmp_path / "map.tif") as file:
         tags = file.tags()
-        assert (tags["unit"], tags["threshold_db"], tags["coverage"]) == (
-            "dB",
-            "-70.0",
-            "the mean of 1 - outage",
-        )
+        assert (tags["unit"], tags["threshold_db"]) == ("dB", "-70.0")
     with rasterio.open(tmp_path / "best.tif") as file:
         assert file.dtypes == ("uint16",) and file.colormap(1)[1][:3] == tuple((255 * colours[1]).astype(int))
         assert file.tags(1)["0"] == found.stations[0]
