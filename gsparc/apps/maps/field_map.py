@@ -318,7 +318,6 @@ def write_classes(
         # Before the values, which fix what colours mean.
         file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
         file.write(values, 1)
-        file.set_band_description(1, "best_server")
         file.update_tags(1, **{str(i): one for i, one in enumerate(names)})
 
 

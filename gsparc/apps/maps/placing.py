@@ -186,8 +186,9 @@ def place_station(
     before = np.nan if dry else float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
     given = {head: words[order] for head, words in given.items()}
+    value, low, high = scores[order].T
     lost = 1 - float(known.mean())
-    return Placement(candidates[order], *scores[order].T, before, lost, grid, still[:, :2], error, given)
+    return Placement(candidates[order], value, low, high, before, lost, grid, still[:, :2], error, given)
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
