@@ -67,7 +67,7 @@ def test_degrees_are_cells_of_metres(tmp_path):
 @pytest.mark.parametrize(("change", "cell_m", "said"), [
     ({"rssi [dBm]": "loud"}, 5.0, "damaged or not a Parquet file .*loud"),
     ({"rssi [dBm]": None, "rssi [W]": 1e-9}, 5.0, r"dataset.columns.rssi_db=COLUMN"),
-    ({"x": None}, 5.0, "no x; say"),
+    ({"x": None}, 5.0, "none is x; say"),
     ({}, 0.0, "dataset.cell_m=0.0"),
     ({}, None, "dataset.cell_m"),
 ])  # fmt: skip

@@ -72,8 +72,15 @@ def of_images(model, **settings):
 
 
 def of_a_real_array(real, folder):
-    """The release's 160 spectra."""
-    settings = ("dataset=rfid", f"dataset.root={real}", "model=gsparc", "baselines=[]", "logger=none")
+    """The release's 160 spectra; with the averaged process the form is distilled."""
+    settings = (
+        "model.effects.residual=false",
+        "dataset=rfid",
+        f"dataset.root={real}",
+        "model=gsparc",
+        "baselines=[]",
+        "logger=none",
+    )
     train(campaigns.compose(*settings), folder)
     return gsparc.load(folder / "model.ckpt")
 
