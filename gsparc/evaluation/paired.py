@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import t
 
 from gsparc.evaluation.metric_formats import WITH_SILENT
 
-SURE = 2.0  # standard errors that a difference must exceed
+LEVEL = 0.95  # of the interval that must not hold 0
 SAME_DB = 0.005  # less is 0 in the two decimals of a table
 
 
@@ -23,18 +24,20 @@ class Lead:
     Attributes:
         ahead_db: mean difference over pairs [dB].
         error_db: its standard error; NaN of a single pair [dB].
-        pairs: how many, of what: `32 test rows`.
+        count: of the pairs.
+        of: what they are: `test rows`.
     """
 
     ahead_db: float
     error_db: float
-    pairs: str
+    count: int
+    of: str
 
     @staticmethod
     def from_gains(gains: np.ndarray, of: str) -> Lead:
         """Return the mean of differences (n,) of pairs that are `of` rows or draws."""
         error = gains.std(ddof=1) / len(gains) ** 0.5 if len(gains) > 1 else np.nan
-        return Lead(float(gains.mean()), float(error), f"{len(gains)} {of}")
+        return Lead(float(gains.mean()), float(error), len(gains), of)
 
     @staticmethod
     def from_facts(facts: Mapping[str, Any], stem: str) -> Lead | None:
@@ -42,11 +45,17 @@ class Lead:
         ahead, error = facts.get(f"{stem}_db"), facts.get(f"{stem}_error_db")
         if ahead is None or error is None:
             return None
-        return Lead(ahead, error, str(facts.get(f"{stem}_pairs")))
+        count, _, of = str(facts[f"{stem}_pairs"]).partition(" ")
+        return Lead(ahead, error, int(count), of)
 
     def facts(self) -> dict[str, Any]:
         """Return it as values of a summary, by the ends of their names."""
         return {"_db": self.ahead_db, "_error_db": self.error_db, "_pairs": self.pairs}
+
+    @property
+    def pairs(self) -> str:
+        """Return how many, of what: `32 test rows`."""
+        return f"{self.count} {self.of}"
 
     @property
     def same(self) -> bool:
@@ -55,22 +64,27 @@ class Lead:
 
     @property
     def sure(self) -> bool:
-        """Whether the difference exceeds `SURE` standard errors; False where these are not known."""
-        return not self.same and abs(self.ahead_db) > SURE * self.error_db
+        """Whether its 95 % interval (Student's t) leaves out 0: few draws tell their scatter badly."""
+        reach = t.ppf((1 + LEVEL) / 2, max(self.count - 1, 1)) * self.error_db
+        return not self.same and bool(abs(self.ahead_db) > reach)  # False where it is not known
 
     def __str__(self) -> str:
         error = "" if np.isnan(self.error_db) else f" ± {self.error_db:.2f}"
         return f"{self.ahead_db:.2f}{error} dB better over {self.pairs}"
 
+    def __neg__(self) -> Lead:
+        """Return what the other has more."""
+        return replace(self, ahead_db=-self.ahead_db)
+
     def no_difference(self, one: str, other: str, figure: str) -> str:
         """Return the sentence for two methods, `one` having the lead, of which neither is surely better.
 
-        >>> Lead(0.22, 0.14, "32 test rows").no_difference("gp", "gsparc", "psnr_db")
+        >>> Lead(0.22, 0.14, 32, "test rows").no_difference("gp", "gsparc", "psnr_db")
         'gp and gsparc are not told apart in psnr_db: gp is 0.22 ± 0.14 dB better over 32 test rows'
         """
         if self.same:
             return f"{one} and {other} have the same {figure} over {self.pairs}"
-        better, lead = (one, self) if self.ahead_db >= 0 else (other, replace(self, ahead_db=-self.ahead_db))
+        better, lead = (one, self) if self.ahead_db >= 0 else (other, -self)
         return f"{one} and {other} are not told apart in {figure}: {better} is {lead}"
 
 

@@ -10,7 +10,6 @@ import re
 import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -238,8 +237,7 @@ def judge_baseline(baseline: str, method: str, figure: str, lead: Lead) -> list[
     if not lead.sure:
         return [f"the baseline {lead.no_difference(baseline, method, figure)}"]
     if lead.ahead_db < 0:
-        ahead = replace(lead, ahead_db=-lead.ahead_db)
-        return [f"{method} is {ahead} in {figure} than {baseline}, the best baseline"]
+        return [f"{method} is {-lead} in {figure} than {baseline}, the best baseline"]
     return [f"the baseline {baseline} is {lead} in {figure}: the better choice for this data and split"]
 
 

@@ -20,7 +20,7 @@ from gsparc.data.links.georeference import Georeference
 REFUSED = -1  # of `best_server`
 NO_CLASS = 65535  # in a file of classes
 OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
-NODES = 16  # levels of the strongest that its rivals are weighed against
+SHARES = ((np.arange(16) + 0.5) / 16)[:, None]  # quantiles of the strongest that rivals are weighed against
 OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
 ARRAYS = (*OF_STATIONS, "sinr_db", "outage", "best_server", "server_chance")
 
@@ -174,16 +174,11 @@ def server_chance(
     mean, spread = power_db[first, cell], error_db[first, cell]
     # A station unknown in a cell may be heard all the same: as likely as it usually is.
     rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
-    # Of a rival given the strongest: never 0, which would divide.
-    left, total = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), np.zeros(len(number))
     above = ndtr((mean - floor_db[first]) / spread)
-    for share in (np.arange(NODES) + 0.5) / NODES:
-        z = ndtri(1 - np.maximum(above, 1e-12) * share)  # equally likely levels above the floor
-        beats = ndtr((mean + spread * z - rival - alike * wrong * z) / left)
-        beats[first, cell] = 1.0
-        # A station that nothing is known of anywhere is left out: it counts as beaten.
-        total += np.nan_to_num(beats, nan=1.0).prod(axis=0)
-    return np.where(number == REFUSED, np.nan, above * total / NODES).astype(np.float32)
+    z = ndtri(1 - np.maximum(above, 1e-12) * SHARES)  # equally likely levels above the floor
+    # A station that nothing is known of anywhere is left out: it counts as beaten.
+    beaten = _chance_all_below(mean + spread * z, rival, wrong, alike, z, first)
+    return np.where(number == REFUSED, np.nan, above * beaten).astype(np.float32)
 
 
 def outage_probability(
@@ -199,14 +194,23 @@ def outage_probability(
         threshold_db: in the unit of the powers.
         below: (n,) probability that the strongest lies below it.
     """
-    first, cell = np.maximum(best_server(power_db), 0), np.arange(power_db.shape[1])
-    left, total = error_db * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), np.zeros(len(cell))
-    for share in (np.arange(NODES) + 0.5) / NODES:
-        z = ndtri(np.clip(below, 1e-12, 1) * share)  # equally likely levels of the strongest below it
-        missed = ndtr((threshold_db - power_db - alike * error_db * z) / left)
-        missed[first, cell] = 1.0
-        total += np.nan_to_num(missed, nan=1.0).prod(axis=0)
-    return (below * total / NODES).astype(np.float32)
+    z = ndtri(np.clip(below, 1e-12, 1) * SHARES)  # equally likely levels of the strongest below it
+    limit, first = np.full(z.shape, threshold_db), np.maximum(best_server(power_db), 0)
+    return (below * _chance_all_below(limit, power_db, error_db, alike, z, first)).astype(np.float32)
+
+
+def _chance_all_below(
+    limit: np.ndarray, rival: np.ndarray, wrong: np.ndarray, alike: np.ndarray | float, z: np.ndarray,
+    first: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Chance (n,) that all of (T, n) rivals lie below limits (K, n), mean over K normal errors of `first`."""
+    # Of a rival given the strongest: never 0, which would divide.
+    left, total, cell = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), 0.0, np.arange(len(first))
+    for level, error in zip(limit, z, strict=True):
+        below = ndtr((level - rival - alike * wrong * error) / left)
+        below[first, cell] = 1.0
+        total = total + np.nan_to_num(below, nan=1.0).prod(axis=0)
+    return np.asarray(total / len(z))
 
 
 def sinr(
