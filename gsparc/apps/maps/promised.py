@@ -71,7 +71,7 @@ def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
         notes.append(f"best_server: in {unsure:.1%} of squares (hatched) it is more likely another, or none")
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
-        notes.append(f"{1 - outage:.1%} of the predicted squares with {level}")
+        notes.append(f"{1 - float(outage):.1%} of the predicted squares with {level}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
