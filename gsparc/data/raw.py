@@ -70,7 +70,7 @@ def read_raw(path: str | Path) -> Raw:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected *.npz, *.h5, *.mat, or Parquet with dataset.cell_m")
+        raise DataError(f"{path}: no such file; expected *.npz, *.h5 or *.mat")
     readers = {".npz": _read_npz, ".mat": _read_mat, **dict.fromkeys(HDF5_SUFFIXES, _read_hdf5)}
     if path.suffix.lower() not in readers:
         suffix, known = path.suffix or "no ending", ", ".join(readers)
