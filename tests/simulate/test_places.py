@@ -15,7 +15,7 @@ from gsparc.simulate.scenes.receivers import (
     nearest_rows,
     place_receivers,
 )
-from gsparc.simulate.scenes.solid import box, write_mesh
+from gsparc.simulate.scenes.solid import box, write_walls
 from gsparc.simulate.scenes.transmitters import place_transmitters
 
 AREA = np.array([[0.0, 0.0], [20.0, 10.0]])
@@ -135,8 +135,8 @@ def test_many_places_are_found_where_few_are_allowed():
 
 def test_mesh_is_read_back_as_walls(tmp_path):
     solid = box("hut", "brick", (1, 2, 0), (4, 4, 3), turn=0.3)
-    write_mesh(solid.vertices[solid.faces], tmp_path / "scene.obj")
-    walls = read_walls(tmp_path / "scene.obj")
+    write_walls(solid.vertices[solid.faces], tmp_path / "walls.yaml")
+    walls = read_walls(tmp_path / "walls.yaml")
     assert len(walls) == 12
     np.testing.assert_allclose(sum(map(polygon_area, walls.faces)), 2 * (6 + 9 + 6), atol=0.02)
     corners = np.unique(np.concatenate(walls.faces), axis=0)
