@@ -22,7 +22,7 @@ from gsparc.simulate.effects import from_config as effects_from_config
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.report import choice_table, closing_sentences, summary_facts
 from gsparc.simulate.scenes.build import from_config as scene_from_config
-from gsparc.simulate.scenes.solid import write_mesh
+from gsparc.simulate.scenes.solid import write_walls
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
@@ -69,7 +69,7 @@ def task(config: DictConfig) -> Outcome | None:
     triangles = outcome.survey.engine.triangles()
     # The exact shoebox has walls, but no triangles.
     if len(triangles):
-        write_mesh(triangles, run_dir / "scene.obj")
+        write_walls(triangles, run_dir / "walls.yaml")
     if outcome.choice is not None:
         console.print(choice_table(outcome.choice))
     load = os.getloadavg()[0] / (os.cpu_count() or 1)

@@ -23,7 +23,7 @@ from gsparc.data import heeded
 from gsparc.data.checks.describe import summarise
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution
-from gsparc.data.files import SUMMARY, is_address, set_aside
+from gsparc.data.files import SUMMARY, set_aside
 from gsparc.data.instantiate import config_node, import_target
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements
@@ -202,10 +202,7 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
         if given:
-            several = OmegaConf.is_list(given)
-            paths = given if several else [given]
-            whole = [one if is_address(one) else str(Path(one).resolve()) for one in paths]
-            config.dataset[key] = whole if several else whole[0]
+            config.dataset[key] = str(Path(given).resolve())
     if start is not None:
         try:
             module.measurements = align_to_site(module.measurements, checkpoint.read(start).site)

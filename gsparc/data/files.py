@@ -8,7 +8,7 @@ import io
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.resources import files
@@ -30,24 +30,6 @@ def platform_cache() -> Path:
     """Return where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "gsparc"
-
-
-def is_address(path: object) -> bool:
-    """Tell whether a file is a URL, which reading downloads."""
-    return "://" in str(path)
-
-
-class SeveralFiles(str):
-    """Paths of files that are read as one; as a string, their names joined for messages."""
-
-    paths: tuple[str, ...]
-
-    def __new__(cls, paths: Iterable[str | Path]) -> SeveralFiles:
-        """Of at least one path."""
-        every = tuple(map(str, paths))
-        result = super().__new__(cls, ", ".join(every))
-        result.paths = every
-        return result
 
 
 def read_text(path: Path, missing_message: str, kind: str = "text") -> str:

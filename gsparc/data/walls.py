@@ -1,7 +1,4 @@
-"""Known walls and boxes of a scene out of a file: YAML (a simulated room too), or a mesh as Wavefront OBJ.
-
-The format of meshes: Wavefront Technologies, "Object files (.obj)", Advanced Visualizer manual, appendix B1.
-"""
+"""Known walls and boxes of a scene out of a YAML file, that of a simulated room too."""
 
 from __future__ import annotations
 
@@ -12,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_text, read_yaml
+from gsparc.data.files import read_yaml
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import finite_array
 
-EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`), or a mesh *.obj"
+EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`)"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here
     "name", "transmitter_m", "area_m", "height_m", "num_receivers", "carrier_hz", "bandwidth_hz",
     "subcarriers", "test_share", "builder", "builtin", "xml", "open_sky", "scattering", "seed", "file",
@@ -43,7 +40,7 @@ class SceneWalls:
 
 
 def read_walls(path: str | Path | None) -> SceneWalls:
-    """Read walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
+    """Read walls out of `*.yaml` or `*.yml`; lengths are metres.
 
     Raises:
         DataError: none is named, no such file, of another kind, or with walls that cannot be.
@@ -52,13 +49,10 @@ def read_walls(path: str | Path | None) -> SceneWalls:
         raise DataError(f"init.file is missing; expected a file of {EXPECTED}")
     path, problems = Path(path), Problems(path)
     walls = SceneWalls((), np.zeros((0, 2, 3)))
-    if path.suffix.lower() == ".obj":
-        walls = _mesh(path, problems)
-    elif path.suffix.lower() in (".yaml", ".yml"):
+    if path.suffix.lower() in (".yaml", ".yml"):
         walls = _table(path, problems)
     else:
-        how = "export meshes of other kinds as Wavefront OBJ"
-        problems.add(path, f"walls are read from *.yaml or *.obj; {how}")
+        problems.add(path, "walls are read from *.yaml; write a mesh's faces as `walls`: corners_m of each")
     if not problems and not len(walls):
         problems.add(path, f"no walls in it; expected {EXPECTED}")
     problems.raise_if_any()
@@ -116,46 +110,6 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
         else:
             boxes = corners
     return faces, boxes
-
-
-def _mesh(path: Path, problems: Problems) -> SceneWalls:
-    """Faces of all objects; texture, normals and materials are not read."""
-    lines = read_text(path, "missing; expected a mesh *.obj").splitlines()
-    corners: list[list[float]] = []
-    faces: list[np.ndarray] = []
-    for number, line in enumerate(lines, 1):
-        name, *values = line.split("#")[0].split() or [""]
-        try:
-            if name == "v":
-                # A fourth value is a weight, further ones are colours: x, y and z are enough.
-                x, y, z = (float(value) for value in values[:3])
-                corners.append([x, y, z])
-            elif name == "f":
-                faces += _triangles_or_flat(_corners(values, corners))
-        except (ValueError, IndexError):
-            problems.add_rows(path, [f"line {number}"], f"{line.strip()!r} is no vertex or face of an OBJ")
-        if len(problems) >= Problems.LIMIT:
-            # A file of another kind with this suffix is wrong in every line.
-            break
-    if not all(np.isfinite(face).all() for face in faces):
-        problems.add(path, "a vertex is not finite")
-    # Exporters write triangles of no area, which have no normal.
-    return SceneWalls(tuple(face for face in faces if polygon_area(face) >= SMALLEST_M2), np.zeros((0, 2, 3)))
-
-
-def _corners(values: list[str], corners: list[list[float]]) -> np.ndarray:
-    """Corners (C, 3) of a face; numbers count from 1, or back from the last where negative."""
-    numbers = [int(value.partition("/")[0]) for value in values]
-    if len(numbers) < 3 or 0 in numbers or max(numbers) > len(corners) or -min(numbers) > len(corners):
-        raise IndexError
-    return np.array([corners[n - 1 if n > 0 else n] for n in numbers], dtype=np.float64)
-
-
-def _triangles_or_flat(face: np.ndarray) -> list[np.ndarray]:
-    """A face as it is where it is flat, else its fan of triangles."""
-    if len(face) == 3 or polygon_area(face) < SMALLEST_M2 or distance_from_plane(face) <= FLAT_M:
-        return [face]
-    return [face[[0, i, i + 1]] for i in range(1, len(face) - 1)]
 
 
 def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
-from gsparc.data.files import is_address
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, Split, hash_indices
@@ -158,19 +157,13 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
     Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
 
     Raises:
-        ValueError: no name, or an address that only the file names: reading would tell somebody who reads it.
+        ValueError: no name.
     """
     before = stored.configuration.get(group)
     before = before if isinstance(before, dict) else {}
     now = {key: value for key, value in (overrides or {}).items() if value is not None}
     if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
         before = {}
-    asked = [key for key, value in before.items() if is_address(value) and key not in now]
-    if asked:
-        where = f"{group}.{asked[0]}"
-        raise ValueError(
-            f"{stored.path}: {where} is an address, {before[asked[0]]}; say {where}=... yourself"
-        )
     settings = {**before, **now}
     if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")

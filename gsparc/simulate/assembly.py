@@ -171,8 +171,7 @@ def _arrays(
     arrays["csi"] = allocate(csi.shape, np.complex64)
     for part in row_blocks(csi):
         arrays["csi"][part] = csi[part]
-    if campaign.spectrum.kind == "bartlett":
-        arrays["spectrum_array_position"] = campaign.spectrum.elements(wavelength)
+    arrays["spectrum_array_position"] = campaign.spectrum.elements(wavelength)
     if csi.shape[1] > 1:
         elements = campaign.csi.elements(wavelength)
         # one row per channel: with two polarisations every place is there twice

@@ -1,14 +1,13 @@
 """Definition of a simulated spectrum, stored with the data.
 
-Bartlett (default): the elements of a stated planar array receive the paths from above their ground plane on
+Bartlett: the elements of a stated planar array receive the paths from above their ground plane on
 every subcarrier, `P(u) = mean_k |a(u)^H h_k|^2 / M^2`, the subcarriers being the snapshots; interference
-within the band is real. Beam: every path is a von Mises-Fisher spot of a stated width carrying its power.
+within the band is real.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,7 +16,6 @@ from gsparc.ops import SphereGrid
 from gsparc.simulate.paths import Paths
 
 BLOCK = 64  # receivers at once
-KINDS = ("bartlett", "beam")
 
 
 @dataclass(frozen=True)
@@ -45,28 +43,22 @@ class ArraySettings:
 
 @dataclass(frozen=True)
 class SpectrumSettings(ArraySettings):
-    """One definition of a spectrum, of the array of a `bartlett` one; a pixel is an amplitude.
+    """One definition of a spectrum, of an array; a pixel is an amplitude.
 
     Attributes:
-        kind: `bartlett` or `beam`.
-        beam_deg: full width at half power of the beam kernel [deg].
         height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width of azimuth.
     """
 
     rows: int = 8
     columns: int = 8
-    kind: Literal["bartlett", "beam"] = "bartlett"
-    beam_deg: float = 10.0
     height: int = 90
     width: int = 360
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"spectrum.kind={self.kind}: expected {' or '.join(KINDS)}")
         if min(self.rows, self.columns, self.height, self.width) < 1:
             raise ValueError("spectrum: rows, columns, height and width are at least 1")
-        if not (self.spacing > 0 and self.beam_deg > 0):
-            raise ValueError("spectrum: spacing and beam_deg are positive")
+        if not self.spacing > 0:
+            raise ValueError("spectrum: spacing is positive")
 
     @property
     def grid(self) -> SphereGrid:
@@ -75,8 +67,7 @@ class SpectrumSettings(ArraySettings):
 
     def attributes(self) -> dict[str, str | float | int]:
         """Return the definition as attributes of a file."""
-        drop = ("beam_deg",) if self.kind == "bartlett" else ("rows", "columns", "spacing")
-        own = {f"spectrum_{key}": value for key, value in asdict(self).items() if key not in drop}
+        own = {f"spectrum_{key}": value for key, value in asdict(self).items()}
         return {"normalisation": "max", "spectrum_scale": "amplitude", **own}
 
 
@@ -91,15 +82,12 @@ def render_spectra(
     above = paths.select_paths(paths.direction[:, 2] >= 0)
     images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)
     elements = settings.elements(wavelength)
-    bartlett = _Bartlett(settings) if settings.kind == "bartlett" else None
+    bartlett = _Bartlett(settings)
     for start in range(0, len(paths), BLOCK):
         rows = slice(start, start + BLOCK)
         some = above.select_receivers(np.arange(len(paths))[rows])
-        if bartlett is None:
-            images[rows] = _beams(some, settings)
-        else:
-            channels = some.responses(frequency_hz, elements, wavelength)
-            images[rows] = bartlett(channels.reshape(len(some), -1, len(elements), len(frequency_hz)))
+        channels = some.responses(frequency_hz, elements, wavelength)
+        images[rows] = bartlett(channels.reshape(len(some), -1, len(elements), len(frequency_hz)))
     np.sqrt(images, out=images)
     peak = images.max(axis=(1, 2))
     peak = np.where(peak > 0, peak, 1.0).astype(np.float64)
@@ -141,16 +129,3 @@ class _Bartlett:
         parts = np.concatenate([lags.real, lags.imag], axis=1)
         image = torch.from_numpy(parts.astype(np.float32)) @ self.basis
         return image.clamp_(min=0).numpy().reshape(-1, *self.image)
-
-
-def _beams(paths: Paths, settings: SpectrumSettings) -> np.ndarray:
-    """Power (R, H, W): von Mises-Fisher spots of half power at half the stated width."""
-    directions = settings.grid.directions(torch.float32).reshape(-1, 3)
-    # exp(sharpness (cos - 1)) is a half at half of the beam's width.
-    sharpness = np.log(2) / (1 - np.cos(np.radians(settings.beam_deg) / 2))
-    images = np.zeros((len(paths), settings.height * settings.width), dtype=np.float32)
-    for r, (start, stop) in enumerate(zip(paths.offsets[:-1], paths.offsets[1:], strict=True)):
-        cosine = torch.from_numpy(paths.direction[start:stop]) @ directions.T
-        power = torch.from_numpy(paths.power[start:stop].astype(np.float32))
-        images[r] = power @ torch.exp(sharpness * (cosine - 1))
-    return images.reshape(-1, settings.height, settings.width)

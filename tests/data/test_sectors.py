@@ -8,7 +8,6 @@ from networks import network
 
 from gsparc.data.datasets.own import read_any
 from gsparc.data.errors import Caution, DataError
-from gsparc.data.load import datamodule
 from gsparc.data.tables.sectors import band_hz, earfcn_hz
 
 
@@ -54,23 +53,6 @@ def test_a_list_of_sites_is_read_whole(tmp_path):
     unread = [note for note in reading.notes if "not read: column 'Vendor'" in note]
     assert len(unread) == 1 and isinstance(unread[0], Caution)
     assert not any("Height" in note and "not used" in note for note in reading.notes)
-
-
-def test_two_drives_are_learned_as_one(tmp_path):
-    """`dataset.file=[a.csv,b.csv]` was a TypeError."""
-    _, drive, heads, sites = drive_of(tmp_path)
-    lines = drive.read_text().splitlines(keepends=True)
-    (tmp_path / "a.csv").write_text("".join(lines[:241]))
-    (tmp_path / "b.csv").write_text("".join([lines[0], *lines[241:]]))
-    how = {"stations_file": str(write(tmp_path / "sites.csv", heads, sites))}
-    both, whole = (
-        datamodule({"name": "own", "file": file, **how}).measurements
-        for file in ([str(tmp_path / "a.csv"), str(tmp_path / "b.csv")], str(drive))
-    )
-    assert both.site.name == "a+b" and both.row_names[-1].startswith("b.csv, line ")
-    np.testing.assert_array_equal(both.target, whole.target)
-    with pytest.raises(DataError, match=r"sites.csv: other columns than .*a.csv has"):
-        _ = datamodule({"name": "own", "file": [str(tmp_path / "a.csv"), how["stations_file"]]}).measurements
 
 
 def test_a_cell_number_that_two_listed_stations_share_is_named(tmp_path):

@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from gsparc.data.errors import DataError
@@ -36,35 +35,10 @@ def test_walls_are_polygons(tmp_path):
     assert [polygon_area(face) for face in found.faces] == [12.0, 2.0] and len(found.boxes) == 0
 
 
-MESH = """# a square as triangles, one as a polygon, texture and normals, numbers from the end
-o wall
-v 0 0 0
-v 2 0 0
-v 2 0 2
-v 0 0 2
-vn 0 1 0
-usemtl concrete
-f 1//1 2//1 3//1
-f 1 3/1/1 4
-v 0 1 0
-v 2 1 0
-v 2 3 0.5
-v 0 3 0
-f -4 -3 -2 -1
-"""
-
-
-def test_a_mesh_has_faces_that_are_flat(tmp_path):
-    found = read_walls(written(tmp_path / "a.obj", MESH))
-    assert [len(face) for face in found.faces] == [3, 3, 3, 3]  # the last polygon is not flat
-    assert sum(polygon_area(face) for face in found.faces[:2]) == pytest.approx(4.0)
-    assert np.array_equal(found.faces[2], [[0, 1, 0], [2, 1, 0], [2, 3, 0.5]])
-
-
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("a.ply", "ply", r"a\.ply: walls are read from \*\.yaml or \*\.obj; export meshes of other kinds"),
+        ("a.ply", "ply", r"a\.ply: walls are read from \*\.yaml; write a mesh's faces as `walls`"),
         ("a.yaml", "{}", r"a\.yaml: no walls in it; expected `walls`"),
         ("a.yaml", "wals: []", r"wals: no such key; did you mean 'walls'\?"),
         ("a.yaml", "room: {size_m: [4, 3]}", r"room\.size_m=\[4, 3\]: expected three lengths above 0"),
@@ -73,10 +47,6 @@ def test_a_mesh_has_faces_that_are_flat(tmp_path):
         ("a.yaml", "walls: [{corners_m: [[0, 0, 0], [1, 1]]}]", r"walls\[0\]: expected corners_m"),
         ("a.yaml", "walls: [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]]", r"walls\[0\]: its corners lie on a line"),
         ("a.yaml", "walls: [[[0,0,0],[1,0,0],[1,1,1],[0,1,0]]]", r"walls\[0\]: .* off a plane; split it"),
-        ("a.obj", "v 0 0 0\nf 1 2 3\n", r"a\.obj, line 2: 'f 1 2 3' is no vertex or face of an OBJ"),
-        ("a.obj", "v 0 zero 0\n", r"a\.obj, line 1: .* is no vertex or face"),
-        ("a.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "a vertex is not finite"),
-        ("a.obj", "v 0 0 0\n", r"a\.obj: no walls in it"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_in_one_line(name, text, said, tmp_path):
@@ -85,9 +55,8 @@ def test_what_cannot_be_is_refused_in_one_line(name, text, said, tmp_path):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("name", ["absent.yaml", "absent.obj"])
-def test_a_missing_file_is_named(name, tmp_path):
-    with pytest.raises(DataError, match=rf"{name}: missing; expected"):
-        read_walls(tmp_path / name)
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"absent\.yaml: missing; expected"):
+        read_walls(tmp_path / "absent.yaml")
     with pytest.raises(DataError, match=r"init\.file is missing; expected a file of `walls`"):
         read_walls(None)

@@ -9,7 +9,7 @@ import numpy as np
 from access_points import walks
 from campaigns import brief, channels, compose, powers, spectra
 from crashes import small_campaign
-from measured import write_npz, write_release, write_walk
+from measured import write_npz, write_walk
 from PIL import Image
 from towns import town_file
 
@@ -69,7 +69,7 @@ class Tiny:
         heads = "x,y,z,rssi_dbm,station\n"
         rng = np.random.default_rng(0)
         rows = [f"{x},{y},1.5,{-60 - x},{s}\n" for x, y in rng.uniform(0, 20, (40, 2)) for s in ("a", "b")]
-        for name in ("drive", "second"):
+        for name in ("drive", "second", "both"):
             (folder / f"{name}.csv").write_text(heads + "".join(rows))
         (folder / "sites.csv").write_text("name,x,y,z\na,0,0,8\nb,20,20,8\n")
         (folder / "places.csv").write_text("x,y,z\n10,10,1.5\n20,20,1.5\n")
@@ -88,7 +88,7 @@ class Tiny:
                     simulate(small_campaign(40), path.with_suffix(".h5")),
                     path.with_suffix(".h5"),
                 )[1],
-                "techtile": lambda: write_release(path),
+                "techtile": lambda: write_npz(path, "techtile"),
                 "powder": lambda: write_walk(path),
                 "ble": lambda: write_npz(path, "ble"),
                 "fingerprints": lambda: self._walks(path.with_suffix(".npz")),
@@ -151,7 +151,7 @@ class Tiny:
                 words |= {"dataset.count": "40", "dataset.root": str(self.folder)}
             elif chosen == "argos_sim":
                 words |= {"dataset.stand_in.count": "60", "dataset.stand_in.root": str(self.folder)}
-            elif "drive.csv" not in words.get("dataset.file", ""):
+            elif words.get("dataset.file") not in ("drive.csv", "both.csv"):
                 words["dataset.file"] = self.data(kind)
             if kind == "argos":
                 words |= {"dataset.positions": "true"} if chosen == "argos_sim" else {}

@@ -214,7 +214,9 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
 
 
 def test_walk_has_times(tmp_path):
-    walk = {"kind": "trajectory", "points_m": [[0.5, 0.5], [5.5, 0.5]], "speed_m_s": 1.0, "every_s": 0.2}
+    rows = [f"{0.5 + 0.2 * i:.1f},0.5,1.2,{0.2 * i:.1f}" for i in range(26)]
+    (tmp_path / "walk.csv").write_text("\n".join(["x,y,z,time_s", *rows]))
+    walk = {"kind": "file", "file": str(tmp_path / "walk.csv")}
     simulate(plan(scene=replace(SCENE, receivers=walk), shard=26), tmp_path / "walk.h5")
     stored, _ = arrays(tmp_path / "walk.h5")
     np.testing.assert_allclose(stored["time_s"], np.arange(26) * 0.2)

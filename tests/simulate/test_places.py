@@ -15,7 +15,7 @@ from gsparc.simulate.scenes.receivers import (
     nearest_rows,
     place_receivers,
 )
-from gsparc.simulate.scenes.solid import box, write_mesh
+from gsparc.simulate.scenes.solid import box, write_walls
 from gsparc.simulate.scenes.transmitters import place_transmitters
 
 AREA = np.array([[0.0, 0.0], [20.0, 10.0]])
@@ -80,18 +80,10 @@ def test_grid_leaves_out_occupied_places():
         laid(kind="grid", spacing_m=2.0, inside="refuse")
 
 
-def test_trajectory_has_times():
-    found = laid(kind="trajectory", points_m=[[0, 8], [10, 8], [10, 2]], speed_m_s=2.0, every_s=0.5)
-    np.testing.assert_allclose(found.time_s, np.arange(17) * 0.5)
-    np.testing.assert_allclose(found.places[[0, 10, 16], :2], [[0, 8], [10, 8], [10, 2]])
-
-
-def test_streets_and_lines_are_sampled_evenly():
+def test_streets_are_sampled_evenly():
     streets = [np.array([[-5.0, 9.0], [30.0, 9.0]]), np.array([[10.0, 0.0], [10.0, 8.0]])]
     found = laid(streets=streets, kind="streets", spacing_m=2.0)
     assert (found.places[:, :2] >= 0).all() and (found.places[:, 0] <= 20).all() and len(found.places) == 15
-    several = laid(kind="lines", points_m=[[[0, 9], [20, 9]], [[10, 0], [10, 8]]], spacing_m=5.0)
-    assert len(several.places) == 5 + 2
 
 
 def test_receivers_of_a_table_in_degrees_with_times(tmp_path):
@@ -123,14 +115,9 @@ def test_bad_times_are_refused(cell, words, tmp_path):
     ({"inside": "maybe"}, "drop or refuse"),
     ({"kind": "grid", "spacing_m": 0.0}, "positive"),
     ({"kind": "grid", "spacing_m": 1e-4}, "places"),
-    ({"kind": "lines"}, "two corners or more"),
-    ({"kind": "lines", "points_m": [[0, 0], [1, "x"]]}, "two corners or more"),
-    ({"kind": "lines", "points_m": [[0, 0], [float("inf"), 1]]}, "finite"),
-    ({"kind": "trajectory", "points_m": [[[0, 0], [1, 1]], [[2, 2], [3, 3]]]}, "one line"),
     ({"kind": "streets"}, "no streets"),
     ({"kind": "file"}, "file is missing"),
     ({"kind": "file", "file": "nowhere.csv"}, "nowhere.csv"),
-    ({"kind": "lines", "points_m": [[0, 0], [1, 1]]}, "fewer than two places"),
 ])  # fmt: skip
 def test_bad_receivers_are_refused(settings, words):
     with pytest.raises(ValueError, match=words) as raised:
@@ -148,8 +135,8 @@ def test_many_places_are_found_where_few_are_allowed():
 
 def test_mesh_is_read_back_as_walls(tmp_path):
     solid = box("hut", "brick", (1, 2, 0), (4, 4, 3), turn=0.3)
-    write_mesh(solid.vertices[solid.faces], tmp_path / "scene.obj")
-    walls = read_walls(tmp_path / "scene.obj")
+    write_walls(solid.vertices[solid.faces], tmp_path / "walls.yaml")
+    walls = read_walls(tmp_path / "walls.yaml")
     assert len(walls) == 12
     np.testing.assert_allclose(sum(map(polygon_area, walls.faces)), 2 * (6 + 9 + 6), atol=0.02)
     corners = np.unique(np.concatenate(walls.faces), axis=0)

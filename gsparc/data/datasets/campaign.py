@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -16,7 +16,8 @@ from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanit
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems
-from gsparc.data.files import SeveralFiles, read_text
+from gsparc.data.files import read_text
+from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
@@ -31,7 +32,7 @@ class Campaign(DataModule):
     """A published campaign with stations, of which all rows or a part are used.
 
     Args:
-        file: what `raw` reads, one or several tables of the same columns; None: what `gsparc data` fetched.
+        file: what `raw` reads; None: what `gsparc data` fetched.
         name, batch_size: see `DataModule`; None: the name of the choice of conf/dataset.
         **settings: of `gsparc.data.selection.Selection`, and what `reader` takes besides.
     """
@@ -46,16 +47,16 @@ class Campaign(DataModule):
 
     def __init__(
         self,
-        file: str | Path | Sequence[str | Path] | None = None,
+        file: str | Path | None = None,
         name: str | None = None,
         batch_size: int = 16,
         **settings: Any,
     ) -> None:
         super().__init__(name or self.choice, batch_size)
         file = fetched_path(self.choice) if file in (None, "", "???") else file
-        one = str(file) if isinstance(file, str | Path) else SeveralFiles(file)
-        whole = isinstance(one, SeveralFiles) or "://" in one  # a path would make one of two slashes
-        self.file = one if whole else Path(one)
+        if not isinstance(file, str | Path):
+            raise SettingError(f"dataset.file={[*map(str, file)]}: expected one file; join tables first")
+        self.file = Path(file)
         part = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
         self.settings, self.selection = settings, Selection(**part)
 

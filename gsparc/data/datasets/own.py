@@ -19,7 +19,6 @@ from gsparc.data.datasets.techtile_power import TechtilePower
 from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
 from gsparc.data.errors import DataError
-from gsparc.data.files import SeveralFiles
 from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
@@ -32,7 +31,6 @@ def read_own(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
-    cell_m: float | None = None,
     **settings: Any,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names.
@@ -41,14 +39,13 @@ def read_own(
         path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
-        cell_m: of Parquet, also a folder or a URL of it: means of rows [dB] by cells of this side [m].
         **settings: see `apply_settings`.
 
     Raises:
         DataError: bad input, or a file of another campaign.
         SettingError: see `apply_settings`.
     """
-    raw = apply_settings(read_file_or_table(path, columns, stations_file, cell_m), **settings)
+    raw = apply_settings(read_file_or_table(path, columns, stations_file), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
@@ -123,14 +120,13 @@ def read_any(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
-    cell_m: float | None = None,
     **settings: Any,
 ) -> Reading:
     """Read a folder or file of a release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
-        columns, stations_file, cell_m: of a table, see `read_own`.
+        columns, stations_file: of a table, see `read_own`.
         **settings: see `apply_settings`, and of `Selection`.
 
     Raises:
@@ -151,7 +147,7 @@ def read_any(
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, said = read_file_or_table(path, columns, stations_file, cell_m), ""
+        raw, said = read_file_or_table(path, columns, stations_file), ""
         if (campaign := dataset_by_arrays(raw)) is not None:
             raw, said = LOADERS[campaign](path), f"this is a file of dataset={campaign}"
     raw = replace(raw, notes=(*filter(None, [said]), *raw.notes))
@@ -162,21 +158,17 @@ def read_file_or_table(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
-    cell_m: float | None = None,
 ) -> Raw:
     """Read the arrays of a file of the schema, or of a table; notes say how its columns were understood.
 
     Raises:
         DataError: not readable, or columns that nothing can be made of.
     """
-    # Columns of tables are matched by their heads; arrays of several files may differ in every shape.
-    if isinstance(path, SeveralFiles) and not (cell_m is None and all(is_table(one) for one in path.paths)):
-        raise DataError(f"{path}: several files are read as one where all are tables, without dataset.cell_m")
-    if cell_m is None and not is_table(path):
+    if not is_table(path):
         named = any(value is not None for value in (columns or {}).values())
         for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
     from gsparc.data.tables.read import parse_table  # here, as pandas takes half a second to import
 
-    return parse_table(path, columns or {}, stations_file, cell_m)
+    return parse_table(path, columns or {}, stations_file)

@@ -6,46 +6,31 @@ import codecs
 import csv
 import re
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
-from fsspec.core import url_to_fs
 
 from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
-from gsparc.data.files import SeveralFiles, check_line_length
+from gsparc.data.files import check_line_length
 from gsparc.data.tables import TABLE_SUFFIXES
 from gsparc.data.tables.heads import SHEET, parse_head
 from gsparc.data.tables.sheet import Sheet
 
-if TYPE_CHECKING:
-    from pyarrow.dataset import Dataset
 
-
-@contextmanager
-def open_parquet(source: str) -> Iterator[Dataset]:
-    """Open the dataset in a Parquet file, a folder of them, or a URL that fsspec knows.
+def read_parquet(source: str) -> Sheet:
+    """Read the columns of a Parquet file.
 
     Raises:
-        DataError: pyarrow is missing, or a file is damaged, also while it is read in the block.
+        DataError: pyarrow is missing, or the file is damaged or empty.
     """
     try:
-        from pyarrow import ArrowException, dataset
+        from pyarrow import ArrowException
     except ImportError:
         raise DataError(f"{source}: Parquet needs pyarrow; say: pip install 'gsparc[tables]'") from None
     errors = (ArrowException, OSError, ValueError, ImportError)
     with readable(source, "damaged or not a Parquet file", errors):
-        system, at = url_to_fs(source) if "://" in source else (None, source)
-        yield dataset.dataset(at, filesystem=system, format="parquet", partitioning="hive")
-
-
-def read_parquet(source: str, most: int | None = None) -> Sheet:
-    """Read columns of what `open_parquet` opens, of the first `most` rows if said; `DataError` likewise."""
-    with open_parquet(source) as files:
-        frame = (files.to_table() if most is None else files.head(most)).to_pandas()
+        frame = pd.read_parquet(source, engine="pyarrow")
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
     frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
     if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
@@ -96,7 +81,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     width = len(_cells(lines[min(lines)], delimiter))
     if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:
         fault = f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and {MOST_CELLS:,}"
-        how = "write Parquet, with dataset.cell_m where rows are many"
+        how = "write Parquet, of means by cells of places where rows are many"
         raise DataError(f"{source}: {fault} cells are read: {how}")
     lines = _with_heads(lines, comment, delimiter, source)
     lines, comment_notes = _without_comments(lines, delimiter, source)
@@ -329,8 +314,6 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
     Raises:
         DataError: no such file, another ending, or no table.
     """
-    if isinstance(path, SeveralFiles):
-        return _stacked([read_sheet(one, problems) for one in path.paths], path)
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
@@ -338,16 +321,3 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
         raise DataError(f"{path}: expected a name ending in .csv, .tsv, .txt or .parquet")
     sheet, notes = (read_parquet(str(path)), []) if path.suffix.lower() == ".parquet" else read_text(path)
     return replace(sheet, problems=Problems(path) if problems is None else problems), notes
-
-
-def _stacked(parts: list[tuple[Sheet, list[str]]], source: str) -> tuple[Sheet, list[str]]:
-    """Rows of one table after those of the other; `DataError` where their columns differ."""
-    first = parts[0][0]
-    for sheet, _ in parts[1:]:
-        if set(sheet.heads) != set(first.heads) or sheet.decimal != first.decimal:
-            lacking = sorted(set(sheet.heads) ^ set(first.heads))[:3]
-            raise DataError(f"{sheet.source}: other columns than {first.source} has: {', '.join(lacking)}")
-    frame = pd.concat([sheet.frame[[*first.heads]] for sheet, _ in parts], ignore_index=True)
-    rows = tuple(f"{Path(sheet.source).name}, {row}" for sheet, _ in parts for row in sheet.rows)
-    notes = list(dict.fromkeys(note for _, own in parts for note in own))
-    return replace(first, source=source, frame=frame, rows=rows), notes

@@ -12,12 +12,10 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import Caution, list_first, suggest_name
-from gsparc.data.files import SeveralFiles
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
-from gsparc.data.tables.cells import LOOKED_AT, merge_cells
 from gsparc.data.tables.columns import (
     CHANNELS,
     JOINED,
@@ -29,7 +27,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
 )
 from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
-from gsparc.data.tables.opening import read_parquet, read_sheet
+from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
     Places,
@@ -48,22 +46,19 @@ def parse_table(
     path: str | Path,
     columns: Mapping[str, object] = NOTHING,
     stations_file: str | Path | None = None,
-    cell_m: float | None = None,
 ) -> Raw:
     """Read the arrays of a table; notes say what was guessed.
 
     Args:
-        path: *.csv, *.tsv, *.txt or *.parquet, or several.
+        path: *.csv, *.tsv, *.txt or *.parquet.
         columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for all rows,
             a pattern with a `*` for a column per station.
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
-        cell_m: of Parquet: rows are merged by cells of this side [m].
 
     Raises:
         DataError: all problems, with row and column.
     """
-    # Of Parquet with cells only the first rows are read here: `merged` streams the file in chunks.
-    sheet, notes = read_sheet(path) if cell_m is None else (read_parquet(str(path), LOOKED_AT), [])
+    sheet, notes = read_sheet(path)
     sheet, unfolding = unfold_slots(sheet, {str(value) for value in columns.values()})
     notes = [*notes, *unfolding]
     listed = None
@@ -80,14 +75,11 @@ def parse_table(
     chosen, guessed = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
-    if cell_m is not None:
-        chosen.pop("row_name", None)  # rows of a cell have many
-        sheet = merge_cells(sheet, chosen, cell_m)
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
-    about = {"name": "+".join(Path(one).stem for one in path.paths)} if isinstance(path, SeveralFiles) else {}
+    about = {}
     if power is not None and "rssi_db" in chosen:
         about["level_unit"] = schema_unit(power)
     # A column that is scaled has the schema's unit.

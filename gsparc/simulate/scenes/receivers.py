@@ -1,4 +1,4 @@
-"""Receivers over an area, on a grid, along streets or a trajectory, or out of a file."""
+"""Receivers over an area, on a grid, along streets, or out of a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsparc.simulate.scenes.solid import Solid
 
 log = logging.getLogger(__name__)
 
-KINDS = ("area", "grid", "streets", "lines", "trajectory", "file")
+KINDS = ("area", "grid", "streets", "file")
 INSIDE = ("drop", "refuse")
 MOST = 1_000_000  # places
 
@@ -43,11 +43,8 @@ class Layout:
     """The settings `scene.receivers`.
 
     Attributes:
-        kind: `area` (drawn at random), `grid`, `streets` (of a map), `lines` (through `points_m`),
-            `trajectory` (through `points_m` at `speed_m_s`, a place every `every_s`) or `file`.
-        spacing_m: of a grid, and along streets and lines [m].
-        points_m: corners [[x, y], ...] of a line or trajectory; of several lines a list of those.
-        speed_m_s, every_s: of a trajectory.
+        kind: `area` (drawn at random), `grid`, `streets` (of a map) or `file`.
+        spacing_m: of a grid, and along streets [m].
         file: a table with x, y and z, or latitude, longitude and height, and perhaps `time_s`.
         inside: places in or on something that stands there are left out (`drop`) or an error (`refuse`);
             None: an error out of a file, else left out.
@@ -55,9 +52,6 @@ class Layout:
 
     kind: str = "area"
     spacing_m: float = 5.0
-    points_m: Sequence[Any] | None = None
-    speed_m_s: float = 1.4
-    every_s: float = 1.0
     file: str | None = None
     inside: str | None = None
 
@@ -66,9 +60,8 @@ class Layout:
             raise ValueError(f"scene.receivers.kind={self.kind}: expected one of {', '.join(KINDS)}")
         if self.inside not in (None, *INSIDE):
             raise ValueError(f"scene.receivers.inside={self.inside}: expected {' or '.join(INSIDE)}")
-        for name in ("spacing_m", "speed_m_s", "every_s"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"scene.receivers.{name}={getattr(self, name)}: expected a positive number")
+        if not 0 < self.spacing_m < np.inf:
+            raise ValueError(f"scene.receivers.spacing_m={self.spacing_m}: expected a positive number")
 
 
 class Placed(NamedTuple):
@@ -120,7 +113,7 @@ def place_receivers(
         flat, time_s = _of_file(how, georeference, float(np.mean(height)))
         names = [f"row {i}" for i in range(len(flat))]
     else:
-        across, time_s = _along(how, area, streets)
+        across, time_s = _along(how, area, streets), None
         if not 0 < len(across) <= MOST:
             raise ValueError(f"scene.receivers: {len(across)} places; expected 1 to {MOST:,}")
         heights = np.random.default_rng(seed).uniform(min(height), max(height), len(across))
@@ -142,10 +135,8 @@ def place_receivers(
     return Placed(points[free], None if time_s is None else time_s[free])
 
 
-def _along(
-    how: Layout, area: np.ndarray, streets: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Places (n, 2) [m] of a grid or along lines; times (n,) [s] of a trajectory."""
+def _along(how: Layout, area: np.ndarray, streets: Sequence[np.ndarray]) -> np.ndarray:
+    """Places (n, 2) [m] of a grid or along streets."""
     if how.kind == "grid":
         low, high = area
         # One more than there are spacings: both ends of a side count.
@@ -153,35 +144,11 @@ def _along(
         if counts.prod() > MOST:
             raise ValueError(f"scene.receivers.spacing_m={how.spacing_m:g}: {counts.prod():,} places")
         axes = [np.arange(n) * how.spacing_m + start for n, start in zip(counts, low, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), None
-    if how.kind == "streets":
-        if not streets:
-            raise ValueError("scene.receivers.kind=streets: this scene has no streets; use lines or grid")
-        walked = np.concatenate([_steps(line, how.spacing_m) for line in streets])
-        inside = ((walked >= area[0]) & (walked <= area[1])).all(1)
-        return walked[inside], None
-    lines = _lines(how)
-    if how.kind == "lines":
-        return np.concatenate([_steps(line, how.spacing_m) for line in lines]), None
-    if len(lines) > 1:
-        raise ValueError(f"scene.receivers.points_m: a trajectory is one line, not {len(lines)}: use lines")
-    walked = _steps(lines[0], how.speed_m_s * how.every_s)
-    return walked, np.arange(len(walked)) * how.every_s
-
-
-def _lines(how: Layout) -> list[np.ndarray]:
-    points: Any = how.points_m
-    try:
-        # A list of lines, or the corners of one.
-        nested = points is not None and np.ndim(points[0]) == 2
-        lines = [np.array(line, dtype=np.float64) for line in (points if nested else [points])]
-    except (TypeError, ValueError, IndexError):
-        lines = []
-    if not lines or any(x.ndim != 2 or x.shape[1] != 2 or len(x) < 2 for x in lines):
-        raise ValueError("scene.receivers.points_m: expected [[x, y], [x, y], ...] of two corners or more")
-    if not all(np.isfinite(line).all() for line in lines):
-        raise ValueError("scene.receivers.points_m: expected finite numbers")
-    return lines
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    if not streets:
+        raise ValueError("scene.receivers.kind=streets: this scene has no streets; use grid or file")
+    walked = np.concatenate([_steps(line, how.spacing_m) for line in streets])
+    return walked[((walked >= area[0]) & (walked <= area[1])).all(1)]
 
 
 def _steps(line: np.ndarray, spacing: float) -> np.ndarray:

@@ -63,13 +63,8 @@ def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: floa
     return Solid(name, material, vertices, faces, np.stack([vertices.min(0), vertices.max(0)]))
 
 
-def write_mesh(triangles: np.ndarray, path: Path) -> None:
-    """Write triangles (n, 3, 3) [m], world, as Wavefront OBJ, whole or not at all; equal corners are one.
-
-    `init=scene` and other programs read it.
-    """
-    corners, which = np.unique(np.round(triangles.reshape(-1, 3), MILLIMETRES), axis=0, return_inverse=True)
-    vertices = [f"v {x:.3f} {y:.3f} {z:.3f}" for x, y, z in corners]
-    faces = [f"f {a} {b} {c}" for a, b, c in which.reshape(-1, 3) + 1]
+def write_walls(triangles: np.ndarray, path: Path) -> None:
+    """Write triangles (n, 3, 3) [m], world, for `init=scene`, whole or not at all; none without area."""
+    lines = [f"- {corners}" for corners in np.round(triangles, MILLIMETRES).tolist()]
     with whole_file(path) as partial:
-        partial.write_text("\n".join([*vertices, *faces, ""]), encoding="utf-8")
+        partial.write_text("\n".join(["walls:", *lines, ""]), encoding="utf-8")
