@@ -1,6 +1,8 @@
 """Fingerprints: levels of access points whose places nobody knows, heard at known places.
 
 An archive (npz, HDF5) holds `rss_dbm` (S, P), NaN where nothing was heard, and `position` (S, 2) or (S, 3).
+A table (CSV) has the columns of UJIIndoorLoc (J. Torres-Sospedra et al., "UJIIndoorLoc: a new multi-building
+and multi-floor database for WLAN fingerprint-based indoor localization problems", IPIN 2014).
 """
 
 from __future__ import annotations
@@ -12,14 +14,18 @@ from typing import Literal, get_args
 import numpy as np
 
 from gsparc.data.datasets.campaign import Expected, check_layout
-from gsparc.data.errors import DataError, list_first, suggest_name
-from gsparc.data.raw import read_raw
+from gsparc.data.errors import DataError, list_first, readable, suggest_name
+from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.tables import is_table
 
 How = Literal["released", "random", "places", "blocks", "walks", "later"]
+SILENT = 100.0  # of a table: not heard
 LOUDEST, FAINTEST = 20.0, -160.0  # levels of no receiver lie beyond [dBm]
+STOREY_M = 3.7  # between floors of a table, which has no heights
 NUMBERS = {"floor": "floor", "building": "building", "walk": "walk", "month": "campaign", "round": "campaign"}
+COLUMNS = {"FLOOR": "floor", "BUILDINGID": "building", "TIMESTAMP": "time_s"}
 LAYOUT = {
     "rss_dbm": Expected(("S", "P")),
     "position": Expected(("S", "D"), place=True),
@@ -69,7 +75,7 @@ class Fingerprints:
 
 
 def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
-    """Read rows of an archive; NaN stands for lacking places, unless they must be `placed`.
+    """Read rows of an archive or a table; NaN stands for lacking places, unless they must be `placed`.
 
     Example:
         rows = read_fingerprints("wifine-floor4.npz")
@@ -79,7 +85,7 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         DataError: no such file, or something in it is missing or wrong.
     """
     path = Path(path)
-    raw = read_raw(path)
+    raw = _of_table(path, placed) if is_table(path) else read_raw(path)
     if not placed:
         raw.arrays.setdefault("position", np.full((len(raw.arrays.get("rss_dbm", ())), 3), np.nan))
     checked = check_layout(raw, path, LAYOUT if placed else UNPLACED)
@@ -111,6 +117,28 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         time_s=checked.get("time_s", np.zeros(count)).astype(np.float64),
         access_point=names,
     )  # fmt: skip
+
+
+def _of_table(path: Path, placed: bool) -> Raw:
+    """The same arrays of a table with columns WAP001, ..., LONGITUDE, LATITUDE [m], FLOOR, BUILDINGID."""
+    import pandas as pd  # half a second
+
+    with readable(path, "not readable as CSV text", (ValueError, OSError)):
+        frame = pd.read_csv(path, skipinitialspace=True)
+    names = [name for name in frame.columns if name.startswith("WAP")]
+    places = ["LONGITUDE", "LATITUDE"] if placed or "LONGITUDE" in frame else []
+    missing = [name for name in places if name not in frame] or ([] if names else ["WAP001"])
+    if missing:
+        raise DataError(f"{path}, line 1: no column {missing[0]}; expected the columns of UJIIndoorLoc")
+    for name in (*names, *places, *(COLUMNS.keys() & set(frame.columns))):
+        if frame[name].dtype.kind not in "iuf":
+            raise DataError(f"{path}, column {name}: expected numbers, found {frame[name].iloc[0]!r}")
+    arrays = {field: frame[name].to_numpy() for name, field in COLUMNS.items() if name in frame}
+    height = STOREY_M * arrays.get("floor", np.zeros(len(frame)))
+    level = frame[names].replace(SILENT, np.nan).to_numpy(np.float32)
+    if places:
+        arrays["position"] = np.c_[frame[places].to_numpy(np.float64), height]
+    return Raw({"rss_dbm": level, "access_point": np.array(names), **arrays})
 
 
 def split_fingerprints(

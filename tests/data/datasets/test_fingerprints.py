@@ -53,6 +53,25 @@ def test_bad_archives_are_refused_in_one_line(tmp_path, other, said):
     assert "\n" not in str(error.value)
 
 
+def test_table_is_read(tmp_path):
+    file = tmp_path / "a.csv"
+    head = "WAP001,WAP002,LONGITUDE,LATITUDE,FLOOR,BUILDINGID\n"
+    file.write_text(head + "-60,100,-7500.5,4864900,2,1\n100,-90,-7400,4864800,0,0\n")
+    rows = read_fingerprints(file)
+    np.testing.assert_array_equal(rows.level, np.array([[-60, NAN], [NAN, -90]], np.float32))
+    np.testing.assert_allclose(rows.position, [[-7500.5, 4864900, 7.4], [-7400, 4864800, 0]])
+    assert rows.building.tolist() == [1, 0] and rows.access_point.tolist() == ["WAP001", "WAP002"]
+    for text, said in (
+        (head.replace("LATITUDE", "Y"), "no column LATITUDE"),
+        ("LONGITUDE,LATITUDE\n1,2\n", "no column WAP001"),
+        (head + "loud,100,1,2,0,0\n", "column WAP001: expected numbers, found 'loud'"),
+        ("", "not readable as CSV"),
+    ):
+        file.write_text(text)
+        with pytest.raises(DataError, match=said):
+            read_fingerprints(file)
+
+
 def invented(count: int = 200) -> Fingerprints:
     rng = np.random.default_rng(0)
     none, places = np.zeros(count, np.int64), rng.uniform(0, 20, (count, 3))
@@ -102,8 +121,10 @@ def test_files_of_the_campaigns(name, how, count):
 
 
 def test_unknown_places_are_read_where_allowed(tmp_path):
-    file = written(tmp_path / "a.npz", position=None)
-    assert np.isnan(read_fingerprints(file, placed=False).position).all()
-    with pytest.raises(DataError, match="position: missing"):
-        read_fingerprints(file)
+    file, table = written(tmp_path / "a.npz", position=None), tmp_path / "a.csv"
+    table.write_text("WAP001,FLOOR\n-60,2\n100,0\n")
+    for path in (file, table):
+        assert np.isnan(read_fingerprints(path, placed=False).position).all()
+        with pytest.raises(DataError, match=r"position: missing|no column LONGITUDE"):
+            read_fingerprints(path)
     assert np.isfinite(read_fingerprints(written(tmp_path / "b.npz"), placed=False).position).all()
