@@ -16,6 +16,9 @@ from gsparc.field.encoding import Prior
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
 
+Snapshot = Literal["none", "phase", "phase_timing"]  # what every channel snapshot has of its own
+
+
 InitName = Literal[
     "auto", "sphere", "uniform", "images", "vectors", "sources", "rays", "bearings", "diffuse", "scene"
 ]
@@ -37,6 +40,7 @@ class InitSettings(Checked):
         margin: around the scene box in which sources are sought [m].
         max_sources: of a search.
         order: largest number of reflections.
+        snapshot: what every channel snapshot has of its own, to be estimated; see `LossSettings`.
     """
 
     name: InitName = setting("auto", choice(*get_args(InitName)))
@@ -47,6 +51,7 @@ class InitSettings(Checked):
     margin: float = setting(8.0, POSITIVE)
     max_sources: int = setting(60, whole(1))
     order: int = setting(3, whole(0))
+    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
 @dataclass(frozen=True)

@@ -5,19 +5,22 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import Checked, number, setting
+from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
+from gsparc.field.initial import Snapshot
 from gsparc.ops.similarity import has_similarity_kernel, similarity_op
 from gsparc.ops.transforms import carries_tangent
 
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
 
+DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in the gradient
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
 
 
@@ -28,9 +31,12 @@ class LossSettings(Checked):
     Attributes:
         ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone, as do images
             smaller than 11 x 11.
+        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
+            not look at it.
     """
 
     ssim_weight: float = setting(0.2, number(0, 1))
+    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
 def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
@@ -130,26 +136,48 @@ def task_loss(prediction: Tensor, batch: Batch, settings: LossSettings) -> Tenso
         batch: with targets and mask.
         settings: read as far as these targets need: what is not read has no effect, and is said.
     """
-    if prediction.is_complex() or prediction.dim() == 2:
+    if prediction.is_complex():
+        return channel_loss(prediction, batch.target, batch.mask, settings.snapshot)
+    if prediction.dim() == 2:
         return channel_loss(prediction, batch.target, batch.mask)
     if batch.mask is not None:
         prediction = torch.where(batch.mask, prediction, batch.target)
     return spectrum_loss(prediction, batch.target, settings.ssim_weight)
 
 
-def channel_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+def channel_loss(
+    prediction: Tensor, target: Tensor, mask: Tensor | None = None, snapshot: Snapshot = "none"
+) -> Tensor:
     """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,).
 
     Args:
-        prediction, target: alike.
+        prediction, target: alike; (B, A, K) complex where snapshots have offsets.
         mask: like target, True where measured.
+        snapshot: `phase`: the least error over one phase per sample; `phase_timing`: over a phase
+            and a delay, `exp(j (phi - 2 pi f tau))`, tones evenly spaced. Both leave the amplitude as it is.
 
     Raises:
         ValueError: shapes differ; broadcasting would hide a missing antenna.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
+    if snapshot != "none":
+        return _error_up_to_phase(prediction, target, mask, snapshot == "phase_timing")
     error = (prediction - target).abs().square()
     if mask is None:
         return error.flatten(1).mean(1)
     return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
+
+
+def _error_up_to_phase(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
+    """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p, h>|."""
+    known = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
+    product = (prediction.conj() * target * known).sum(1)  # (B, K)
+    if timing and product.shape[1] > 1:
+        period = DELAYS_PER_TONE * product.shape[1]
+        best = torch.fft.ifft(product.detach(), period).abs().argmax(1, keepdim=True)
+        turn = 2 * math.pi / period * best * torch.arange(product.shape[1], device=product.device)
+        product = product * torch.polar(torch.ones_like(turn), turn)
+    power = ((prediction.abs().square() + target.abs().square()) * known).flatten(1).sum(1)
+    alike = torch.view_as_real(product.sum(1)).square().sum(1).clamp_min(1e-20).sqrt()
+    return (power - 2 * alike) / known.flatten(1).sum(1).clamp_min(1)

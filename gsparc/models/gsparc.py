@@ -95,7 +95,7 @@ class Gsparc(LearnsTogether):
     hands_on: ClassVar[type[Method]] = LearnedField  # whose settings `field` are
     resumable = uses_censored = True
     stored_names: ClassVar[dict[str, str]] = {
-        "steps": "", "position_std": "", "terms": "",
+        "steps": "", "position_std": "", "terms": "", "loss.snapshot": "init.snapshot",
         "refit": "rendered.refit", "keep_best": "rendered.keep_best",
     }  # fmt: skip
 

@@ -97,6 +97,7 @@ def resolve_terms(
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True
+    options += ["model.loss.snapshot"] if site.kind == "csi" else []
     obstacle = obstacles["phase"]
     return Terms(
         **on, rendered=rendered, obstacle=obstacle, reasons=tuple(reasons), options=tuple(options)

@@ -80,9 +80,39 @@ def test_channel_loss_counts_what_was_measured():
     assert torch.allclose(got[0], (h[0, :, 0].abs() ** 2).mean()) and got[1] == 0
 
 
+@pytest.mark.parametrize("snapshot", ["phase", "phase_timing"])
+def test_a_snapshots_own_phase_and_delay_do_not_count(snapshot):
+    torch.manual_seed(0)
+    h = torch.randn(3, 2, 12, dtype=torch.complex64)
+    phase = torch.tensor([0.3, -2.0, 3.0])[:, None, None]
+    delay = torch.tensor([0.0, 2.0, -3.0])[:, None, None] / 12 * (snapshot == "phase_timing")
+    turned = h * torch.exp(1j * (phase - 2 * torch.pi * delay * torch.arange(12)))
+    assert channel_loss(h, turned, snapshot=snapshot).max() < 1e-4
+    assert channel_loss(h, turned).min() > 0.01
+    assert channel_loss(h, 2 * turned, snapshot=snapshot).min() > 0.5  # amplitude does
+    mask = torch.ones(3, 2, 12, dtype=torch.bool)
+    mask[..., 9:] = False
+    spoiled = torch.where(mask, turned, 50 * turned)
+    assert channel_loss(h, spoiled, mask, snapshot).max() < 1e-4
+
+
+@pytest.mark.parametrize("snapshot", ["phase", "phase_timing"])
+def test_slopes_of_the_blind_losses(snapshot):
+    torch.manual_seed(1)
+    target = torch.randn(2, 2, 5, dtype=torch.complex128)
+    parts = torch.randn(2, 2, 5, 2, dtype=torch.float64, requires_grad=True)
+
+    def loss(values):
+        return channel_loss(torch.view_as_complex(values), target, snapshot=snapshot)
+
+    # The delay is held on its comb: its best value moves the loss in second order only.
+    assert torch.autograd.gradcheck(loss, [parts])
+
+
+@pytest.mark.parametrize("snapshot", ["none", "phase", "phase_timing"])
 @pytest.mark.parametrize("masked", [False, True])
-def test_channel_losses_stay_on_the_device_of_the_channels(masked):
-    """`meta` mixes with the CPU as little as a GPU does."""
+def test_channel_losses_stay_on_the_device_of_the_channels(snapshot, masked):
+    """Offsets of timing took their tones from the CPU; `meta` mixes with those as little as a GPU does."""
     channels = torch.empty(3, 2, 5, dtype=torch.complex64, device="meta")
     mask = torch.empty(3, 2, 5, dtype=torch.bool, device="meta") if masked else None
-    assert channel_loss(channels, channels, mask).device.type == "meta"
+    assert channel_loss(channels, channels, mask, snapshot).device.type == "meta"

@@ -16,6 +16,7 @@ from torch import Tensor
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
+from gsparc.field.initial import Snapshot
 from gsparc.models.closed_form import LeftOutRows, Moments, from_containers, to_containers
 from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path_scene, find_element_factors
@@ -32,7 +33,7 @@ from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
 from gsparc.models.image_sources.refine import POLISHING_STEPS
 from gsparc.models.image_sources.rows import Rows, draw_rows, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import JITTER, Scene
-from gsparc.models.image_sources.search import Found, SearchSettings, Snapshot
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import hesse_form, image_rotations

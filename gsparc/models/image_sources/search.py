@@ -8,13 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
-from gsparc.field.initial import InitSettings
+from gsparc.field.initial import InitSettings, Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import (
     find_sources_in_box,
@@ -42,7 +42,6 @@ PARENTS = 4  # of a new source, tried in turn until one is found
 SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
 PRUNE = 5.0  # least gain of a source kept [nats]
-Snapshot = Literal["none", "phase", "phase_timing"]  # what every channel snapshot has of its own
 Found = tuple[Tensor, Tensor]  # places and amplitudes of sources
 PATIENCE, PROGRESS = 3, SEQUENCE_SCORE  # rounds without a gain of a source's nats, that end the search
 REARRANGED_EVERY = 3  # rounds between attempts at walls, and at the visibility's lengths

@@ -74,7 +74,7 @@ def _search_arguments(init: InitSettings, clutter: bool, context: FitContext) ->
     for name in ("search_rows", "rows"):
         # Factoring a covariance of n rows takes n^3.
         own[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
-    return {**own, "clutter": clutter, "seed": context.seed}
+    return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
 
 
 CANDIDATES: dict[str, Candidate] = {

@@ -32,7 +32,8 @@ class ImageSources(Mixture):
         """See `Mixture`."""
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
-        return _candidates(*placed, *["diffuse"] * self.adds_process)
+        # Offsets are known to sources alone.
+        return _candidates(*placed, *["diffuse"] * (self.init.snapshot == "none" and self.adds_process))
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""

@@ -102,7 +102,7 @@ class LearnedField(Method):
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = takes_weights = True
-    stored_names: ClassVar[dict[str, str]] = {"steps": ""}
+    stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     # Whether a process beside it has all the weight: another stage is worth no seconds.
     _is_process_alone = False
     _limited_by: Clock | None = None
@@ -129,7 +129,7 @@ class LearnedField(Method):
         check_arguments(locals(), refit=switch(), keep_best=switch(), steps=or_word(whole(0), "auto"))
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
-        self.init = init or InitSettings()
+        self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
         self.refit, self.guesses = refit, tuple(guesses)
         self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
         self.model: GaussianModel | None = None

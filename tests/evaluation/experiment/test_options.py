@@ -227,6 +227,13 @@ def test_callbacks_of_a_training_without_steps(none, caplog):
     assert warned(caplog)[0].endswith("(no gradient steps are asked for: say model.steps=auto)")
 
 
+def test_phases_of_snapshots_mean_nothing_to_powers():
+    """`model.loss.snapshot=phase` of powers ended in an IndexError."""
+    given = "model=splat", "model.field.count=20", "trainer.max_steps=1", "model.loss.snapshot=phase"
+    assert fitted("power", *given)[0] == {"model.loss.snapshot"}
+    assert not fitted("tone", *given)[0]
+
+
 # Where nothing that hides is found, or no station that was never heard is asked about.
 FOUND_NOTHING = {("tone", "visibility"), ("antennas", "visibility"), ("stations", "visibility")}
 # A plain process answers the same, which a warning or the log says.
