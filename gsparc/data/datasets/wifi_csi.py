@@ -1,7 +1,7 @@
-"""Wi-Fi channels as Nexmon logs them: one log, or a folder of logs, and a table that says where each is from.
+"""Wi-Fi channels as cards log them: one log, or a folder of logs, and a table that says where each was taken.
 
 Places are a row per file (`file`, `x`, `y`), or a track (`time_s`, `x`, `y`) of all files or, with `file`, of
-each; `z` and `rssi_dbm` may stand beside them. Every packet is a row; those of one place share it.
+each; `z`, `rssi_dbm` and `channel` may stand beside them. Every packet is a row; those of one place share it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.datasets.wifi_logs import Packets, read_packets
+from gsparc.data.datasets.wifi_logs import READERS, SUFFIXES, Packets, channel_hz, read_packets
 from gsparc.data.datasets.wsr import SPACING_HZ
 from gsparc.data.errors import DataError, list_first, readable
 from gsparc.data.files import read_csv
-from gsparc.data.limits import choice
+from gsparc.data.limits import choice, or_null
 from gsparc.data.raw import Raw
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-PLACES, NUMBERS = "places.csv", ("time_s", "x", "y", "z", "rssi_dbm")
+PLACES, NUMBERS = "places.csv", ("time_s", "x", "y", "z", "rssi_dbm", "channel")
 CHIPS = ("43455c0", "4339", "4358", "4366c0")
 # First and last subcarrier that a frame of 802.11a/g/n/ac fills, by the last that an FFT of its width has.
 FILLED = {32: (1, 26), 64: (2, 58), 128: (2, 122)}
@@ -38,7 +38,9 @@ KEPT_DB = 2.0  # between the channel's power and RSSI, less a constant: the leve
 def read_wifi_csi(
     path: str | Path,
     places: str | Path | None = None,
+    card: str | None = None,
     chip: str = CHIPS[0],
+    carrier_hz: float | None = None,
     transmitters: Mapping[str, Sequence[float]] | None = None,
 ) -> Raw:
     """Read Wi-Fi logs; what was left out and where levels are from is logged.
@@ -46,7 +48,8 @@ def read_wifi_csi(
     Args:
         path: a log, or a folder of them.
         places: the table of places; None: places.csv beside the logs.
-        chip: see `read_packets`.
+        card, chip: see `read_packets`.
+        carrier_hz: where neither logs nor places say a channel.
         transmitters: places [m] of senders by their addresses; None: nobody knows them.
 
     Returns:
@@ -58,10 +61,11 @@ def read_wifi_csi(
         DataError: a log or a place is missing or damaged, or logs are not of one kind.
         SettingError: a setting that cannot be.
     """
+    or_null(choice(*READERS)).check("dataset.card", card)
     choice(*CHIPS).check("dataset.chip", chip)
     path = Path(path)
     table = _table(Path(places or (path if path.is_dir() else path.parent) / PLACES))
-    logs = [_placed(one, table, chip) for one in _logs(path)]
+    logs = [_placed(one, table, card, chip) for one in _logs(path, card)]
     logs = [one for one in logs if len(one.csi)]
     if not logs:
         raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
@@ -69,6 +73,9 @@ def read_wifi_csi(
     if len(kinds) > 1:
         said = f"antennas, subcarriers and carriers {list_first(kinds)}"
         raise DataError(f"{path}: {said}; give each a folder of its own")
+    carrier = carrier_hz or logs[0].carrier_hz
+    if carrier is None:
+        raise DataError(f"{path}: neither it nor the places name the channel; say dataset.carrier_hz")
     time, sender, csi, rssi, position = (
         np.concatenate([getattr(one, name) for one in logs])
         for name in ("time_s", "sender", "csi", "rssi_dbm", "position")
@@ -86,11 +93,11 @@ def read_wifi_csi(
     arrays = {
         "rx_position": position,
         "station_position": np.array([known.get(name, [np.nan] * 3) for name in names], np.float64),
-        "station_name": names,
+        "station_name": np.array([name or "transmitter" for name in names]),
         "station": station.reshape(-1),
         "time_s": time,
         "csi": csi.astype(np.complex64),
-        "frequency_hz": logs[0].carrier_hz + SPACING_HZ * tone,
+        "frequency_hz": carrier + SPACING_HZ * tone,
     }
     return Raw(arrays, {"name": "wifi_csi", "level_unit": unit})
 
@@ -108,17 +115,22 @@ def _table(path: Path) -> pd.DataFrame:
         return table.astype({name: float for name in NUMBERS if name in head})
 
 
-def _logs(path: Path) -> list[Path]:
-    found = [path] if path.is_file() else sorted(path.rglob("*.pcap"))
-    if not found:
-        raise DataError(f"{path}: no such log, or a folder without *.pcap")
-    return found
+def _logs(path: Path, card: str | None) -> list[Path]:
+    if path.is_file():
+        return [path]
+    files = [one for one in sorted(path.rglob("*")) if one.name != PLACES]
+    endings = [ending for ending, of in SUFFIXES.items() if card in (None, of)]
+    for ending in endings:  # tables may lie beside logs
+        found = [one for one in files if one.suffix.lower() == ending]
+        if found:
+            return found
+    raise DataError(f"{path}: no such log, or a folder without {', '.join(endings)}")
 
 
-def _placed(path: Path, table: pd.DataFrame, chip: str) -> Packets:
+def _placed(path: Path, table: pd.DataFrame, card: str | None, chip: str) -> Packets:
     """Packets of a log whose places are known; how many are left out is logged."""
     at = table[table["file"].isin([path.name, path.stem])] if "file" in table else table
-    packets = read_packets(path, chip)
+    packets = read_packets(path, card, chip)
     time = packets.time_s
     if "time_s" in at:
         at = at.sort_values("time_s")
@@ -136,6 +148,7 @@ def _placed(path: Path, table: pd.DataFrame, chip: str) -> Packets:
     return replace(
         packets, time_s=time[rows], sender=packets.sender[rows], csi=packets.csi[rows],
         rssi_dbm=np.where(np.isnan(rssi), on.get("rssi_dbm", rssi), rssi),
+        carrier_hz=packets.carrier_hz or (channel_hz(int(on["channel"][0])) if "channel" in on else None),
         position=np.stack([on.get(axis, nothing) for axis in "xyz"], 1),
     )  # fmt: skip
 
@@ -179,7 +192,7 @@ def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.nda
 
 
 class WifiCsi(Campaign):
-    """Wi-Fi channels as Nexmon logs them; settings of `read_wifi_csi` and `Campaign`."""
+    """Wi-Fi channels as cards log them; settings of `read_wifi_csi` and `Campaign`."""
 
     choice, reader = "wifi_csi", staticmethod(read_wifi_csi)
     inside = "*.pcap"

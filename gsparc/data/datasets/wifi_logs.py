@@ -1,8 +1,7 @@
-"""Packets of Wi-Fi logs of Nexmon, read by `csiread`.
+"""Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; ESP32 on no log of a card yet.
 
 `csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a
-file that is not there ends the process. So lengths are looked at before it reads. Logs of other cards: write
-what `csiread` reads of them, with their places, as a file of the schema.
+file that is not there ends the process. So lengths are looked at before it reads.
 """
 
 from __future__ import annotations
@@ -14,8 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.datasets.wsr import RECORD, TONES, read_log
 from gsparc.data.errors import DataError, readable
 
+SUFFIXES = {".pcap": "nexmon", ".dat": "intel", ".csv": "esp32"}
+HT40 = 0x800  # of the rates of an Intel 5300: 40 MHz
+TONES_40 = np.array([*range(-58, 0, 4), *range(2, 59, 4)])  # of 128 that it reports there
+STREAMS = 3  # most antennas at either end of the cards
+BUFFER = 1024  # bytes of `csiread` for a record of an Intel 5300
+TICKS = 2.0**32  # microseconds after which the clock of an Intel 5300 begins again
 HEADS = 16, 60  # bytes of a packet before its Ethernet frame, and of that before the channel
 POINTS = {256: 20, 512: 40, 1024: 80}  # MHz by bytes of the channel, after which come a few that are none
 PADDING = 256  # bytes, more than those
@@ -28,11 +34,11 @@ class Packets:
 
     Attributes:
         time_s: (n,) float64 [s], of the clock that the card or the computer logs.
-        sender: (n,) str, the address that each is from.
+        sender: (n,) str, the address that each is from; empty where the log does not say.
         csi: (n, A, K) complex, in the card's own scale.
         tone: (K,) int, subcarriers counted from the carrier.
         rssi_dbm: (n,) float64, NaN where the log does not say.
-        carrier_hz: of all packets.
+        carrier_hz: of all packets; None where the log does not say.
         position: (n, 3) [m] where they were received, which no log says.
     """
 
@@ -41,8 +47,33 @@ class Packets:
     csi: np.ndarray
     tone: np.ndarray
     rssi_dbm: np.ndarray
-    carrier_hz: float
+    carrier_hz: float | None = None
     position: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> Packets:
+    """Read the packets of a log.
+
+    Args:
+        path: *.pcap of Nexmon, *.dat of an Intel 5300, or what `card` names.
+        card: `nexmon`, `intel` or `esp32`; None: by the file's ending.
+        chip: of Nexmon: `4339`, `43455c0`, `4358` or `4366c0`.
+
+    Raises:
+        DataError: `csiread` is missing, or the file, or it is no log of this card.
+    """
+    try:
+        import csiread
+    except ImportError:
+        raise DataError(f"{path}: Wi-Fi logs need csiread; say: pip install 'gsparc[wifi]'") from None
+    card = card or SUFFIXES.get(path.suffix.lower())
+    if card not in READERS:
+        raise DataError(f"{path}: no log of a known card; say dataset.card={'|'.join(READERS)}")
+    with readable(path, f"not readable as a log of {card}", Exception):  # `csiread` raises anything
+        packets = READERS[card](path, csiread, chip)
+    if not len(packets.csi):
+        raise DataError(f"{path}: no packet with a channel in it; is it a log of {card}?")
+    return packets
 
 
 def channel_hz(channel: int) -> float:
@@ -54,27 +85,6 @@ def channel_hz(channel: int) -> float:
 def format_address(octets: np.ndarray) -> np.ndarray:
     """Return addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
     return np.array([":".join(f"{octet:02x}" for octet in one) for one in octets], str)
-
-
-def read_packets(path: Path, chip: str = "43455c0") -> Packets:
-    """Read the packets of a log.
-
-    Args:
-        path: *.pcap of Nexmon.
-        chip: `4339`, `43455c0`, `4358` or `4366c0`.
-
-    Raises:
-        DataError: `csiread` is missing, or the file, or it is no log of Nexmon.
-    """
-    try:
-        import csiread
-    except ImportError:
-        raise DataError(f"{path}: Wi-Fi logs need csiread; say: pip install 'gsparc[wifi]'") from None
-    with readable(path, "not readable as a log of Nexmon", Exception):  # `csiread` raises anything
-        packets = _nexmon(path, csiread, chip)
-    if not len(packets.csi):
-        raise DataError(f"{path}: no packet with a channel in it; is it a log of Nexmon?")
-    return packets
 
 
 def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
@@ -113,3 +123,44 @@ def _frames(path: Path) -> Iterator[tuple[int, bytes, bool]]:
         if frame[6:12] == b"NEXMON":
             yield (size - head) // PADDING * PADDING, frame[42:46], len(frame) == size
         at += before + size
+
+
+def _intel(path: Path, csiread: Any, _: str) -> Packets:
+    content = path.read_bytes()
+    size = int.from_bytes(content[:2], "big")
+    if size + 2 == RECORD.itemsize:  # with time and sender, which `csiread` would take for the channel
+        own = read_log(path)
+        power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
+        sender = format_address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
+        return Packets(own.time, sender, own.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
+    at, count = 0, 0
+    while at + 2 < len(content):
+        size = int.from_bytes(content[at : at + 2], "big")
+        if size > BUFFER:
+            raise DataError(f"{path}, byte {at}: a record of {size} bytes; is it a log of an Intel 5300?")
+        at, count = at + 2 + size, count + 1
+    log = csiread.Intel(str(path), STREAMS, STREAMS, if_report=False, bufsize=count)
+    log.read()
+    wide = (log.rate & HT40) > 0
+    kept = (log.Nrx == log.Nrx.max(initial=0)) & (wide == wide[:1])
+    tick = log.timestamp_low[kept].astype(np.float64)
+    tick += TICKS * np.cumsum(np.diff(tick, prepend=tick[:1]) < 0)
+    return Packets(
+        1e-6 * tick,
+        np.full(len(tick), ""),
+        log.csi[kept, :, : int(log.Nrx.max(initial=0)), 0].swapaxes(1, 2),  # the first transmit antenna
+        TONES_40 if wide[:1].any() else TONES,
+        log.get_total_rss()[kept],
+    )
+
+
+def _esp32(path: Path, csiread: Any, _: str) -> Packets:
+    log = csiread.ESP32(str(path), if_report=False)
+    log.read()
+    tone = np.fft.fftfreq(64, 1 / 64).round().astype(int)  # of the legacy training field, which comes first
+    carrier = channel_hz(int(log.channel[0]))
+    csi = log.csi[:, None, :64]
+    return Packets(1e-6 * log.local_timestamp, np.array(log.mac), csi, tone, log.rssi * 1.0, carrier)
+
+
+READERS = {"nexmon": _nexmon, "intel": _intel, "esp32": _esp32}
