@@ -28,13 +28,14 @@ import numpy as np
 from numpy.lib.format import MAGIC_PREFIX
 from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
-from scipy.io import loadmat
+from scipy.io import loadmat, netcdf_file
 
 from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
 from gsparc.data.errors import DataError, explain_error, readable
 from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
 UNREADABLE = (SyntaxError, TokenError)  # of a header that is no Python literal
 COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
@@ -64,7 +65,7 @@ class Raw:
 
 
 def read_raw(path: str | Path) -> Raw:
-    """Read every array of an npz, HDF5 or MATLAB file.
+    """Read every array of an npz, HDF5, MATLAB or NetCDF file.
 
     Raises:
         DataError: no such file, another format, damaged, or Python objects inside.
@@ -72,12 +73,11 @@ def read_raw(path: str | Path) -> Raw:
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.npz, *.h5 or *.mat")
-    readers = {".npz": _read_npz, ".mat": _read_mat, **dict.fromkeys(HDF5_SUFFIXES, _read_hdf5)}
+    readers = {".npz": _read_npz, ".mat": _read_mat}
+    readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(NETCDF_SUFFIXES, _read_netcdf)
     if path.suffix.lower() not in readers:
         suffix, known = path.suffix or "no ending", ", ".join(readers)
-        raise DataError(
-            f"{path}: expected a name ending in one of {known}; found {suffix}; save others by numpy.savez"
-        )
+        raise DataError(f"{path}: expected a name ending in one of {known}; found {suffix}")
     return readers[path.suffix.lower()](path)
 
 
@@ -227,7 +227,7 @@ def _stated_npz(path: Path) -> Stated:
 
 
 @contextmanager
-def _datasets(path: Path) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
+def _datasets(path: Path, to_disk: bool = False) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
     """An HDF5 file and its datasets by name, none larger than it can hold."""
     fault = hdf5_text_error(path)
     if fault is not None:
@@ -238,17 +238,17 @@ def _datasets(path: Path) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]
         known = {name: one for name, one in items.items() if one.size is not None}
         # What lies in one piece takes nothing that is not in the file.
         stated = {name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in known.items()}
-        check_array_sizes(path, stated, to_disk=True)
+        check_array_sizes(path, stated, to_disk)
         yield file, items
 
 
 def _read_hdf5(path: Path) -> Raw:
     arrays, units, name = {}, {}, "the file"
     try:
-        with _datasets(path) as (file, items):
+        with _datasets(path, to_disk=True) as (file, items):
             for name, item in items.items():
                 plain = not h5py.check_string_dtype(item.dtype) and not item.dtype.names
-                arrays[name] = map_from_disk(item) if plain and is_big(item) else _values(item)
+                arrays[name] = map_from_disk(item) if plain and is_big(item) else _values(item, fixed=True)
                 if "units" in item.attrs:
                     units[name] = _plain(item.attrs["units"])
                 if _plain(item.attrs.get("MATLAB_class")) == "char":  # columns first, as all of MATLAB's
@@ -283,12 +283,13 @@ def _read_mat(path: Path) -> Raw:
     return Raw({name: array.squeeze() for name, array in arrays.items() if name not in words}, words)
 
 
-def _values(item: h5py.Dataset) -> np.ndarray:
-    """Values of a dataset; compounds of real and imaginary parts are complex."""
+def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:
+    """Values of a dataset; text of variable length, and `fixed` where wanted, as text, compounds complex."""
+    text = h5py.check_string_dtype(item.dtype)
     if item.dtype.names and " ".join(item.dtype.names).lower() in COMPLEX:
         parts = item[()]
         return np.asarray(parts[item.dtype.names[0]] + 1j * parts[item.dtype.names[1]])
-    return np.asarray(item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()])
+    return np.asarray(item.asstr()[()] if text and (fixed or text.length is None) else item[()])
 
 
 def _plain(value: Any) -> Any:
@@ -374,3 +375,50 @@ def _has_heap(path: Path) -> bool:
         return False
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         return content.find(HEAP) >= 0
+
+
+NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is 9.97e36
+
+
+def _read_netcdf(path: Path) -> Raw:
+    """Every variable of the root group; text as text, fill values of floating point numbers as NaN."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start == b"CDF\x05":
+        raise DataError(f"{path}: NetCDF classic of 64-bit data is not read; convert with nccopy -k nc4")
+    read = _classic if start[:3] == b"CDF" else _hdf5 if start == b"\x89HDF" else None
+    if read is None:
+        raise DataError(f"{path}: neither NetCDF3 nor NetCDF4; its first bytes are {start!r}")
+    # The last three are what SciPy raises on damage.
+    with readable(
+        path, "damaged or not a NetCDF file", (*DAMAGED, AssertionError, IndexError, AttributeError)
+    ):
+        return Raw({name: _of_netcdf(*variable) for name, variable in read(path).items()})
+
+
+def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
+    with netcdf_file(str(path), "r", mmap=False) as file:
+        variables = file.variables.items()
+        return {name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in variables}
+
+
+def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
+    with _datasets(path) as (_, items):
+        return {name: (_values(item), item.attrs.get("_FillValue")) for name, item in items.items()}
+
+
+def _of_netcdf(array: np.ndarray, fill: Any) -> np.ndarray:
+    """Numbers in the machine's byte order, rows of characters joined to text."""
+    if array.dtype == object:
+        return array.astype(str)
+    if array.dtype.kind == "S":
+        if array.dtype.itemsize == 1 and array.ndim and array.shape[-1]:
+            array = np.ascontiguousarray(array).view(f"S{array.shape[-1]}")[..., 0]
+        return np.char.strip(np.char.decode(array, "utf-8", errors="replace"), "\0 ")
+    array = array.astype(array.dtype.newbyteorder("="))
+    if array.dtype.kind == "f":
+        never = np.abs(array) > NEVER_WRITTEN
+        if fill is not None:
+            never |= array == np.asarray(fill).ravel()[0]
+        array[never] = np.nan
+    return array

@@ -183,7 +183,7 @@ def _array_twice(whole: bytes) -> bytes:
 NO_FILES = {  # name of the file, what becomes of a sound archive, and what is said
     "absent.npz": (None, "no such file"),
     "half.npz": (lambda whole: whole[: len(whole) // 2], "damaged or not an npz"),
-    "mine.csv": (lambda whole: b"x", r"expected .* \.hdf5; found \.csv; save others by numpy\.savez"),
+    "mine.csv": (lambda whole: b"x", r"expected .* \.hdf5, \.nc, \.nc3, \.nc4, \.cdf; found \.csv"),
     "empty.hdf5": (lambda whole: b"", "damaged or not an HDF5"),
     "flipped.npz": (_flipped, "csi: damaged"),
     "locked.npz": (_encrypted, "damaged or not an npz file.*encrypted"),

@@ -149,7 +149,10 @@ def unwritten(path, rows=10**12, **more):
     (10**8, {f"extra{n}": "u1" for n in range(40)},
         "shape .100000000,., 100,000,000 bytes: .* does not hold"),
 ])  # fmt: skip
-def test_an_array_that_was_never_written_filled_the_disk(tmp_path, monkeypatch, refused, rows, more, says):
+@pytest.mark.parametrize("name", ["own.h5", "own.nc"])
+def test_an_array_that_was_never_written_filled_the_disk(
+    tmp_path, monkeypatch, refused, rows, more, says, name
+):
     """A file of 7 kB: 73 GB in 8 s, until other programs died."""
     monkeypatch.setattr(
         blocks, "allocate_on_disk", lambda *unused: pytest.fail("written before it was refused")
@@ -157,7 +160,7 @@ def test_an_array_that_was_never_written_filled_the_disk(tmp_path, monkeypatch, 
     monkeypatch.setattr(
         h5py.Dataset, "__getitem__", lambda *unused: pytest.fail("read before it was refused")
     )
-    refused(says, read_any, unwritten(tmp_path / "own.h5", rows, **more))
+    refused(says, read_any, unwritten(tmp_path / name, rows, **more))
 
 
 def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch, refused):

@@ -2,10 +2,15 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
+from scipy.io import netcdf_file
 
+HOSTS = np.array(["A05", "A06", "B05"])
 ANTENNAS = np.array([[7.85, 0.66, 2.4], [7.85, 1.26, 2.4], [6.65, 0.66, 2.4]])
 RUNS = np.array(["EXP005", "EXP006"])
+CYCLES = 8  # of each run; the first has no position in EXP006, the last was measured in EXP005 only
+KINDS = ("netcdf3", "netcdf4")
 
 
 def channels_of(places: np.ndarray) -> np.ndarray:
@@ -25,6 +30,62 @@ def techtile_arrays() -> dict[str, np.ndarray]:
         "csi": np.where(mask, channels_of(places), 0).astype(np.complex64), "mask": mask,
         "run": np.repeat(RUNS, [8, 4]), "frequency_hz": np.array(920e6),
     }  # fmt: skip
+
+
+def release_variables() -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+    """Dimensions and values of the variables of a small NetCDF file in Techtile's layout."""
+    rng = np.random.default_rng(1)
+    where = rng.uniform([1, 1, 0.7], [3, 3, 0.8], (2, CYCLES, 3))
+    stored = channels_of(where).conj()  # reference minus received phase
+    placed, heard = np.ones((2, CYCLES), np.int8), np.ones((2, CYCLES, 3), np.int8)
+    placed[1, 0], where[1, 0] = 0, np.nan
+    heard[1, -1], stored[1, -1] = 0, np.nan
+    heard[0, 3, 2], stored[0, 3, 2] = 0, np.nan
+    over = ("experiment_id", "cycle_id")
+    return {
+        "experiment_id": (over[:1], RUNS), "cycle_id": (over[1:], np.arange(1, CYCLES + 1, dtype=np.int32)),
+        "hostname": (("hostname",), HOSTS),
+        **{f"rover_{axis}": (over, where[..., i]) for i, axis in enumerate("xyz")},
+        "position_available": (over, placed), "csi_real": ((*over, "hostname"), stored.real.copy()),
+        "csi_imag": ((*over, "hostname"), stored.imag.copy()), "csi_available": ((*over, "hostname"), heard),
+    }  # fmt: skip
+
+
+def write_release(folder: Path, kind: str = "netcdf3", variables=None, antennas: bool = True) -> Path:
+    """A NetCDF file of the release, and Techtile's table of antennas beside it."""
+    variables = release_variables() if variables is None else variables
+    path = folder / "csi.nc"
+    (_write_netcdf3 if kind == "netcdf3" else _write_netcdf4)(path, variables)
+    if antennas:
+        rows = [
+            f"- tile: {host}\n  channels:\n  - {{x: 0, y: 0, z: 0}}\n"
+            f"  - {{x: {place[0]}, y: {place[1]}, z: {place[2]}}}\n"
+            for host, place in zip(HOSTS[::-1], ANTENNAS[::-1], strict=True)
+        ]
+        (folder / "techtile_antenna_locations.yml").write_text("antennes:\n" + "".join(rows))
+    return path
+
+
+def _write_netcdf3(path: Path, variables) -> None:
+    with netcdf_file(str(path), "w", version=2) as file:
+        for name, (dimensions, values) in variables.items():
+            if values.dtype.kind == "U":  # text is an array of characters
+                values = values.astype("S")
+                width = values.dtype.itemsize
+                values = np.frombuffer(values.tobytes(), "S1").reshape(*values.shape, width)
+                dimensions = (*dimensions, f"string{width}_{name}")
+            for dimension, size in zip(dimensions, values.shape, strict=True):
+                if dimension not in file.dimensions:
+                    file.createDimension(dimension, size)
+            file.createVariable(name, values.dtype, dimensions)[:] = values
+
+
+def _write_netcdf4(path: Path, variables) -> None:
+    with h5py.File(path, "w") as file:
+        for name, (_, values) in variables.items():
+            text = values.dtype.kind == "U"
+            kind = h5py.string_dtype() if text else values.dtype
+            file.create_dataset(name, data=values.astype(object) if text else values, dtype=kind)
 
 
 STATIONS = np.array(["ebc-nuc1-b210", "madsen-nuc2-b210", "cbrssdr1-fm-comp"])

@@ -9,7 +9,7 @@ import numpy as np
 from access_points import walks
 from campaigns import brief, channels, compose, powers, spectra
 from crashes import small_campaign
-from measured import write_npz, write_walk
+from measured import write_npz, write_release, write_walk
 from PIL import Image
 from towns import town_file
 
@@ -88,7 +88,7 @@ class Tiny:
                     simulate(small_campaign(40), path.with_suffix(".h5")),
                     path.with_suffix(".h5"),
                 )[1],
-                "techtile": lambda: write_npz(path, "techtile"),
+                "techtile": lambda: write_release(path),
                 "powder": lambda: write_walk(path),
                 "ble": lambda: write_npz(path, "ble"),
                 "fingerprints": lambda: self._walks(path.with_suffix(".npz")),

@@ -4,21 +4,138 @@
 import numpy as np
 import pytest
 from measured import (
+    ANTENNAS,
+    CYCLES,
     DEGREES,
+    HOSTS,
+    KINDS,
     MAKERS,
     STATIONS,
     TABLE,
+    channels_of,
     powder_arrays,
+    release_variables,
     write_npz,
+    write_release,
     write_walk,
 )
 from releases import real
 
 from gsparc.data.datasets.own import LOADERS, read_any
 from gsparc.data.datasets.powder import read_powder
+from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
-from gsparc.data.raw import Raw, write_raw
+from gsparc.data.raw import Raw, read_raw, write_raw
+
+EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
+
+
+@EVERY_KIND
+def test_techtile_release(tmp_path, kind):
+    raw = read_techtile(write_release(tmp_path, kind))
+    held, rows = raw.arrays, 2 * CYCLES - 2  # one without position, one without channels
+    assert held["tx_position"].shape == (rows, 3) and held["tx_position"].dtype == np.float64
+    assert held["station_name"].tolist() == HOSTS.tolist()
+    assert np.array_equal(held["station_position"], ANTENNAS)  # matched by tile, not by order
+    assert held["frequency_hz"] == 920e6 and np.isfinite(held["csi"]).all()
+    assert held["row_name"][0] == "EXP005 cycle 1" and held["row_name"][-1] == "EXP006 cycle 7"
+    assert held["run"].tolist() == ["EXP005"] * CYCLES + ["EXP006"] * (CYCLES - 2)
+    assert held["mask"].sum() == 3 * rows - 1 and not held["mask"][3, 2]
+    assert raw.notes[0] == "1 of 15 cycles left out: no position"
+    # The release stores reference minus received phase, which rises with distance.
+    expected = channels_of(held["tx_position"])
+    assert np.allclose(held["csi"][held["mask"]], expected[held["mask"]], atol=1e-6)
+
+
+@EVERY_KIND
+def test_techtile_release_of_one_experiment(tmp_path, kind):
+    variables = {
+        name: (dimensions[1:], values[0]) if dimensions[0] == "experiment_id" else (dimensions, values)
+        for name, (dimensions, values) in release_variables().items()
+    }
+    del variables["experiment_id"]
+    held = read_techtile(write_release(tmp_path, kind, variables)).arrays
+    assert held["csi"].shape == (CYCLES, 3) and set(held["run"]) == {"csi"}
+
+
+def test_techtile_release_without_flags(tmp_path):
+    variables = {n: v for n, v in release_variables().items() if not n.endswith("_available")}
+    masks = [read_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"] for v in (None, variables)]
+    assert np.array_equal(*masks)
+
+
+def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
+    path = write_release(tmp_path)
+    table = (tmp_path / "techtile_antenna_locations.yml").rename(tmp_path / "ceiling.yml")
+    assert np.array_equal(read_techtile(path, table).arrays["station_position"], ANTENNAS)
+    refused("name the file with dataset.antennas", read_techtile, path)
+    variables = {**release_variables(), "rx_antenna_position": (("hostname", "xyz"), ANTENNAS)}
+    path = write_release(tmp_path, variables=variables, antennas=False)
+    assert np.array_equal(read_techtile(path).arrays["station_position"], ANTENNAS)
+
+
+TECHTILE = {
+    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc, csi_imag: missing; expected real numbers (E, C, H)"),
+    "one experiment of two": ({"csi_real": (("h", "c"), np.zeros((3, 8)))},
+        "csi.nc, csi_imag: expected shape (E, C, H)"),
+    "transposed": (
+        {"csi_imag": (("h", "c", "e"), np.zeros((3, 8, 2)))},
+        "csi.nc, csi_imag: expected shape (E, C, H), here (2, 8, 3), found (3, 8, 2); transposed?",
+    ),
+    "another host": ({"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
+        "techtile_antenna_locations.yml: no antenna of the tiles G99"),
+    "no position": ({"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
+        "csi.nc: no cycle has both a position and a channel"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TECHTILE)
+def test_spoilt_techtile_releases(tmp_path, refused, case):
+    change, says = TECHTILE[case]
+    variables = {
+        name: value for name, value in {**release_variables(), **change}.items() if value is not None
+    }
+    refused(says, read_techtile, write_release(tmp_path, variables=variables))
+
+
+ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: .nan, y: 2, z: 3}}"
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("antennes: 3", "expected `antennes:` with a list"),
+    ("antennes:\n- tile: A05\n", "no antenna of the tiles A06, B05"),
+    *(
+            (
+                "antennes:\n" + "".join(f"- {{tile: {h}, {c}}}\n" for h in HOSTS),
+                "A05: expected x, y, z [m] of channel 1",
+            )
+            for c in (ONE_CHANNEL, NAN_CHANNEL)
+        ),
+    ("[1, 2", "not readable as YAML"),
+])  # fmt: skip
+def test_spoilt_tables_of_antennas(tmp_path, refused, text, says):
+    path = write_release(tmp_path)
+    (tmp_path / "techtile_antenna_locations.yml").write_text(text)
+    refused(says, read_techtile, path)
+
+
+@EVERY_KIND
+def test_damaged_netcdf(tmp_path, refused, kind):
+    path = write_release(tmp_path, kind)
+    whole = path.read_bytes()
+    for content in (b"", b"hello", whole[: len(whole) // 2], whole[:40], b"CDF\x05" + whole[4:]):
+        path.write_bytes(content)
+        refused("csi.nc: ", read_raw, path)
+    refused("no such file", read_raw, tmp_path / "other.nc")
+
+
+def test_values_that_were_never_written_are_none(tmp_path):
+    variables = release_variables()
+    variables["rover_x"][1][0, 2] = 9.969209968386869e36
+    raw = read_techtile(write_release(tmp_path, variables=variables))
+    assert raw.notes[0].startswith("2 of 15 cycles")
+    assert np.isfinite(raw.arrays["tx_position"]).all()
 
 
 def test_powder_stations_without_a_place_are_left_out(tmp_path):
