@@ -30,15 +30,16 @@ def facts_under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:
 def result_rows(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the row of a run's method and those of the baselines beside it, from the facts of its summary.
 
-    Columns are those of `OF_RUN`, `OF_MODEL` and `COSTS`; `fold` (None: all are pooled), `method`, `baseline`
-    (whether it is one), `measured` (rows that a model learned from), `effects`, `figure` (the deciding one),
-    its `value`, that of Gaussians `alone`, and every figure under its own name; None where a summary has no
-    such fact.
+    Columns are those of `OF_RUN`, `OF_MODEL` and `COSTS`; `draw` of the split, `fold` (None: all are pooled),
+    `method`, `baseline` (whether it is one), `measured` (rows that a model learned from), `effects`,
+    `figure` (the deciding one), its `value`, that of Gaussians `alone`, and every figure under its own name;
+    None where a summary has no such fact.
     """
     # Counts of a summary are sums over folds; `measured` is per model.
     counts = [int(facts.get(f"split/{name}") or 0) for name in ("train", "val", "folds")]
     folds = max(counts[2], 1)
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
+    shared["draw"] = str(facts.get("split/sha256"))[:8]  # which rows learn and test
     shared["kind"] = shared["kind"] if shared["kind"] in DECIDING else "spectrum"
     shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts), "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}

@@ -64,10 +64,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.group_by_setting(runs)) < len(runs):
         study.tables.append(tables.table_of_seeds(runs))
-    if tables.has_draws(runs):
-        study.tables.append(tables.table_of_leads(runs))
-    last = tables.table_of_results(runs), tables.table_of_worst(runs)
-    study.tables += [table for table in last if table.rows]
+    kinds = tables.table_of_leads, tables.table_of_results, tables.table_of_worst
+    study.tables += [table for table in (kind(runs) for kind in kinds) if table.rows]
     study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
     study.plots = [
         (str(figure.get_label()), _unique_ids(plots.to_svg(figure), number))
@@ -91,7 +89,8 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         groups = tables.group_by_setting(scored).values()
         group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
-        if leads := tables.lead_over_draws(group):
+        leads = {name: lead for name, lead in tables.leads_of_baselines(group).items() if lead}
+        if leads:
             name = max(leads, key=lambda one: leads[one].ahead_db)
             remarks += judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
     elif scored:  # a baseline must beat the best run of the page

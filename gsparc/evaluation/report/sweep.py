@@ -76,7 +76,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import make_sections, write_report
     from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again
-    from gsparc.evaluation.report.tables import group_by_setting, has_draws, table_of_leads, table_of_seeds
+    from gsparc.evaluation.report.tables import group_by_setting, table_of_leads, table_of_seeds
 
     runs = find_runs([folder])
     if settings.retime:
@@ -90,11 +90,11 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
-        (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
+        shown = [table, leads] if (leads := table_of_leads(group)).rows else [table]
+        text = "\n".join(one.markdown() for one in shown)
+        (folder / f"{stem}.md").write_text(text, encoding="utf-8")
         plots.draw_distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
-        console.print(table.without(*WIDE))
-        if has_draws(group):
-            console.print(table_of_leads(group))
+        console.print(*(one.without(*WIDE) for one in shown))
         for same in equal_settings(group_by_setting(group)):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
     summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})
