@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from hashlib import file_digest, sha256
-from importlib.metadata import distribution, packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -38,6 +37,7 @@ OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
+INSTALLED = (".py", ".so")  # of a package, kernels among it
 NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
 OURS = ("gsparc/", "ops/", "callbacks/", "conf/", "hydra_plugins/")  # of gsparc's; the rest is somebody's
 STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
@@ -202,7 +202,7 @@ def package_hash(package: str) -> str:
 
     In a checkout it is of what git tracks and of new files, as they are, of gsparc's in its own folders:
     commits that change pages, tests, comments or docstrings alone change nothing. Of an installed
-    distribution it is of its record, else of all modules in its folder.
+    package it is of all modules in its folder.
     """
     spec = find_spec(package)
     if spec is None:
@@ -214,11 +214,8 @@ def package_hash(package: str) -> str:
     checkout = _checkout(folder)
     if checkout is not None:
         return _of_files(*checkout)
-    for name in packages_distributions().get(package, ()):
-        one = distribution(name)  # the record of an editable one names no module
-        if any(file.parts[0] == package for file in one.files or ()):
-            return sha256(str(one.read_text("RECORD")).encode()).hexdigest()
-    return _of_files(folder, [str(file.relative_to(folder)) for file in folder.rglob("*.py")])
+    files = (file for file in folder.rglob("*") if file.suffix in INSTALLED)
+    return _of_files(folder, [str(file.relative_to(folder)) for file in files])
 
 
 def strip_comments(text: str) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment
@@ -19,7 +20,14 @@ from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import better_baseline, busy_machine, judge_baseline, run_conditions
+from gsparc.evaluation.summary import (
+    better_baseline,
+    busy_machine,
+    judge_baseline,
+    program_version,
+    provenance,
+    run_conditions,
+)
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -120,10 +128,15 @@ def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
 
 
 def write_report(
-    folder: Path, title: str, note: str, sections: Sequence[Section], figures: Sequence[str] = ()
-) -> None:
-    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    folder: Path, title: str, runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
+    figures: Sequence[str] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`.
+
+    Returns where the program comes from, see `provenance`.
+    """
+    sections, origin = make_sections(runs, fronts), provenance()
+    note = f"{len(runs)} run{'s' * (len(runs) > 1)}; made by {program_version(origin)}"
     (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:
@@ -137,6 +150,7 @@ def write_report(
             name = f"{_slug(study.title)}-{_slug(str(figure.get_label()))}.png"
             save(figure, folder / name, also=figures)
     (folder / "report.md").write_text("\n".join(parts), encoding="utf-8")
+    return origin
 
 
 def _slug(text: str) -> str:

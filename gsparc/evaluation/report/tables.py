@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
+import pandas as pd
 
 from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
@@ -66,25 +67,18 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
     return (values, None) if len(values) > 1 else None
 
 
-def interval_over_seeds(values: Sequence[float | None]) -> Interval | None:
-    """Mean, least and largest over those seeds that have a value; None where none has."""
-    known = [value for value in values if value is not None]
+def pooled_interval(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
+    """Return the mean over draws of the split and its standard error, seeds of each averaged.
+
+    Of one draw with the least and largest over seeds; None where none has a value.
+    """
+    known = pd.DataFrame({"value": values, "draw": draws}).dropna()
+    means = known.groupby("draw").value.mean()
+    if len(means) > 1:
+        return Interval(means.mean(), error=means.sem())
     # A single seed has no spread: no brackets.
-    if len(known) < 2:
-        return Interval(known[0]) if known else None
-    return Interval(float(np.mean(known)), min(known), max(known))
-
-
-def interval_over_draws(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
-    """Mean over draws of the split and its standard error, seeds of each averaged; of one draw over seeds."""
-    known: dict[str, list[float]] = {}
-    for value, draw in zip(values, draws, strict=True):
-        if value is not None:
-            known.setdefault(draw, []).append(value)
-    if len(known) < 2:
-        return interval_over_seeds(values)
-    means = np.array([np.mean(own) for own in known.values()])
-    return Interval(float(means.mean()), error=float(means.std(ddof=1) / len(means) ** 0.5))
+    ends = (known.value.min(), known.value.max()) if len(known) > 1 else ()
+    return Interval(known.value.mean(), *ends) if len(known) else None
 
 
 def has_draws(runs: Sequence[Run]) -> bool:
@@ -152,7 +146,7 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
     for setting, group in groups.items():
         draws = [row["draw"] for row in group]
         counts = [len(set(draws)), len({row["seed"] for row in group})] if several else [len(group)]
-        values = [interval_over_draws([column.value(row) for row in group], draws) for column in spread]
+        values = [pooled_interval([column.value(row) for row in group], draws) for column in spread]
         rows.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
     counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
     note = "Brackets: least and largest over seeds, on the same split: split.seed draws others. "
