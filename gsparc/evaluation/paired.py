@@ -155,7 +155,7 @@ def lead_over_runs(own: Sequence[Row], others: Sequence[Row]) -> Lead | None:
         gains[a["draw"]].append(score_db(a) - score_db(b))
     if len(gains) > 1:
         return Lead.from_gains(np.array([np.mean(seeds) for seeds in gains.values()]), "draws")
-    rows = [gains_of_rows(*(_samples(row) for row in pair), pair[0]["figure"]) for pair in pairs]
+    rows = [gains_of_rows(_samples(a), _samples(b), a["figure"]) for a, b in pairs]
     known = [of_rows for of_rows in rows if of_rows is not None]
     if not known or len(known) < len(rows):
         return None

@@ -17,7 +17,7 @@ from uuid import uuid4
 
 import pandas as pd
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     TABLES,
@@ -47,8 +47,7 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     """
     # Sorted keys: summaries of two runs are compared line by line.
     text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
-    with whole_file(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    write_whole(path, text + "\n")
 
 
 def read_summary(path: str | Path) -> dict[str, Any] | None:
@@ -69,8 +68,7 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
     """
     # object: pandas would write whole numbers beside empty cells as 3.0.
     frame = pd.DataFrame(columns, dtype=object)
-    with whole_file(path) as partial:
-        frame.to_csv(partial, index=False, lineterminator="\n")
+    write_whole(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def new_run_id() -> str:
@@ -237,20 +235,12 @@ def judge_baseline(baseline: str, method: str, figure: str, lead: Lead) -> list[
 
 
 def _value(key: str, value: Any) -> int | float | str | None:
-    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:  # NumPy and torch scalars
-        value = value.item()
+    value = value.item() if getattr(value, "ndim", None) == 0 else value  # NumPy and torch scalars
     # JSON's true is no number to programs that read figures.
-    if isinstance(value, bool):
-        value = int(value)
-    if value is None or isinstance(value, (int, str)):
+    value = int(value) if isinstance(value, bool) else value
+    if value is None or isinstance(value, (int, str)) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    if not isinstance(value, float):
-        raise ValueError(
-            f"summary: {key} is a {type(value).__name__}; only numbers, strings and null are kept"
-        )
-    if not math.isfinite(value):
-        raise ValueError(f"summary: {key} is {value}; a summary holds finite numbers (null when undefined)")
-    return value
+    raise ValueError(f"summary: {key} is {value!r}; finite numbers, strings and null (undefined) are kept")
 
 
 def run_git(folder: Path, *arguments: str) -> str | None:

@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.assemble import content_hash, identity_hash
 from gsparc.data.errors import DataError, list_first
-from gsparc.data.files import SUMMARY, set_aside, whole_file
+from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.summary import read_summary, run_git
@@ -175,12 +175,12 @@ def recorded(folder: Path, state: State, unread: State | None = None) -> Iterato
             log.info("%s: begun anew: %s", folder, state.changes(record))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "unread": unread and asdict(unread), "began": time.time(), "ended": False}
-        _write(folder / RECORD, record)
+        write_whole(folder / RECORD, json.dumps(record, indent=1))
     else:
         left = _last_state(folder, record["began"])
     (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
     yield left
-    _write(folder / RECORD, {**record, "ended": True})
+    write_whole(folder / RECORD, json.dumps({**record, "ended": True}, indent=1))
 
 
 def program_hash(settings: Any) -> str:
@@ -279,8 +279,3 @@ def _last_state(folder: Path, began: float) -> str | None:
         if own(folder / name):
             return str(folder / name)
     return str(folder) if any(own(path) for pattern in PARTS for path in folder.glob(pattern)) else None
-
-
-def _write(path: Path, record: Mapping[str, Any]) -> None:
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(record, indent=1), encoding="utf-8")

@@ -16,18 +16,11 @@ from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
 
+from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import (
-    better_baseline,
-    busy_machine,
-    judge_baseline,
-    program_version,
-    provenance,
-    run_conditions,
-)
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -92,7 +85,9 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 def warnings(runs: Sequence[Run]) -> list[str]:
     """Return what a reader must know first, each once: the loads of a busy machine are one range."""
     # Loads differ from run to run: as remarks of their own there would be one a run.
-    remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
+    remarks = [
+        remark for run in runs for remark in summary.run_conditions({**run.facts, "machine/load": None})
+    ]
     scored = [run for run in runs if run.row["value"] is not None]
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         groups = tables.group_by_setting(scored).values()
@@ -100,11 +95,11 @@ def warnings(runs: Sequence[Run]) -> list[str]:
         leads = {name: lead for name, lead in tables.leads_of_baselines(group).items() if lead}
         if leads:
             name = max(leads, key=lambda one: leads[one].ahead_db)
-            remarks += judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
+            remarks += summary.judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
     elif scored:  # a baseline must beat the best run of the page
-        remarks += better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
+        remarks += summary.better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
-    return list(dict.fromkeys(remarks + busy_machine(loads)))
+    return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
 
 
 def _unique_ids(svg: str, number: int) -> str:
@@ -135,8 +130,8 @@ def write_report(
 
     Returns where the program comes from, see `provenance`.
     """
-    sections, origin = make_sections(runs, fronts), provenance()
-    note = f"{len(runs)} run{'s' * (len(runs) > 1)}; made by {program_version(origin)}"
+    sections, origin = make_sections(runs, fronts), summary.provenance()
+    note = f"{len(runs)} run{'s' * (len(runs) > 1)}; made by {summary.program_version(origin)}"
     (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 
 MILLIMETRES = 3  # digits of a corner in a file
 
@@ -71,5 +71,4 @@ def write_mesh(triangles: np.ndarray, path: Path) -> None:
     corners, which = np.unique(np.round(triangles.reshape(-1, 3), MILLIMETRES), axis=0, return_inverse=True)
     vertices = [f"v {x:.3f} {y:.3f} {z:.3f}" for x, y, z in corners]
     faces = [f"f {a} {b} {c}" for a, b, c in which.reshape(-1, 3) + 1]
-    with whole_file(path) as partial:
-        partial.write_text("\n".join([*vertices, *faces, ""]), encoding="utf-8")
+    write_whole(path, "\n".join([*vertices, *faces, ""]))
