@@ -1,5 +1,6 @@
 """The map shows every package, and the documents name files, commands and choices that exist."""
 
+import csv
 import re
 from collections import defaultdict
 from functools import cache
@@ -57,6 +58,10 @@ def test_what_a_page_names_is_there(page):
     missing = [file for file in files if not (page.parent / file).exists()]
     shown_tables = re.findall(r"<!-- table: (\S+) -->", text)
     missing += [path for path in shown_tables if not (ROOT / path).exists()]
+    for path in shown_tables:  # a comma without quotes made five cells of four
+        with (ROOT / path).open(encoding="utf-8", newline="") as file:
+            heads, *rows = csv.reader(file)
+        missing += [f"{path}: {row[0]}" for row in rows if len(row) != len(heads)]
     rooms = r"(?:gsparc|ops|callbacks|conf|bench|tests|docs)"
     paths = re.findall(rf"`({rooms}/[\w./-]+(?:\.\w+|/))`", text)
     missing += [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]

@@ -13,9 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.report.page import make_sections, write_report
-from gsparc.evaluation.report.runs import find_runs, read_columns, time_again
-from gsparc.evaluation.summary import program_version, provenance, write_summary
+from gsparc.evaluation.report.page import write_report
+from gsparc.evaluation.report.runs import find_runs, group_by_study, read_columns, time_again
+from gsparc.evaluation.summary import write_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -30,14 +30,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.retime:
         runs = time_again(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
     out = run_directory()
-    sections = make_sections(runs, _fronts(paths))
-    origin = provenance()
-    note = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program_version(origin)}"
-    write_report(out, config.title, note, sections, config.figures)
-    facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(sections), **origin}
+    origin = write_report(out, config.title, runs, _fronts(paths), config.figures)
+    facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(group_by_study(runs)), **origin}
     write_summary(out / "summary.json", facts)
-    console = open_console()
-    console.print(f"{note}; written to {out / 'report.html'}", highlight=False)
+    runs_read = f"{len(runs)} run{'s' * (len(runs) > 1)}"
+    open_console().print(f"{runs_read}; written to {out / 'report.html'}", highlight=False)
     return facts
 
 

@@ -18,7 +18,7 @@ from gsparc.apps.view.viewed import open_model
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.errors import DataError
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.data.limits import whole
 from gsparc.prediction.timing import peak_memory
 
@@ -79,8 +79,7 @@ def write(view: SiteView, path: Path) -> str:
     if path.suffix.lower() == ".html":
         from gsparc.apps.view.server.page import render_page
 
-        with whole_file(path) as partial:
-            partial.write_text(render_page(view), encoding="utf-8")
+        write_whole(path, render_page(view))
     else:
         name = view.viewed.stations[0]
         cloud = model_gaussians(view.viewed, name, view.station(name).measured)

@@ -129,6 +129,12 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def write_whole(path: str | Path, content: str | bytes) -> None:
+    """Write text, in UTF-8, or bytes, whole or not at all."""
+    with whole_file(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
     """Open an empty folder beside `path`, which must not exist, and which it becomes when the block ends.

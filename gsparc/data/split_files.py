@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.errors import DataError, readable
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.data.splits import Fold, Split, hash_indices
 
 log = logging.getLogger(__name__)
@@ -23,8 +23,7 @@ def write_split(
     facts |= {} if run_id is None else {"run_id": run_id}
     folds = [{name: part.tolist() for name, part in vars(fold).items()} for fold in split.folds]
     content = {**facts, "sha256": split.sha256, "folds": folds}
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(content) + "\n")
 
 
 def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:

@@ -14,8 +14,6 @@ import numpy as np
 import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.utilities import dim_zero_cat
 
 from gsparc.data.schema import Scored
 
@@ -28,7 +26,7 @@ SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
 
 
-class SampleMetric(Metric):
+class SampleMetric:
     """Base: one float64 per sample and quantity, kept in the order of the updates.
 
     `compute()` gives the arrays, `summary()` the flat figures.
@@ -37,14 +35,9 @@ class SampleMetric(Metric):
         scale: physical target = stored target * scale; spectra have none.
     """
 
-    full_state_update = False
-    quantities: tuple[str, ...] = ()
-
     def __init__(self, scale: float = 1.0) -> None:
-        super().__init__()
         self.scale = scale
-        for name in self.quantities:
-            self.add_state(name, default=[], dist_reduce_fx="cat")
+        self.parts: list[dict[str, Any]] = []
 
     def update(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
         """Add B samples; shapes and types of the kind's targets, mask like them (True where measured).
@@ -57,8 +50,7 @@ class SampleMetric(Metric):
             raise ValueError(f"{shapes} must have one shape")
         if not torch.isfinite(prediction).all():
             raise ValueError("a prediction holds NaN or Inf; it is not scored")
-        for name, value in self._score(prediction.detach().cpu(), target.detach().cpu(), mask).items():
-            getattr(self, name).append(torch.as_tensor(value, dtype=torch.float64))
+        self.parts.append(self._score(prediction.detach().cpu(), target.detach().cpu(), mask))
 
     def compute(self) -> dict[str, np.ndarray]:
         """Return per-sample quantities, each (S,) float64.
@@ -66,9 +58,10 @@ class SampleMetric(Metric):
         Raises:
             ValueError: no sample was added.
         """
-        if not getattr(self, self.quantities[0]):
+        if not self.parts:
             raise ValueError("no sample was scored: the chosen subset is empty")
-        return {name: dim_zero_cat(getattr(self, name)).numpy() for name in self.quantities}
+        every = ((name, [part[name] for part in self.parts]) for name in self.parts[0])
+        return {name: np.concatenate(values).astype(np.float64) for name, values in every}
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         raise NotImplementedError
@@ -88,8 +81,6 @@ class SpectrumMetrics(SampleMetric):
     >>> round(figures["psnr_db"], 2), round(figures["mae"], 3), figures["samples"]
     (20.0, 0.1, 2)
     """
-
-    quantities = ("ssim", "ssim_gauss", "psnr_db", "mse", "mae", "target_power")
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = prediction.double().numpy(), target.double().numpy()
@@ -129,10 +120,6 @@ class ChannelMetrics(SampleMetric):
     >>> round(figures["snr_db"], 2), round(figures["nmse"], 4), round(figures["nmse_scalar"], 4)
     (20.0, 0.01, 0.0)
     """
-
-    quantities: tuple[str, ...] = (
-        "error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db",
-    )  # fmt: skip
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         # In stored units, which are near 1: fourth powers of 1e-90 or 1e90 under- or overflow.
@@ -182,8 +169,6 @@ class AlignedChannelMetrics(ChannelMetrics):
     `tone_rmse_db` is the error of levels at single subcarriers and antennas.
     """
 
-    quantities: tuple[str, ...] = (*ChannelMetrics.quantities, "tone_db2")
-
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.abs().double().flatten(1).numpy() for x in (prediction, target))
         known = t > 0 if mask is None else (t > 0) & mask.flatten(1).numpy()
@@ -213,8 +198,6 @@ class PowerMetrics(SampleMetric):
     >>> round(metric.summary(metric.compute())["mae_db"], 3)  # 0 dB and 10 dB
     5.0
     """
-
-    quantities = ("prediction", "target")
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.double().flatten() * self.scale for x in (prediction, target))

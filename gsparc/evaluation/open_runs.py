@@ -358,8 +358,7 @@ def collect_evidence(
     parts, seen = [], np.zeros(0, np.int64)
     facts: dict[str, Any] = {}
     for path in paths:
-        run = _unseen(path, dataset, split)
-        own, fold = _learned_from(run)
+        run, own, fold = _unseen(path, dataset, split)
         # Folds and seeds share test rows: a row counts in the evidence once, by the first checkpoint.
         rows = np.setdiff1d(rows_to_score(run.split.folds[0], "test"), seen)
         if len(rows):
@@ -374,8 +373,7 @@ def calibrate_and_store(
     seed: int, apart_m: float = 0.0,
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
-    run = _unseen(path, dataset, split)
-    own, fold = _learned_from(run)
+    run, own, fold = _unseen(path, dataset, split)
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
@@ -413,16 +411,14 @@ def calibrate_and_store(
     )
 
 
-def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
-    """A checkpoint with test rows that it has not learned from: on others no promise would hold."""
+def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> tuple[Opened, Measurements, Fold]:
+    """A checkpoint with test rows that it has not learned from, and what it learned from.
+
+    On other test rows no promise would hold.
+    """
     run = open_files([path], dataset, split, others_whole=True)
     if run.learned != 0:
         advice = "calibrate with the data and split of its training"
         raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
-    return run
-
-
-def _learned_from(run: Opened) -> tuple[Measurements, Fold]:
-    """What the first method learned from, of other data than `run.data` where it was trained on others."""
-    own, split = run.trained or (run.data, run.split)
-    return own, split.folds[0]
+    own, before = run.trained or (run.data, run.split)
+    return run, own, before.folds[0]

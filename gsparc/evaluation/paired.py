@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.stats import t
 
 from gsparc.evaluation.metric_formats import WITH_SILENT
+from gsparc.evaluation.results import score_db
+from gsparc.evaluation.table import Row
 
 LEVEL = 0.95  # of the interval that must not hold 0
 SAME_DB = 0.005  # less is 0 in the two decimals of a table
@@ -64,9 +68,13 @@ class Lead:
 
     @property
     def sure(self) -> bool:
-        """Whether its 95 % interval (Student's t) leaves out 0: few draws tell their scatter badly."""
-        reach = t.ppf((1 + LEVEL) / 2, max(self.count - 1, 1)) * self.error_db
-        return not self.same and bool(abs(self.ahead_db) > reach)  # False where it is not known
+        """Whether its 95 % interval leaves out 0."""
+        return not self.same and bool(abs(self.ahead_db) > self.reach_db)  # False where it is not known
+
+    @property
+    def reach_db(self) -> float:
+        """Return half of its 95 % interval (Student's t): few draws tell their scatter badly [dB]."""
+        return float(t.ppf((1 + LEVEL) / 2, max(self.count - 1, 1)) * self.error_db)
 
     def __str__(self) -> str:
         error = "" if np.isnan(self.error_db) else f" ± {self.error_db:.2f}"
@@ -88,15 +96,12 @@ class Lead:
         return f"{one} and {other} are not told apart in {figure}: {better} is {lead}"
 
 
-def lead_over_rows(
-    one: Mapping[str, Any], other: Mapping[str, Any], figure: str, of: str = "test rows"
-) -> Lead | None:
-    """Return what the score of `one` has more than that of `other`.
+def gains_of_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str) -> np.ndarray | None:
+    """Return what each row adds to the score of `one` beyond that of `other` (n,) [dB], NaN where unknown.
 
     Args:
         one, other: columns of `per_sample.csv` (n,) of the same rows.
         figure: the deciding one.
-        of: what the pairs are called.
 
     Returns:
         None for figures that are no mean over rows, and of fewer than two rows.
@@ -107,17 +112,59 @@ def lead_over_rows(
     if figure == "nmse_scalar" or column not in one or column not in other:
         return None
     a, b = (np.asarray(own[column], float) for own in (one, other))
-    known = np.isfinite(a) & np.isfinite(b)
-    a, b = a[known], b[known]
-    if len(a) < 2:
+    a, b = a + 0 * b, b + 0 * a  # NaN in one is NaN in both: the means are of the same rows
+    if np.isfinite(a).sum() < 2:
         return None
     if column == "psnr_db":
-        gains = a - b
-    elif column == "error_power":
+        return a - b
+    if column == "error_power":
         # The difference of logarithms, and to first order what each row adds to it.
-        low, high = (max(float(x.mean()), np.finfo(float).tiny) for x in (a, b))
-        gains = 10 / np.log(10) * (np.log(high / low) + b / high - a / low)
-    else:  # a^2 - b^2 = (a - b) (a + b)
-        roots = sum(float(np.mean(x**2)) ** 0.5 for x in (a, b))
-        gains = (b**2 - a**2) / max(roots, np.finfo(float).tiny)
-    return Lead.from_gains(gains, of)
+        low, high = (max(float(np.nanmean(x)), np.finfo(float).tiny) for x in (a, b))
+        return 10 / np.log(10) * (np.log(high / low) + b / high - a / low)
+    # a^2 - b^2 = (a - b) (a + b)
+    roots = sum(float(np.nanmean(x**2)) ** 0.5 for x in (a, b))
+    return (b**2 - a**2) / max(roots, np.finfo(float).tiny)
+
+
+def lead_over_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str) -> Lead | None:
+    """Return what the score of `one` has more than that of `other`, over rows; see `gains_of_rows`."""
+    gains = gains_of_rows(one, other, figure)
+    return None if gains is None else Lead.from_gains(gains[np.isfinite(gains)], "test rows")
+
+
+def lead_over_runs(own: Sequence[Row], others: Sequence[Row]) -> Lead | None:
+    """Return what runs of a method or setting have more than those of another, pair by pair.
+
+    Pairs are draws of the split, seeds of each averaged. Of a single draw they are its test rows, or its
+    seeds where these tell less: a method without chance has no scatter over seeds.
+
+    Args:
+        own, others: rows of results with their `run`; one without a seed is paired with every seed.
+
+    Returns:
+        None without a common draw and seed, or where one draw has no common samples.
+    """
+    pairs = [
+        (a, b)
+        for a, b in product(own, others)
+        if a["draw"] == b["draw"] and (a["seed"] == b["seed"] or None in (a["seed"], b["seed"]))
+        if None not in (a["value"], b["value"])
+    ]
+    gains: dict[str, list[float]] = defaultdict(list)
+    for a, b in pairs:
+        gains[a["draw"]].append(score_db(a) - score_db(b))
+    if len(gains) > 1:
+        return Lead.from_gains(np.array([np.mean(seeds) for seeds in gains.values()]), "draws")
+    rows = [gains_of_rows(_samples(a), _samples(b), a["figure"]) for a, b in pairs]
+    known = [of_rows for of_rows in rows if of_rows is not None]
+    if not known or len(known) < len(rows):
+        return None
+    mean = np.mean(known, axis=0)
+    over_rows = Lead.from_gains(mean[np.isfinite(mean)], "test rows")
+    over_seeds = Lead.from_gains(np.array(next(iter(gains.values()))), "seeds")
+    return over_seeds if over_seeds.reach_db > over_rows.reach_db else over_rows
+
+
+def _samples(row: Row) -> Mapping[str, Any]:
+    """Columns of a run's `per_sample.csv`; a baseline beside it has others."""
+    return {} if row["baseline"] else row["run"].samples

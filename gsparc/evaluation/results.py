@@ -27,34 +27,36 @@ def facts_under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:
     return {name[len(stem) :]: value for name, value in facts.items() if name.startswith(stem)}
 
 
-def result_rows(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str, Any]]:
     """Return the row of a run's method and those of the baselines beside it, from the facts of its summary.
 
-    Columns are those of `OF_RUN`, `OF_MODEL` and `COSTS`; `fold` (None: all are pooled), `method`, `baseline`
-    (whether it is one), `measured` (rows that a model learned from), `effects`, `figure` (the deciding one),
-    its `value`, that of Gaussians `alone`, and every figure under its own name; None where a summary has no
-    such fact.
+    Figures are of rows `prefix`: `test`, `train` or `val`. Columns are those of `OF_RUN`, `OF_MODEL` and
+    `COSTS`; `draw` of the split, `fold` (None: all are pooled), `method`, `baseline` (whether it is one),
+    `measured` (rows that a model learned from), `effects`, `figure` (the deciding one), its `value`, that of
+    Gaussians `alone`, and every figure under its own name; None where a summary has no such fact.
     """
     # Counts of a summary are sums over folds; `measured` is per model.
     counts = [int(facts.get(f"split/{name}") or 0) for name in ("train", "val", "folds")]
     folds = max(counts[2], 1)
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
+    shared["draw"] = str(facts.get("split/sha256"))[:8]  # which rows learn and test
     shared["kind"] = shared["kind"] if shared["kind"] in DECIDING else "spectrum"
-    shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts), "alone": None}
+    shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts, prefix), "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}
     own = {name: facts.get(key) for name, key in OF_MODEL.items()}
     model = own | {"effects": facts.get("model/effects") or "none"}
     model["alone"] = facts.get(f"field/{shared['figure']}")
     name = str(facts.get("model/name", "?"))
-    rows = [shared | model | _of_method(name, facts_under(facts, "test"), facts_under(facts, "time"))]
+    rows = [shared | model | row_of_method(name, facts_under(facts, prefix), facts_under(facts, "time"))]
     # dict.fromkeys: a set of names would forget the order that the summary has them in.
     beside = dict.fromkeys(name.split("/")[1] for name in facts if name.startswith("baseline/"))
     every = ((name, facts_under(facts, f"baseline/{name}")) for name in beside)
-    rows += [dict.fromkeys(own) | shared | _of_method(name, its, its) for name, its in every]
+    rows += [dict.fromkeys(own) | shared | row_of_method(name, its, its) for name, its in every]
     return [{**row, "baseline": row is not rows[0], "value": row.get(row["figure"])} for row in rows]
 
 
-def _of_method(name: str, figures: Mapping[str, Any], times: Mapping[str, Any]) -> dict[str, Any]:
+def row_of_method(name: str, figures: Mapping[str, Any], times: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns of one method: its name, figures and `COSTS`."""
     costs = {column: times.get(key) for column, key in COSTS.items()}
     figures = {key: value for key, value in figures.items() if key not in COSTS.values()}
     return {**figures, **costs, "method": name}

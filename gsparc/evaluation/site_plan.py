@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.spatial import cKDTree
 
 from gsparc.data.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
@@ -80,12 +81,9 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
-    value = power[row, entry]
-    if data.site.kind == "rssi":
-        value = 10 * np.log10(value)
+    value = power[row, entry] if data.site.kind == "csi" else 10 * np.log10(power[row, entry])
     # Powers of channels are averaged linearly, levels of stations in decibels.
-    total, number = (np.bincount(which[row], w, minlength=count) for w in (value, None))
-    mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    mean = pd.Series(value).groupby(which[row]).mean().reindex(range(count)).to_numpy()
     if data.site.kind == "rssi":
         of = ", mean of the stations heard" if several else ""
         return mean, f"received power{of} [{data.site.level_unit}]"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import platform
@@ -16,9 +15,9 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import numpy as np
+import pandas as pd
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     TABLES,
@@ -28,6 +27,7 @@ from gsparc.evaluation.metric_formats import (
     score_of,
 )
 from gsparc.evaluation.paired import Lead
+from gsparc.evaluation.results import facts_under, result_rows, row_of_method
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
 from gsparc.training.cost import LINE
 
@@ -47,8 +47,7 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     """
     # Sorted keys: summaries of two runs are compared line by line.
     text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
-    with whole_file(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    write_whole(path, text + "\n")
 
 
 def read_summary(path: str | Path) -> dict[str, Any] | None:
@@ -65,15 +64,11 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
     """Write equally long columns as CSV, atomically; NaN becomes an empty cell.
 
     Raises:
-        ValueError: columns of different lengths.
+        ValueError: columns are not of the same length.
     """
-    lengths = {name: len(values) for name, values in columns.items()}
-    if len(set(lengths.values())) > 1:
-        raise ValueError(f"columns of different lengths: {lengths}")
-    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows([_cell(v) for v in row] for row in zip(*columns.values(), strict=True))
+    # object: pandas would write whole numbers beside empty cells as 3.0.
+    frame = pd.DataFrame(columns, dtype=object)
+    write_whole(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def new_run_id() -> str:
@@ -105,19 +100,17 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
     # Silent rows, and variances, are not of all data and methods.
     beside = [name for name in (WITH_SILENT, CALIBRATION) if f"{prefix}/{name}" in facts]
     wanted = [*TABLES[facts["dataset/kind"]], "skill", *beside]
-    names = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")})
-    names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
-    rows, own = [], [(method, prefix, "time")]
-    if f"field/{wanted[0]}" in facts:
-        own.insert(0, (f"{method}, Gaussians alone", "field", "field"))
-    for name, figures, times in [*((n, *[f"baseline/{n}"] * 2) for n in names), *own]:
-        values = [facts.get(f"{figures}/{figure}") for figure in wanted]
-        if name == method and times != "time" and values == [facts.get(f"{prefix}/{f}") for f in wanted]:
-            continue  # fitted once: its row is the method's own
-        costs = [facts.get(f"{times}/{key}") for key in ("train_s", "render_ms_p50")]
-        rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *values, *costs])
-    columns = [Column("method", ""), *(Column(name, number_format(name)) for name in wanted), TRAIN, P50]
-    return Table(title, columns, rows, bold=method)
+    own, *others = result_rows(facts, prefix)
+    figures = [own.get(name) for name in wanted]
+    # A baseline that the method is was fitted once: its row is the method's own.
+    kept = [o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures]
+    kept.sort(key=lambda row: ORDER.index(row["method"]) if row["method"] in ORDER else len(ORDER))
+    named = [row | {"method": f"{method} (baseline)"} if row["method"] == method else row for row in kept]
+    alone = facts_under(facts, "field")
+    fields = [row_of_method(f"{method}, Gaussians alone", alone, alone)] if alone else []
+    shown = (Column(name, number_format(name), of=name) for name in wanted)
+    columns = [Column("method", "", of="method"), *shown, TRAIN, P50]
+    return Table.from_rows(title, columns, [*named, *fields, own | {"method": method}], bold=method)
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -242,24 +235,12 @@ def judge_baseline(baseline: str, method: str, figure: str, lead: Lead) -> list[
 
 
 def _value(key: str, value: Any) -> int | float | str | None:
-    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:  # NumPy and torch scalars
-        value = value.item()
+    value = value.item() if getattr(value, "ndim", None) == 0 else value  # NumPy and torch scalars
     # JSON's true is no number to programs that read figures.
-    if isinstance(value, bool):
-        value = int(value)
-    if value is None or isinstance(value, (int, str)):
+    value = int(value) if isinstance(value, bool) else value
+    if value is None or isinstance(value, (int, str)) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    if not isinstance(value, float):
-        raise ValueError(
-            f"summary: {key} is a {type(value).__name__}; only numbers, strings and null are kept"
-        )
-    if not math.isfinite(value):
-        raise ValueError(f"summary: {key} is {value}; a summary holds finite numbers (null when undefined)")
-    return value
-
-
-def _cell(value: Any) -> Any:
-    return "" if isinstance(value, (float, np.floating)) and math.isnan(value) else value
+    raise ValueError(f"summary: {key} is {value!r}; finite numbers, strings and null (undefined) are kept")
 
 
 def run_git(folder: Path, *arguments: str) -> str | None:

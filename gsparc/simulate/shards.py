@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import whole_file, write_whole
 
 ROWS = "rows"  # of a shard: which rows of the dataset it holds
 NOTE = "choice.json"
@@ -44,11 +44,11 @@ class Shards:
                 f"{self.folder} holds parts of a different simulation; remove it, or choose another out="
             )
         if not stored.exists():
-            _write(stored, self.plan)
+            write_whole(stored, self.plan)
 
     def write_note(self, content: Mapping[str, Any]) -> None:
         """Store a decision, so that a resumed run does not decide again."""
-        _write(self.folder / NOTE, json.dumps(content, indent=1))
+        write_whole(self.folder / NOTE, json.dumps(content, indent=1))
 
     def read_note(self) -> dict[str, Any] | None:
         """Return the stored decision, or None."""
@@ -88,8 +88,3 @@ class Shards:
     def _sweep(self) -> None:
         if self._removed.exists():
             shutil.rmtree(self._removed)
-
-
-def _write(path: Path, content: str) -> None:
-    with whole_file(path) as partial:
-        partial.write_text(content, encoding="utf-8")

@@ -130,8 +130,8 @@ def test_where_the_search_begins_misleads_no_more_sets_than_promised() -> None:
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
-    run.stored, run.trained = [SimpleNamespace(extra={})], None
-    monkeypatch.setattr(command, "_unseen", lambda *_: run)
+    run.stored = [SimpleNamespace(extra={})]
+    monkeypatch.setattr(command, "_unseen", lambda *_: (run, 0, 0))
     monkeypatch.setattr(command, "rows_to_score", lambda *_: None)
     for name in ("known_positions", "position_kernel"):
         monkeypatch.setattr(command.confidence, name, lambda *_: evidence.position)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from campaigns import spectra
 from doors import knock
+from pages import compare_files
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared.run_lock import locked
@@ -29,6 +30,19 @@ def compare(tmp_path, *more: str) -> tuple[int, str]:
     """Exit status, and what is said."""
     answer = knock(COMMANDS["compare"].run, "compare", words(tmp_path, *more))
     return answer.status, "\n".join([*answer.out, *answer.err])
+
+
+def test_a_comparison_left_files_that_its_page_did_not_name(tmp_path):
+    """The page said compare.png where there is one picture a dataset, and not cells.csv."""
+    spectra(tmp_path / "own.npz")
+    drawn = ["splits.drawn.datasets=[own]", "splits.drawn.draws=2", "latency=false"]
+    for only, picture in (("random", "compare.png"), ("drawn", "own.png")):
+        run = tmp_path / only
+        status, said = compare(tmp_path, f"only=[own/{only}/mean/*]", *drawn, f"hydra.run.dir={run}")
+        assert status == 0 and (run / picture).exists(), said
+        assert compare_files("compare", run) == ([], [])
+    cell = tmp_path / "cells/own/random/mean/any/any"
+    assert compare_files("train", cell)[0] == []
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ def test_samples_become_rows(tmp_path):
     write_samples(tmp_path / "s.csv", {"row": np.arange(2), "name": ["a", "b,c"], "ssim": [0.5, np.nan]})
     rows = list(csv.reader((tmp_path / "s.csv").open(newline="")))
     assert rows == [["row", "name", "ssim"], ["0", "a", "0.5"], ["1", "b,c", ""]]
-    with pytest.raises(ValueError, match="different lengths"):
+    with pytest.raises(ValueError, match="same length"):
         write_samples(tmp_path / "s.csv", {"a": [1], "b": [1, 2]})
 
 

@@ -3,9 +3,12 @@
 import json
 import re
 import shlex
+from fnmatch import filter as filter_names
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from access_points import walks
 from campaigns import brief, channels, compose, powers, spectra
 from crashes import small_campaign
@@ -25,6 +28,22 @@ FOLDERS = ("docs", "docs/tutorials", "docs/reference")
 PAGES = [*TOP, *(page for folder in FOLDERS for page in sorted((ROOT / folder).glob("*.md")))]
 PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also speaks of names that are gone
 COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
+
+
+def compare_files(command: str, folder: Path) -> tuple[list[str], list[str]]:
+    """What a command left that docs/reference/files.csv does not name, and what it names and was not left."""
+    table = pd.read_csv(ROOT / "docs" / "reference" / "files.csv", keep_default_na=False)
+    rows = table[[bool({command, "all"} & set(by.split(", "))) for by in table["command"]]]
+    patterns = {
+        name.strip("`"): where
+        for names, where in zip(rows["file"], rows["where"], strict=True)
+        for name in names.split(", ")
+    }
+    left = [file.name + "/" * file.is_dir() for file in folder.iterdir()]
+    shown = [name for name in left if not name.startswith(".") or name == ".hydra/"]  # but locks
+    unnamed = [name for name in shown if not any(fnmatch(name, pattern) for pattern in patterns)]
+    absent = [pattern for pattern, where in patterns.items() if not where and not filter_names(left, pattern)]
+    return unnamed, absent
 
 
 def said(page: Path) -> list[str]:

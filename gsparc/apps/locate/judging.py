@@ -179,7 +179,7 @@ def _trust(
     except DataError as error:
         raise DataError(f"{error}; calibrate=0 goes without calibration") from None
     result = locating.learn_trust(learned, locator, int(config.calibrate), cells)
-    log.info("calibrated on %d snapshots that were left out: %s", result[1], result[0])
+    log.info("calibrated on %d snapshots left out: areas of %.1f %%", result[1], 100 * result[0].level)
     return result
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError, explain_error
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.data.links.georeference import Georeference
 
 if TYPE_CHECKING:
@@ -92,5 +92,4 @@ def write_line(path: Path, corners: np.ndarray, origin: Georeference | None) -> 
     """Write a line of corners (n, 2) [m], in degrees where their place on Earth is known."""
     if origin is not None:
         corners = np.column_stack(origin.to_degrees(corners)[::-1])
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps({"type": "LineString", "coordinates": corners.tolist()}))
+    write_whole(path, json.dumps({"type": "LineString", "coordinates": corners.tolist()}))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.errors import DataError
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.data.site_objects import GaussianCloud
 
 FIELDS = (
@@ -42,5 +42,4 @@ def write_ply(path: str | Path, cloud: GaussianCloud, colours: np.ndarray) -> No
         raise DataError("there are no Gaussians to write, or one is not finite")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]
     header += [*(f"property float {name}" for name in FIELDS), "end_header", ""]
-    with whole_file(Path(path)) as partial:
-        partial.write_bytes("\n".join(header).encode() + columns.tobytes())
+    write_whole(path, "\n".join(header).encode() + columns.tobytes())

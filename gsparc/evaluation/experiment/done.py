@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from hashlib import file_digest, sha256
-from importlib.metadata import distribution, packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.assemble import content_hash, identity_hash
 from gsparc.data.errors import DataError, list_first
-from gsparc.data.files import SUMMARY, set_aside, whole_file
+from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.summary import read_summary, run_git
@@ -38,6 +37,7 @@ OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
+INSTALLED = (".py", ".so")  # of a package, kernels among it
 NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
 OURS = ("gsparc/", "ops/", "callbacks/", "conf/", "hydra_plugins/")  # of gsparc's; the rest is somebody's
 STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
@@ -175,12 +175,12 @@ def recorded(folder: Path, state: State, unread: State | None = None) -> Iterato
             log.info("%s: begun anew: %s", folder, state.changes(record))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "unread": unread and asdict(unread), "began": time.time(), "ended": False}
-        _write(folder / RECORD, record)
+        write_whole(folder / RECORD, json.dumps(record, indent=1))
     else:
         left = _last_state(folder, record["began"])
     (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
     yield left
-    _write(folder / RECORD, {**record, "ended": True})
+    write_whole(folder / RECORD, json.dumps({**record, "ended": True}, indent=1))
 
 
 def program_hash(settings: Any) -> str:
@@ -202,7 +202,7 @@ def package_hash(package: str) -> str:
 
     In a checkout it is of what git tracks and of new files, as they are, of gsparc's in its own folders:
     commits that change pages, tests, comments or docstrings alone change nothing. Of an installed
-    distribution it is of its record, else of all modules in its folder.
+    package it is of all modules in its folder.
     """
     spec = find_spec(package)
     if spec is None:
@@ -214,11 +214,8 @@ def package_hash(package: str) -> str:
     checkout = _checkout(folder)
     if checkout is not None:
         return _of_files(*checkout)
-    for name in packages_distributions().get(package, ()):
-        one = distribution(name)  # the record of an editable one names no module
-        if any(file.parts[0] == package for file in one.files or ()):
-            return sha256(str(one.read_text("RECORD")).encode()).hexdigest()
-    return _of_files(folder, [str(file.relative_to(folder)) for file in folder.rglob("*.py")])
+    files = (file for file in folder.rglob("*") if file.suffix in INSTALLED)
+    return _of_files(folder, [str(file.relative_to(folder)) for file in files])
 
 
 def strip_comments(text: str) -> str:
@@ -282,8 +279,3 @@ def _last_state(folder: Path, began: float) -> str | None:
         if own(folder / name):
             return str(folder / name)
     return str(folder) if any(own(path) for pattern in PARTS for path in folder.glob(pattern)) else None
-
-
-def _write(path: Path, record: Mapping[str, Any]) -> None:
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(record, indent=1), encoding="utf-8")

@@ -7,10 +7,11 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.data.executor import run_each
@@ -20,6 +21,7 @@ from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.done import State, read_finished, run_once
 from gsparc.evaluation.experiment.problem import Problem, compose
 from gsparc.evaluation.metric_formats import number_format
+from gsparc.evaluation.report.runs import read_columns
 from gsparc.evaluation.results import result_rows
 from gsparc.models.checkpoint import MODEL
 
@@ -48,8 +50,13 @@ class CellResult:
 
     @property
     def row(self) -> dict[str, Any]:
-        """Return the row of the table of results."""
-        return result_rows(self.facts)[0]
+        """Return the row of the table of results, its seed None where the method has none."""
+        return {**result_rows(self.facts)[0], "seed": self.cell.seed, "run": self}
+
+    @cached_property
+    def samples(self) -> dict[str, np.ndarray]:
+        """Return `per_sample.csv` by column."""
+        return read_columns(self.folder / "per_sample.csv")
 
     @property
     def checkpoint(self) -> Path:

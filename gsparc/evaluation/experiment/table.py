@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from gsparc.evaluation.metric_formats import (
     number_format,
     score_heading,
 )
-from gsparc.evaluation.paired import Lead, lead_over_rows
+from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Table, value_with_error
@@ -64,7 +63,7 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         second = DECIDING[own["kind"]] if own["figure"] == WITH_SILENT else SECOND[own["kind"]]
         label = str(own["label"] or "")
         rows.append({
-            **own, **asdict(one.cell), "folder": one.folder, "draws": one.drawn, "score_db": score_db(own),
+            **own, **asdict(one.cell), "result": own, "draws": one.drawn, "score_db": score_db(own),
             "second_figure": second, "second_value": own.get(second),
             **{name: own.get(key) for name, key in BESIDE.items()},
             "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
@@ -86,13 +85,13 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
             of fewer measurements answer faster.
 
     Returns:
-        Columns `ROW` (see `columns_of_csv`), `folder`, of the first seed's run, and `by_draw`, scores by
-        seed; NaN where something is not known.
+        Columns `ROW` (see `columns_of_csv`), and `results`, a row of each seed or draw; NaN where something
+        is not known.
         `budget_s` [s]: NaN for a method without one, which stands in the tables of all budgets.
         `score_db`: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE; `spread_db`: its standard
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
         `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
-        `behind_db`: how much the problem's best has more, mean of the same draws, and its standard error.
+        `behind_db`: how much the best over draws has more, and its standard error, see `lead_over_runs`.
         `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier score of
         predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB]; `chi2`: of
         `reduced_chi_squared`.
@@ -105,22 +104,19 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     cells = table_of_cells(filled)
     if cells.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
-    cells["behind_db"] = _behind(cells)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
-    means = ["score_db", "value", "behind_db", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
+    means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
-    rows[["figure", "second_figure", "folder"]] = groups[["figure", "second_figure", "folder"]].first()
+    rows[["figure", "second_figure"]] = groups[["figure", "second_figure"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
-    rows["by_draw"] = groups[["seed", "score_db"]].apply(lambda own: dict(own.itertuples(index=False)))
+    rows["results"] = groups["result"].agg(list)
     rows["draws"] = several
     # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
     rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
     rows["value_error"] = groups["value"].sem().where(several)
-    # Of differences on the same draw: draws differ more than methods do.
-    rows["behind_error_db"] = groups["behind_db"].sem()
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
-    rows = rows.reset_index()
+    rows = _with_behind(rows.reset_index())
     problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
     # Reversed, so that of a dataset's splits the first remains.
     first = dict(reversed(problems))  # split of each dataset
@@ -132,20 +128,19 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
         rows[name] = [getattr(one, field, np.nan) for one in times]
     order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
     rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
-    return rows[[*ROW, "folder", "by_draw"]].reset_index(drop=True)
+    return rows[[*ROW, "results"]].reset_index(drop=True)
 
 
-def _behind(cells: pd.DataFrame) -> pd.Series:
-    """How much the problem's best of the methods with most draws has more on the same draw [dB]."""
-    behind = pd.Series(np.nan, cells.index)
-    for _, here in cells[cells.draws].groupby(PROBLEM):
-        groups = here.groupby(["budget_s", "method"], dropna=False, sort=False).score_db
-        count = groups.transform("count")
+def _with_behind(rows: pd.DataFrame) -> pd.DataFrame:
+    """Add how much the problem's best of the methods with most draws has more [dB], and its error."""
+    rows = rows.assign(behind_db=np.nan, behind_error_db=np.nan)
+    for _, here in rows[rows.draws].groupby(PROBLEM):
         # A method that failed on hard draws has an easier mean: it is no best.
-        best = groups.transform("mean")[count == count.max()].idxmax()
-        same = here[groups.ngroup() == groups.ngroup()[best]].set_index("seed").score_db
-        behind[here.index] = here.seed.map(same) - here.score_db
-    return behind
+        best = here[here.seeds == here.seeds.max()].score_db.idxmax()
+        for row, own in here.results.items():
+            if lead := lead_over_runs(here.results[best], own):
+                rows.loc[row, ["behind_db", "behind_error_db"]] = lead.ahead_db, lead.error_db
+    return rows
 
 
 def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
@@ -185,7 +180,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     first = rows[0]
     level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
     lines = [f"first: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
-    leads = {row.method: _lead(first, row) for row in rows[1:]}
+    leads = {row.method: lead_over_runs(first.results, row.results) for row in rows[1:]}
     if len(rows) > 1 and (lead := leads[rows[1].method]):
         before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
@@ -195,12 +190,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     figure = heading_of(first.figure)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
-        # Independent errors add in squares.
-        spread = float(np.hypot(*np.nan_to_num([own.spread_db, first.spread_db])))  # of both over seeds
-        within = own.score_db >= first.score_db - spread and own.seeds > 1 and not own.draws
-        gap += ", within the seeds' spread" if within else ""
-        unsure = lead is not None and not lead.sure
-        lines.append(lead.no_difference(first.method, ours, figure) if lead and unsure else gap)
+        lines.append(gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure))
     if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
         if own is None or lead is None or lead.sure:
@@ -212,7 +202,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     for row in rows[1:]:
         if own is None or row.method not in SIMPLE or row.score_db <= own.score_db:
             continue
-        ahead = _lead(row, own)
+        ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
     spent = [
@@ -233,20 +223,6 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if old:
         lines.append(f"measured with another program (at commit): {old}")
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
-
-
-def _lead(first: Any, other: Any) -> Lead | None:
-    """What the first has more than another one: on the same draws, or the same rows; None: not known."""
-    if min(first.seeds, other.seeds) > 1 and first.draws:
-        both = first.by_draw.keys() & other.by_draw.keys()
-        gains = np.array([first.by_draw[draw] - other.by_draw[draw] for draw in sorted(both)])
-        return Lead.from_gains(gains, "draws") if len(gains) > 1 else None
-    files = [Path(str(row.folder)) / "per_sample.csv" for row in (first, other)]
-    if not all(file.exists() for file in files):
-        return None
-    one, two = (pd.read_csv(file) for file in files)
-    of = "test rows" + " of the first seeds" * (max(first.seeds, other.seeds) > 1)
-    return lead_over_rows(one, two, first.figure, of) if list(one.row) == list(two.row) else None
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:

@@ -9,17 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
 
+from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
-from gsparc.evaluation.summary import better_baseline, busy_machine, judge_baseline, run_conditions
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -64,10 +65,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     # With one run a setting, spreads over seeds would be empty brackets.
     if len(tables.group_by_setting(runs)) < len(runs):
         study.tables.append(tables.table_of_seeds(runs))
-    if tables.has_draws(runs):
-        study.tables.append(tables.table_of_leads(runs))
-    last = tables.table_of_results(runs), tables.table_of_worst(runs)
-    study.tables += [table for table in last if table.rows]
+    kinds = tables.table_of_leads, tables.table_of_results, tables.table_of_worst
+    study.tables += [table for table in (kind(runs) for kind in kinds) if table.rows]
     study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
     study.plots = [
         (str(figure.get_label()), _unique_ids(plots.to_svg(figure), number))
@@ -86,18 +85,21 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 def warnings(runs: Sequence[Run]) -> list[str]:
     """Return what a reader must know first, each once: the loads of a busy machine are one range."""
     # Loads differ from run to run: as remarks of their own there would be one a run.
-    remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
+    remarks = [
+        remark for run in runs for remark in summary.run_conditions({**run.facts, "machine/load": None})
+    ]
     scored = [run for run in runs if run.row["value"] is not None]
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         groups = tables.group_by_setting(scored).values()
         group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
-        if leads := tables.lead_over_draws(group):
+        leads = {name: lead for name, lead in tables.leads_of_baselines(group).items() if lead}
+        if leads:
             name = max(leads, key=lambda one: leads[one].ahead_db)
-            remarks += judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
+            remarks += summary.judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
     elif scored:  # a baseline must beat the best run of the page
-        remarks += better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
+        remarks += summary.better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
-    return list(dict.fromkeys(remarks + busy_machine(loads)))
+    return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
 
 
 def _unique_ids(svg: str, number: int) -> str:
@@ -121,10 +123,15 @@ def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
 
 
 def write_report(
-    folder: Path, title: str, note: str, sections: Sequence[Section], figures: Sequence[str] = ()
-) -> None:
-    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    folder: Path, title: str, runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
+    figures: Sequence[str] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`.
+
+    Returns where the program comes from, see `provenance`.
+    """
+    sections, origin = make_sections(runs, fronts), summary.provenance()
+    note = f"{len(runs)} run{'s' * (len(runs) > 1)}; made by {summary.program_version(origin)}"
     (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:
@@ -138,6 +145,7 @@ def write_report(
             name = f"{_slug(study.title)}-{_slug(str(figure.get_label()))}.png"
             save(figure, folder / name, also=figures)
     (folder / "report.md").write_text("\n".join(parts), encoding="utf-8")
+    return origin
 
 
 def _slug(text: str) -> str:

@@ -52,7 +52,7 @@ class Run:
     @cached_property
     def row(self) -> dict[str, Any]:
         """Its own row of the results, with `setting`, and times measured alone, where they were."""
-        own = {**self.rows[0], "setting": self.setting, "draw": self.draw, "run": self}
+        own = {**self.rows[0], "setting": self.setting, "run": self}
         if len(self.render_ms):
             own["query_ms"], own["query_p95_ms"] = p50_p95(self.render_ms)
         return own
@@ -64,14 +64,8 @@ class Run:
         beside = {row["method"]: row for row in self.rows[1:] if row["value"] is not None}
         # A sweep may thin what they learn from.
         of = [o for o in self._named if o.lstrip("+~").startswith(("split.", "dataset."))]
-        own = {"draw": self.draw, "run": self}
         settings = {n: " ".join([f"{n} (baseline)", *of]) for n in BASELINES if n in beside}
-        return [{**beside[name], "setting": setting, **own} for name, setting in settings.items()]
-
-    @property
-    def draw(self) -> str:
-        """Which rows learn and test, by the hash of the split."""
-        return str(self.facts.get("split/sha256"))[:8]
+        return [{**beside[name], "setting": setting, "run": self} for name, setting in settings.items()]
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:

@@ -74,27 +74,21 @@ class SweepReport(Callback):
 def report_sweep(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
-    from gsparc.evaluation.report.page import make_sections, write_report
+    from gsparc.evaluation.report.page import write_report
     from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again
-    from gsparc.evaluation.report.tables import group_by_setting, has_draws, table_of_leads, table_of_seeds
+    from gsparc.evaluation.report.tables import group_by_setting, table_of_leads, table_of_seeds
 
     runs = find_runs([folder])
     if settings.retime:
         runs = time_again(runs, rounds=settings.rounds, budget_s=settings.budget_s)
-    origin = summary.provenance()
-    write_report(
-        folder, title, f"{len(runs)} runs; made by {summary.program_version(origin)}", make_sections(runs)
-    )
+    origin = write_report(folder, title, runs)
     for number, (study, together) in enumerate(group_by_study(runs).items()):
         group = drop_shared_overrides(together)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
-        (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
         plots.draw_distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
-        console.print(table.without(*WIDE))
-        if has_draws(group):
-            console.print(table_of_leads(group))
+        console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
         for same in equal_settings(group_by_setting(group)):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
     summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
+import pandas as pd
 
 from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
-from gsparc.evaluation.paired import Lead
+from gsparc.evaluation.paired import Lead, lead_over_runs
 from gsparc.evaluation.report.runs import Run, distinct_baselines
-from gsparc.evaluation.results import score_db
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
@@ -67,41 +67,31 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
     return (values, None) if len(values) > 1 else None
 
 
-def interval_over_seeds(values: Sequence[float | None]) -> Interval | None:
-    """Mean, least and largest over those seeds that have a value; None where none has."""
-    known = [value for value in values if value is not None]
+def pooled_interval(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
+    """Return the mean over draws of the split and its standard error, seeds of each averaged.
+
+    Of one draw with the least and largest over seeds; None where none has a value.
+    """
+    known = pd.DataFrame({"value": values, "draw": draws}).dropna()
+    means = known.groupby("draw").value.mean()
+    if len(means) > 1:
+        return Interval(means.mean(), error=means.sem())
     # A single seed has no spread: no brackets.
-    if len(known) < 2:
-        return Interval(known[0]) if known else None
-    return Interval(float(np.mean(known)), min(known), max(known))
-
-
-def interval_over_draws(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
-    """Mean over draws of the split and its standard error, seeds of each averaged; of one draw over seeds."""
-    known: dict[str, list[float]] = {}
-    for value, draw in zip(values, draws, strict=True):
-        if value is not None:
-            known.setdefault(draw, []).append(value)
-    if len(known) < 2:
-        return interval_over_seeds(values)
-    means = np.array([np.mean(own) for own in known.values()])
-    return Interval(float(means.mean()), error=float(means.std(ddof=1) / len(means) ** 0.5))
+    ends = (known.value.min(), known.value.max()) if len(known) > 1 else ()
+    return Interval(known.value.mean(), *ends) if len(known) else None
 
 
 def has_draws(runs: Sequence[Run]) -> bool:
     """Return whether a setting was run on several draws of the split."""
-    return any(len({run.draw for run in group}) > 1 for group in group_by_setting(runs).values())
+    return any(len({run.row["draw"] for run in group}) > 1 for group in group_by_setting(runs).values())
 
 
-def lead_over_draws(group: Sequence[Run]) -> dict[str, Lead]:
-    """Return what each baseline has more than a setting on the same draws, seeds of a draw averaged."""
-    gains: dict[str, dict[str, list[float]]] = {}
-    for run in (run for run in group if run.row["value"] is not None):
-        for base in run.baselines:
-            gain = score_db(base) - score_db(run.row)
-            gains.setdefault(base["method"], {}).setdefault(run.draw, []).append(gain)
-    means = {name: np.array([np.mean(own) for own in draws.values()]) for name, draws in gains.items()}
-    return {name: Lead.from_gains(own, "draws") for name, own in means.items()}
+def leads_of_baselines(group: Sequence[Run]) -> dict[str, Lead | None]:
+    """Return what each baseline has more than a setting, see `lead_over_runs`."""
+    rows: dict[str, list[Row]] = {}
+    for base in (base for run in group for base in run.baselines):
+        rows.setdefault(base["method"], []).append(base)
+    return {name: lead_over_runs(own, [run.row for run in group]) for name, own in rows.items()}
 
 
 def accuracy_column(figure: str, note: str = "") -> Column:
@@ -156,7 +146,7 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
     for setting, group in groups.items():
         draws = [row["draw"] for row in group]
         counts = [len(set(draws)), len({row["seed"] for row in group})] if several else [len(group)]
-        values = [interval_over_draws([column.value(row) for row in group], draws) for column in spread]
+        values = [pooled_interval([column.value(row) for row in group], draws) for column in spread]
         rows.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
     counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
     note = "Brackets: least and largest over seeds, on the same split: split.seed draws others. "
@@ -167,15 +157,22 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
 
 
 def table_of_leads(runs: Sequence[Run]) -> Table:
-    """Return what each setting has more than each baseline, draw by draw."""
-    rows = [
-        [setting, name, Interval(-lead.ahead_db, error=lead.error_db), lead.pairs]
-        for setting, group in group_by_setting(runs).items()
-        for name, lead in lead_over_draws(group).items()
-    ]
-    heads = [SETTING, Column("baseline", ""), Column("ahead of it, dB", ".2f"), Column("pairs", "")]
-    note = f"Of {heading_of(runs[0].row['figure'])}, on the same draws; ± standard error of the mean."
-    return Table("Settings against baselines", heads, rows, note)
+    """Return what each setting has more than the first one and than each baseline, pair by pair."""
+    groups, rows = group_by_setting(runs), []
+    first, *others = groups
+    leads = {setting: leads_of_baselines(group) for setting, group in groups.items()}
+    for setting in others:
+        one, other = ([run.row for run in groups[name]] for name in (first, setting))
+        leads[setting] = {first: lead_over_runs(one, other), **leads[setting]}
+    for setting, against, lead in ((s, *pair) for s, own in leads.items() for pair in own.items()):
+        if lead is not None:
+            told = "same" if lead.same else "yes" if lead.sure else "no"
+            rows.append([setting, against, Interval(-lead.ahead_db, error=lead.error_db), lead.pairs, told])
+    ahead = Column("ahead of it, dB", ".2f")
+    columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("told apart", "")]
+    figure = heading_of(runs[0].row["figure"])
+    note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; told apart: 95 % (Student's t)."
+    return Table("Paired differences", columns, rows, note)
 
 
 def _spread_columns(runs: Sequence[Run]) -> list[Column]:

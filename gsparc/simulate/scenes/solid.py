@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 
 MILLIMETRES = 3  # digits of a corner in a file
 
@@ -66,5 +66,5 @@ def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: floa
 def write_walls(triangles: np.ndarray, path: Path) -> None:
     """Write triangles (n, 3, 3) [m], world, for `init=scene`, whole or not at all; none without area."""
     lines = [f"- {corners}" for corners in np.round(triangles, MILLIMETRES).tolist()]
-    with whole_file(path) as partial:
-        partial.write_text("\n".join(["walls:", *lines, ""]), encoding="utf-8")
+    write_whole(path, "
+".join(["walls:", *lines, ""]))

@@ -146,7 +146,7 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
     assert "PSNR dB error" in pooled.csv() and "least" not in pooled.csv()
     ahead = cells(tables.table_of_leads(runs), 1)
     gains = np.array([0.1, -0.2, 0.6])
-    assert (ahead["baseline"], ahead["pairs"]) == ("gp", "3 draws")
+    assert (ahead["against"], ahead["pairs"], ahead["told apart"]) == ("gp", "3 draws", "no")
     assert ahead["ahead of it, dB"].value == pytest.approx(gains.mean())
     assert ahead["ahead of it, dB"].error == pytest.approx(gains.std(ddof=1) / 3**0.5)
     results = tables.table_of_results(runs)
@@ -165,3 +165,33 @@ def test_one_model_had_two_latencies_and_a_note_in_the_report_alone(three):
     runs = find_runs(three)
     notes = [tables.table_of_seeds(runs).note, tables.table_of_results(runs).note]
     assert all("a run's own table has other milliseconds" in note for note in notes)
+
+
+def sweep_of(run_dir, folder, levels):
+    """Runs of two settings, on and off, with a seed for each pair of levels [dB]."""
+    for seed, pair in enumerate(levels):
+        for word, level in zip(("on", "off"), pair, strict=True):
+            run_dir(folder / f"{word}{seed}", seed=seed, psnr=level, overrides=(f"x={word}", f"seed={seed}"))
+    return drop_shared_overrides(find_runs([folder]))
+
+
+def test_an_ablation_by_multirun_had_no_paired_difference(run_dir, tmp_path):
+    """Two means with their least and largest stood side by side; the rows and seeds of both are the same."""
+    (lead,) = tables.table_of_leads(sweep_of(run_dir, tmp_path / "a", [(29.0, 28.7), (30.0, 29.9)])).rows
+    first, other = lead[1], lead[0]
+    assert (other, first) == ("gsparc x=on", "gsparc x=off") and lead[3:] == ["2 seeds", "no"]
+    assert lead[2].value == pytest.approx(0.2) and lead[2].error == pytest.approx(0.1)
+    assert (
+        "| gsparc x=on | gsparc x=off | 0.20 ± 0.10 | 2 seeds | no |"
+        in tables.table_of_leads(find_runs([tmp_path / "a"])).markdown()
+    )
+
+
+def test_a_method_without_chance_had_differences_without_error(run_dir, tmp_path):
+    """Three seeds of a closed form are one fit: its difference is known as well as its test rows tell it."""
+    runs = sweep_of(run_dir, tmp_path, [(29.0, 28.7)] * 3)
+    for run in runs:
+        change = np.repeat([0.1, 0.0], 12)  # on half of the rows
+        run.samples["psnr_db"] = run.samples["psnr_db"] + (change if "on" in run.setting else -change)
+    (lead,) = tables.table_of_leads(runs).rows
+    assert lead[3] == "24 test rows" and lead[2].error == pytest.approx(0.1 / 23**0.5)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 from gsparc.prediction.predictor import Predictor
 
 # \r\n as in PNG: a transfer as text would change it, which is then found out. 64: a cache line.
@@ -56,6 +56,5 @@ def pack_form(form: Form, origin: np.ndarray, error: float = 0.0, worst: float =
 def write_form(path: Path, form: Form, origin: np.ndarray, error: float, worst: float) -> int:
     """Write `pack_form` whole or not at all; returns its bytes."""
     blob = pack_form(form, origin, error, worst)
-    with whole_file(path) as partial:
-        partial.write_bytes(blob)
+    write_whole(path, blob)
     return len(blob)
