@@ -49,10 +49,26 @@ class Cells:
         """Return these cells and others."""
         return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
 
+    def box(self) -> np.ndarray:
+        """Return the corners (2, 3) [m] of all cells."""
+        return np.stack([(self.centre - self.edge / 2).min(0), (self.centre + self.edge / 2).max(0)])
+
     def index_of(self, place: np.ndarray) -> int:
         """Return the cell that a place (3,) is in, or that is nearest to it."""
         outside = (np.abs(self.centre - place) - self.edge / 2).clip(0) * (self.edge > 0)
         return int((outside.sum(1) + 1e-6 * np.linalg.norm(self.centre - place, axis=1)).argmin())
+
+
+def beyond_box(place: np.ndarray, box: np.ndarray, margin: np.ndarray | float = 0.0) -> bool:
+    """Tell whether a place (3,) is beyond corners (2, 3), or within a margin [m], seen from above."""
+    within = (place - margin > box[0]) & (place + margin < box[1])
+    return not within[:2][np.ptp(box, axis=0)[:2] > 0].all()
+
+
+def widen_box(trained: np.ndarray) -> np.ndarray:
+    """Return corners (2, 3) [m] around places (n, 3), half of their extent away along east and north."""
+    grown = np.ptp(trained, axis=0) * [0.5, 0.5, 0]
+    return np.stack([trained.min(0) - grown, trained.max(0) + grown])
 
 
 def cover_box(

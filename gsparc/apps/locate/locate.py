@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.apps.locate.cells import cover_box
+from gsparc.apps.locate.cells import cover_box, widen_box
 from gsparc.apps.locate.locator import MOST, Located, Locator, restore_trust, to_world
 from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
@@ -61,4 +61,5 @@ def _locator(
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
     trust = restore_trust(predictor.extra, unknown, share)
     cells = cover_box(local, MOST, places is not None)
-    return Locator(SiteField(predictor), cells, unknown, trust, share)
+    wider = cover_box(widen_box(local), MOST, False) if places is None else None
+    return Locator(SiteField(predictor), cells, unknown, trust, share, wider)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
-from gsparc.apps.locate.cells import Cells
+from gsparc.apps.locate.cells import Cells, beyond_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.posterior import Posterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
@@ -31,6 +31,7 @@ HALVED = 16  # cells that are halved at a time
 KEPT = 0.9  # of the mass: cells beyond it stay as they are
 LEVELS = 8  # halvings of a cell
 ENOUGH = 32  # cells of one size that hold this mass need not be halved
+BEYOND, UNLIKE = "beyond the trained places", "unlike all rows that were left out"
 KEY = "locate"  # in a checkpoint's `extra`
 
 
@@ -44,6 +45,8 @@ class Located:
         modes: parts of that area that are apart, each of some mass.
         posterior: masses of cells.
         seconds: that it took.
+        doubt: why its area promises nothing: it lies beyond the places that were learned from, or the
+            snapshot fits no place; empty: neither.
     """
 
     place: np.ndarray
@@ -51,6 +54,7 @@ class Located:
     modes: int
     posterior: Posterior
     seconds: float
+    doubt: str = ""
 
     @classmethod
     def from_posterior(cls, posterior: Posterior, mass: float, place: np.ndarray, seconds: float = 0) -> Self:
@@ -70,6 +74,7 @@ class Locator:
         unknown: what differs by chance between snapshots.
         trust: see there.
         share: of places that an area holds.
+        wider: cells of a larger box, for what is likeliest at the edge of `cells`; None: not looked at.
     """
 
     field: SiteField
@@ -77,11 +82,23 @@ class Locator:
     unknown: Nuisances
     trust: Trust
     share: float = 0.9
+    wider: Cells | None = None
 
     @cached_property
     def _coarse(self) -> Moments:
         """Computed once: most of the time of the first snapshot."""
         return self.field.moments_at(torch.from_numpy(self.cells.centre))
+
+    @cached_property
+    def _further(self) -> Locator | None:
+        """Of the larger box; made once, as the moments of its coarse cells are."""
+        return None if self.wider is None else replace(self, cells=self.wider, wider=None)
+
+    def _at_edge(self, search: Search) -> bool:
+        """Whether the likelihood still rises at the edge of the box: its likeliest cell touches it."""
+        likeliest = int(search.log_density(self.trust).argmax())
+        centre, edge = search.cells.centre[likeliest], search.cells.edge[likeliest]
+        return beyond_box(centre, self.cells.box(), 0.51 * edge)  # 1 % of a cell for rounding
 
     def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
         """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
@@ -106,10 +123,17 @@ class Locator:
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
 
         def one(number: int) -> Located:
-            started = time.perf_counter()
-            posterior = self.search_cells(heard.subset(np.array([number])), self.trust).posterior(self.trust)
+            started, one, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
+            search = self.search_cells(one, self.trust)
+            unlike = search.least_misfit(self.trust) > self.trust.worst
+            if self._further is not None and (unlike or self._at_edge(search)):
+                beyond = self._further.search_cells(one, self.trust)
+                if beyond_box(beyond.posterior(self.trust).peak(), self.cells.box()):
+                    search, doubt = beyond, BEYOND
+            doubt = doubt or UNLIKE * unlike
+            posterior = search.posterior(self.trust)
             located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
-            return replace(located, seconds=time.perf_counter() - started)
+            return replace(located, seconds=time.perf_counter() - started, doubt=doubt)
 
         return run_all(one, range(len(heard)), "snapshots")
 
