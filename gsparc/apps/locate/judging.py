@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from omegaconf import DictConfig
 
 from gsparc.apps.locate import locator as locating
-from gsparc.apps.locate.cells import Cells, beyond_box, cover_box, widen_box
+from gsparc.apps.locate.cells import Cells, beyond_box, cover_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
 from gsparc.apps.locate.neighbours import locate_by_neighbours
@@ -36,7 +36,6 @@ from gsparc.prediction.predictor import update_extra
 
 log = logging.getLogger(__name__)
 
-DOUBTS = {"beyond": locating.BEYOND, "unlike": locating.UNLIKE}
 SHOWN = 6  # snapshots, evenly over all
 
 
@@ -125,7 +124,7 @@ def report(
 def _doubts(result: Localisation, facts: dict[str, Any]) -> list[str]:
     """A sentence on each doubt about areas; their counts go to `facts`."""
     doubt, lines = np.array(result.about.get("doubt", []), str), []
-    for key, why in DOUBTS.items():
+    for key, why in locating.DOUBTS.items():
         facts[f"locate/{key}"] = count = int((doubt == why).sum())
         if count:
             of = f"{count} of {len(doubt)} snapshots"
@@ -160,9 +159,8 @@ def locate_by_model(
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     field, count = SiteField(run.predictor), 0
-    trained_places = data.moving[learned][:, :3]
-    wider = None if config.prior == "trained" else cells(widen_box(trained_places))
-    locator = Locator(field, cells(trained_places), unknown, start, share, wider)
+    boxes = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
+    locator = Locator(field, *boxes, unknown, start, share)
     if config.calibrate:
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
@@ -173,7 +171,7 @@ def locate_by_model(
     if not config.calibrate and locating.KEY not in run.stored[0].extra:
         promise += " by the model's own variances, which nothing tested (calibrate=0)"
     promise += f"; {float(locator.cells.volume.sum()):.3g} m2 were searched"
-    beyond = sum(beyond_box(at, locator.cells.box()) for at in heard.place) if placed else 0
+    beyond = int(beyond_box(heard.place, locator.cells.box()).sum()) if placed else 0
     promise += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]

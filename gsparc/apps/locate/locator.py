@@ -31,7 +31,8 @@ HALVED = 16  # cells that are halved at a time
 KEPT = 0.9  # of the mass: cells beyond it stay as they are
 LEVELS = 8  # halvings of a cell
 ENOUGH = 32  # cells of one size that hold this mass need not be halved
-BEYOND, UNLIKE = "beyond the trained places", "unlike all rows that were left out"
+FURTHER = 0.5  # of its sides, that a larger box reaches beyond the trained places
+DOUBTS = {"beyond": "beyond the trained places", "unlike": "unlike all rows that were left out"}
 KEY = "locate"  # in a checkpoint's `extra`
 
 
@@ -71,34 +72,23 @@ class Locator:
     Attributes:
         field: what would be heard.
         cells: of a coarse grid.
+        wider: of a larger box, for what is likeliest at the edge of `cells`.
         unknown: what differs by chance between snapshots.
         trust: see there.
         share: of places that an area holds.
-        wider: cells of a larger box, for what is likeliest at the edge of `cells`; None: not looked at.
     """
 
     field: SiteField
     cells: Cells
+    wider: Cells
     unknown: Nuisances
     trust: Trust
     share: float = 0.9
-    wider: Cells | None = None
 
     @cached_property
     def _coarse(self) -> Moments:
         """Computed once: most of the time of the first snapshot."""
         return self.field.moments_at(torch.from_numpy(self.cells.centre))
-
-    @cached_property
-    def _further(self) -> Locator | None:
-        """Of the larger box; made once, as the moments of its coarse cells are."""
-        return None if self.wider is None else replace(self, cells=self.wider, wider=None)
-
-    def _at_edge(self, search: Search) -> bool:
-        """Whether the likelihood still rises at the edge of the box: its likeliest cell touches it."""
-        likeliest = int(search.log_density(self.trust).argmax())
-        centre, edge = search.cells.centre[likeliest], search.cells.edge[likeliest]
-        return beyond_box(centre, self.cells.box(), 0.51 * edge)  # 1 % of a cell for rounding
 
     def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
         """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
@@ -121,16 +111,20 @@ class Locator:
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
+        further, box = replace(self, cells=self.wider), self.cells.box()
 
         def one(number: int) -> Located:
             started, one, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
             search = self.search_cells(one, self.trust)
             unlike = search.least_misfit(self.trust) > self.trust.worst
-            if self._further is not None and (unlike or self._at_edge(search)):
-                beyond = self._further.search_cells(one, self.trust)
-                if beyond_box(beyond.posterior(self.trust).peak(), self.cells.box()):
-                    search, doubt = beyond, BEYOND
-            doubt = doubt or UNLIKE * unlike
+            volume = search.cells.volume
+            likely = search.cells.subset(densest_cells(search.log_density(self.trust), volume, KEPT))
+            # What may be as likely beyond the edge touches it; 1 % for rounding.
+            if unlike or beyond_box(likely.centre, box, 0.51 * likely.edge).any():
+                doubt = DOUBTS["unlike"] * unlike
+                wide = further.search_cells(one, self.trust)
+                if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
+                    search, doubt = wide, DOUBTS["beyond"]
             posterior = search.posterior(self.trust)
             located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
             return replace(located, seconds=time.perf_counter() - started, doubt=doubt)
