@@ -159,8 +159,8 @@ def locate_by_model(
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     field, count = SiteField(run.predictor), 0
-    boxes = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
-    locator = Locator(field, *boxes, unknown, start, share)
+    box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
+    locator = Locator(field, box, wider, unknown, start, share)
     if config.calibrate:
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
