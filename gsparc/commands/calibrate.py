@@ -68,19 +68,20 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     ]  # fmt: skip
     kinds = [{"kind": kind, **facts_under(facts, f"confidence/{kind}")} for kind in NAMES]
     draws = [
-        Column("parted by", "", of="how"), Column("confidence", "", of="kind"),
-        Column("accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
-        Column("sets that accepted none", ".0%", of="silent"),
-        Column("of the others, broken by", ".1%", of=_broken),
-        Column("of all, broken by", ".1%", of="broken_of_all"),
+        Column("rows divided", "", of="how"), Column("confidence", "", of="kind"),
+        Column("answers accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
+        Column("trials accepting none", ".0%", of="silent"),
+        Column("too many bad, of accepting trials", ".1%", of=_broken),
+        Column("too many bad, of all trials", ".1%", of="broken_of_all"),
         Column("promised at most", ".0%", of=lambda row: facts["promise/delta"]),
     ]  # fmt: skip
     # Spatial draws are left out where the patches are too few.
     trials_of = [{"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")]
     of = f"{facts['dataset/name']}, {facts['positions']} test positions of {facts['model/name']}"
     heading = f"{of}: which confidence orders errors best (a smaller area is better)"
-    kept = f"of accepted answers at most {facts['promise/alpha']:.0%} have an error above"
-    promise = f"Is the promise kept, {kept} {facts['promise/limit_db']:g} dB? By random calibration sets"
+    bad = f"bad (an error above {facts['promise/limit_db']:g} dB)"
+    trials = "Trials of the promise, each of a threshold set on some rows and tried on others"
+    promise = f"{trials}: more than {facts['promise/alpha']:.0%} of accepted answers {bad} are too many"
     return [
         Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
         Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row]),

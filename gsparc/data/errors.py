@@ -78,6 +78,10 @@ class Caution(str):
     """A remark of a reader that something may be wrong: `gsparc check` and runs print it as a warning."""
 
 
+class Severe(Caution):
+    """A caution about what changes every figure, a unit or a convention: runs say it again at their end."""
+
+
 class DataError(ValueError):
     """Input that was refused at load; nothing half-loaded exists when it is raised.
 

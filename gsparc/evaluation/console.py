@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from textwrap import shorten
-from typing import Any
+from typing import Any, ClassVar
 
 from hydra import errors
 from hydra.core.config_store import ConfigStore
@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.data.errors import warning_kind
+from gsparc.data.errors import Severe, warning_kind
 from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import SettingError
 
@@ -26,6 +26,7 @@ FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
 WIDE = 120
 AGAIN = 40  # characters of a warning that tell it from others
+READERS = "gsparc.data.datasets"  # loggers: one file may be read several times in a run
 PATH = r"^\S*/\S*: "  # at its head
 
 
@@ -49,16 +50,24 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
         stream: where lines go; None: stdout.
     """
 
+    read: ClassVar[set[str]] = set()  # what was said of files, by any handler: jobs of a sweep have their own
+
     def __init__(self, quiet: Iterable[str] = (), stream: Any = None) -> None:
         super().__init__(stream or sys.stdout)
         self.quiet = tuple(f"{name}." for name in quiet)
         self.warned: dict[str, tuple[int, str]] = {}  # by kind: how often, and the first
+        self.severe: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a record is shown; counts warnings."""
-        if record.levelno < logging.WARNING:
-            return not f"{record.name}.".startswith(self.quiet)
         message = record.getMessage()
+        if record.levelno < logging.WARNING:
+            told = re.sub(r"^\S*/", "", message) if record.name.startswith(READERS) else ""
+            again = told in self.read
+            self.read.update({told} - {""})
+            return not again and not f"{record.name}.".startswith(self.quiet)
+        if isinstance(record.args, tuple) and any(isinstance(part, Severe) for part in record.args):
+            self.severe.append(f"this changes every figure above: {message}")
         count, first = self.warned.get(warning_kind(message), (0, message))
         self.warned[warning_kind(message)] = count + 1, first
         return count == 0
@@ -70,11 +79,12 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
 
 
 def repeated_warnings() -> list[str]:
-    """Return a command's last line on warnings that its log's file has more of, or none."""
+    """Return a command's last lines on warnings: severe ones, and whether its log's file has more of any."""
     screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
     more = [(n, first) for one in screens for n, first in one.warned.values() if n > 1]
     again = [f"{n} like '{shorten(re.sub(PATH, '', first), AGAIN, placeholder='')} ...'" for n, first in more]
-    return [f"warnings that came again: {', '.join(again)}"] if again else []
+    severe = dict.fromkeys(text for one in screens for text in one.severe)
+    return [*severe, *([f"warnings that came again: {', '.join(again)}"] if again else [])]
 
 
 def to_dict(node: DictConfig) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from gsparc.prediction.risk import (
     Guarantee,
     calibrate_threshold,
     design_effect,
+    explain_kind,
     explain_too_few,
     join_evidence,
     number_patches,
@@ -378,7 +379,7 @@ def calibrate_and_store(
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
     how = kind, spatial, seed, apart_m
-    kind_used, choice, _, _ = calibrate_threshold(evidence, guarantee, *how, tested=False)
+    kind_used, choice, _, choose_on = calibrate_threshold(evidence, guarantee, *how, tested=False)
     threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
     box = confidence.calibrated_box(known, evidence.position)
@@ -386,15 +387,18 @@ def calibrate_and_store(
     earlier = confidence.read_trusted(run.stored[0].extra)
     before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
-    kind_changed = f"confidence={kind_used}, before: {before}; "
+    why = f", {explain_kind(evidence, choose_on)}" if kind == "auto" else ""
+    kind_changed = f"confidence={kind_used}{why}, before: {before}; "
     if kind == "auto" and not np.isfinite(threshold):
         # Without a promise a choice by chance would replace what falls away from the measurements.
         stored, kind_changed = earlier, f"confidence stays {before}, the checkpoint as it was; "
     else:
         confidence.store_trusted(path, stored)
     if np.isfinite(threshold):
-        of = f"at most {guarantee.alpha:.0%} of these are worse than {guarantee.limit_db:g} dB"
-        return stored, f"{kind_changed}accepted from {threshold:.4g}: {of}"
+        share = np.mean(evidence.scores[kind_used] >= threshold)
+        of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
+        from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
+        return stored, f"{kind_changed}{from_there}: {of}, which fails in {guarantee.delta:.0%} of cases"
     wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
     effect = design_effect(wrong, number_patches(evidence.position)) if spatial else 1.0
     bad = float(wrong.mean())

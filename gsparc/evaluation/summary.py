@@ -119,7 +119,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
     }
-    chi2 = {str(facts.get("model/label")): facts.get(f"{prefix}/{CALIBRATION}")}
+    stated = [key.split("/") for key in facts if key.endswith(f"/{CALIBRATION}")]
+    chi2 = {key[1]: facts["/".join(key)] for key in stated if key[0] == "baseline"}
+    chi2[str(facts.get("model/label"))] = facts.get(f"{prefix}/{CALIBRATION}")
     wrong = wrong_deviations(chi2, main_figure(facts, prefix))
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
@@ -134,8 +136,10 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
     made, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
-    said = [] if made in (None, label) else [made if kind in made else f"{kind}: {made}"]
-    said += str(facts.get("model/learned") or "").splitlines()[:MOST_LEARNED]
+    said = [] if made in (None, label) else [made if kind in made else f"{kind}, {made}"]
+    # Notes of a method begin with its name, of which one is enough.
+    notes = str(facts.get("model/learned") or "").replace(f"{facts.get('model/name')}: ", "")
+    said += notes.splitlines()[:MOST_LEARNED]
     lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(said)]
     folds = facts.get("split/folds") or 1
     return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
@@ -195,8 +199,8 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
 def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]:
     """Return methods whose `std` is wrong by a factor of two or more, by their reduced chi-squared, if any.
 
-    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")[0][:30]
-    'std of field is 5 times too sm'
+    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")[0].split(": ")[1][:33]
+    'std of field is 5 times too small'
     """
     low, high = RIGHT_CHI2
     # False for NaN: methods without a std have no such figure. 1e-12: answers may be exact.
@@ -206,7 +210,8 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     tested = "gsparc map ckpt=FILE has tested intervals"
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
-    return [f"std {said}: it orders answers, but is no error bar here; {tested}"] if said else []
+    meant = f"{CALIBRATION} is 1 where std, the stated uncertainty, is right: std {said}"
+    return [f"{meant}; it orders answers, but is no error bar here; {tested}"] if said else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

@@ -14,7 +14,7 @@ from gsparc.commands.locate import locate
 from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
 
-UNPLACED = {"x", "y", "z", "area_m2", "modes"}
+UNPLACED = {"x", "y", "z", "area_m2", "modes", "doubt"}
 PLACED = UNPLACED | {"x_true", "y_true", "z_true", "error_m", "inside"}
 
 
@@ -81,6 +81,27 @@ def test_a_table_was_refused_and_after_the_calibration(tmp_path):
     assert len(found) == 20 and facts["locate/median_m"] < 3
     with pytest.raises(DataError, match="no such file"):  # at once
         located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/c.csv'")
+
+
+def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsaid(tmp_path, capsys):
+    """Areas of 90 % held none of 35 places of a hall's other part, without a word."""
+    rng = np.random.default_rng(0)
+    place = rng.uniform(0, 30, (160, 2)) * [1, 0.5]
+    level = -40 - 25 * np.log10(1 + np.linalg.norm(place[:, None] - [[0, 0], [15, 20], [18, -5]], axis=2))
+    rows = np.hstack([place, level + rng.normal(0, 0.5, level.shape)])
+    far = place[:, 0] > 20
+    for name, part in (("a", rows[~far]), ("b", rows[far])):
+        np.savetxt(tmp_path / f"{name}.csv", part, "%.3f", ",", header="x,y,AP1,AP2,AP3", comments="")
+    ckpt = towns.trained(tmp_path / "a.csv", "gp")
+    facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/b.csv'", "calibrate=0")
+    beyond = [row["doubt"] == "beyond the trained places" for row in found]
+    assert facts["locate/beyond"] == sum(beyond) > 0.6 * len(found)
+    assert facts["locate/median_m"] < 0.3 * facts["baseline/nearest/median_m"], "sought beyond the edge"
+    said = capsys.readouterr().out
+    assert f"{sum(beyond)} of {len(found)} snapshots: beyond the trained places, where areas promise" in said
+    assert f"{len(found)} true places lie beyond these" in said
+    facts, found = located(tmp_path / "own", f"ckpt={ckpt}", "calibrate=0")
+    assert facts["locate/beyond"] <= 0.2 * len(found)
 
 
 def test_nobody_is_located_in_a_wall(trained, tmp_path):

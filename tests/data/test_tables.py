@@ -87,6 +87,12 @@ def test_every_guess_is_said_and_what_is_not_used(write):
     assert arrays["rssi_db"].tolist() == [4, 8]
 
 
+def test_a_column_of_times_was_listed_as_not_used_without_a_word(write):
+    notes = parse_table(write("x,y,rssi,time\n1,2,-80,0\n4,5,-81,1\n")).notes
+    said = next(note for note in notes if "'time'" in note)
+    assert "rows count in the order of the file" in said and "dataset.columns.run=COLUMN" in said
+
+
 def test_levels_without_a_unit_were_said_to_be_in_dbm(write):
     """A map of the same levels said dB."""
     table = parse_table(write("x,y,z,RSSI\n1,2,3,-80\n4,5,6,-81\n"))

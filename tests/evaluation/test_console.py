@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from gsparc.data.errors import Severe
 from gsparc.evaluation.console import ConsoleHandler, config_folder, error_in_one_line, repeated_warnings
 
 
@@ -76,6 +77,25 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
         "warnings that came again: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...', "
         "2 like '1 spectrum cannot come from this array ...'"
     ]
+
+
+def test_a_wrong_convention_was_said_once_far_above_the_table(monkeypatch):
+    screen = ConsoleHandler([], io.StringIO())
+    monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
+    log = logging.getLogger("gsparc.data.datasets.campaign")
+    log.warning("%s: %s", "a.npz", Severe("dataset.conjugate=true mends it"))
+    log.warning("%s: %s", "a.npz", "3 wild rows")
+    assert repeated_warnings() == ["this changes every figure above: a.npz: dataset.conjugate=true mends it"]
+
+
+def test_jobs_of_a_sweep_said_again_how_columns_are_read(monkeypatch):
+    """Twice in each job, and after the last by the path: a file is read more than once."""
+    monkeypatch.setattr(ConsoleHandler, "read", set())
+    said = []
+    for text in ("a.csv: columns x", "data/a.csv: columns x", "b.csv: columns x"):
+        record = logging.LogRecord("gsparc.data.datasets.campaign", logging.INFO, "", 0, text, (), None)
+        said.append(ConsoleHandler([], io.StringIO()).filter(record))
+    assert said == [True, False, True]
 
 
 def test_the_file_of_a_log_has_every_line_of_which_the_console_shows_some(tmp_path, capsys):

@@ -109,7 +109,7 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
 
 
 @pytest.mark.parametrize(("kind", "made", "learned", "said"), [
-    ("ImageSources", "rays in closed form", None, ["gsparc: image sources: rays in closed form"]),
+    ("ImageSources", "rays in closed form", None, ["gsparc: image sources, rays in closed form"]),
     ("ArrayProcess", "array process through 9", None, ["gsparc: array process through 9"]),
     ("Powers", "joint_powers in closed form", None, ["gsparc: powers of all stations in closed form"]),
     ("Powers", "powers in closed form", "length 3 m\na law\nc\nd",
@@ -168,3 +168,21 @@ def test_headings_were_broken_inside_words_and_columns_of_dashes_shown():
 def test_what_an_own_method_learned_stood_without_its_name():
     facts = {"model/made": None, "model/label": "own", "model/learned": "ridge 0.001\nrows 9"}
     assert describe_model(facts) == ["own: ridge 0.001", "  rows 9"]
+
+
+def test_the_name_of_a_method_stood_twice_before_what_it_learned():
+    facts = {
+        "model/made": None,
+        "model/label": "gp",
+        "model/name": "gp",
+        "model/learned": "AP0: gp: length 3 m",
+    }
+    assert describe_model(facts) == ["gp: AP0: length 3 m"]
+
+
+def test_a_baseline_whose_errors_are_forty_times_its_std_had_no_remark():
+    facts = {"dataset/kind": "rssi", "model/label": "gsparc", "test/rmse_db": 1.0, "test/reduced_chi2": 1.1}
+    (said,) = remarks(facts | {"baseline/gp/reduced_chi2": 1600.0})
+    assert said.startswith(
+        "reduced_chi2 is 1 where std, the stated uncertainty, is right: std of gp is 40 times too"
+    )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,10 +13,12 @@ from scipy.optimize import minimize
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.search import Search
 
+log = logging.getLogger(__name__)
+
 # Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
-LOOKS = 160
+LOOKS, SAID = 160, 40  # trials, and those after which it is said
 
 
 def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: float, start: Trust) -> Trust:
@@ -34,12 +38,16 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
     edge = float(np.max([one.cells.edge.max() for one in snapshots]))
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
 
+    trials = itertools.count(1)
+
     # In logarithms: all are positive and known up to factors.
     def decode_trust(point: np.ndarray) -> Trust:
         inflation, temperature, tail, spread = np.exp(np.clip(point, *spans)).tolist()
         return Trust(inflation, temperature, tail, edge * spread)
 
     def surprise(point: np.ndarray) -> float:
+        if (number := next(trials)) % SAID == 0:
+            log.info("how far it is trusted: %d of at most %d trials", number, LOOKS)
         trust, pairs = decode_trust(point), zip(snapshots, places, strict=True)
         return -float(np.mean([one.posterior(trust).log_density_at(place) for one, place in pairs]))
 
@@ -52,9 +60,10 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
 
 
 def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
-    """Return the trust with the level whose areas hold a share of the places (n, 3) [m, local]."""
+    """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit."""
     levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
-    return replace(trust, level=float(np.sort(levels)[rank - 1]) if rank <= len(levels) else 1.0)
+    level = float(np.sort(levels)[rank - 1]) if rank <= len(levels) else 1.0
+    return replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))

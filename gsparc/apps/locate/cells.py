@@ -49,26 +49,39 @@ class Cells:
         """Return these cells and others."""
         return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
 
+    def box(self) -> np.ndarray:
+        """Return the corners (2, 3) [m] of all cells."""
+        return np.stack([(self.centre - self.edge / 2).min(0), (self.centre + self.edge / 2).max(0)])
+
     def index_of(self, place: np.ndarray) -> int:
         """Return the cell that a place (3,) is in, or that is nearest to it."""
         outside = (np.abs(self.centre - place) - self.edge / 2).clip(0) * (self.edge > 0)
         return int((outside.sum(1) + 1e-6 * np.linalg.norm(self.centre - place, axis=1)).argmin())
 
 
+def beyond_box(places: np.ndarray, box: np.ndarray, margin: np.ndarray | float = 0.0) -> np.ndarray:
+    """Tell which places (n, 3) are beyond corners (2, 3), or within a margin [m], seen from above: (n,)."""
+    within = (places - margin > box[0]) & (places + margin < box[1])
+    return ~within[:, :2][:, np.ptp(box, axis=0)[:2] > 0].all(1)
+
+
 def cover_box(
-    trained: np.ndarray, most: int, around: bool, open_at: Callable[[np.ndarray], np.ndarray] | None = None
-) -> Cells:
+    trained: np.ndarray, most: int, around: bool, open_at: Callable[[np.ndarray], np.ndarray] | None = None,
+    beyond: float = 0,
+) -> Cells:  # fmt: skip
     """Return about `most` equal cells of the box of trained places (n, 3) [m].
 
     Args:
         trained, most: places [m, local], and cells of the whole box.
         around: whether only cells near trained places are kept, as in a building one walked through.
         open_at: whether one can stand at places (m, 3) [m, local], by a floor plan.
+        beyond: share of its sides that the box reaches further on each of its four sides.
 
     Raises:
         ValueError: all places are one, or one can stand nowhere.
     """
     low, extent = trained.min(0), np.ptp(trained, axis=0)
+    low, extent = low - beyond * extent * [1, 1, 0], extent * (1 + 2 * beyond * np.array([1, 1, 0]))
     live = extent > THIN * extent.max()
     if not live.any() or not extent.max() > 0:
         raise ValueError("locate: the model was trained at a single place")

@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 from omegaconf import DictConfig
 
 from gsparc.apps.locate import locator as locating
-from gsparc.apps.locate.cells import Cells, cover_box
+from gsparc.apps.locate.cells import Cells, beyond_box, cover_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
 from gsparc.apps.locate.neighbours import locate_by_neighbours
@@ -96,8 +96,9 @@ def report(
         "locate/snapshots": len(heard), "time/locate_ms_p50": result.each_ms,
         "locate/area_m2": None if area is None else float(np.median(area)),
     }  # fmt: skip
+    doubts = _doubts(result, facts)
     if not result.placed:
-        return facts, [], []
+        return facts, [], doubts
     for name in dict.fromkeys(against):
         if name not in places:
             stems[name] = stem = f"baseline/{name}"
@@ -112,12 +113,25 @@ def report(
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
     if result.inside is None:
-        return facts, shown, []
+        return facts, shown, doubts
     sentence = (
         f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
         f"{result.promise}; {result.each_ms:.3g} ms a snapshot"
     )
-    return facts, shown, [sentence]
+    return facts, shown, [sentence, *doubts]
+
+
+def _doubts(result: Localisation, facts: dict[str, Any]) -> list[str]:
+    """A sentence on each doubt about areas; their counts go to `facts`."""
+    doubt, lines = np.array(result.about.get("doubt", []), str), []
+    for key, why in locating.DOUBTS.items():
+        facts[f"locate/{key}"] = count = int((doubt == why).sum())
+        if count:
+            of = f"{count} of {len(doubt)} snapshots"
+            lines.append(f"{of}: {why}, where areas promise nothing (locate.csv, doubt)")
+    if lines and result.inside is not None and (sure := doubt == "").any():
+        lines.append(f"areas of the other {sure.sum()} hold {result.inside[sure].mean():.0%} of places")
+    return lines
 
 
 def locate_by_model(
@@ -145,7 +159,8 @@ def locate_by_model(
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     field, count = SiteField(run.predictor), 0
-    locator = Locator(field, cells(data.moving[learned][:, :3]), unknown, start, share)
+    box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
+    locator = Locator(field, box, wider, unknown, start, share)
     if config.calibrate:
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
@@ -156,6 +171,8 @@ def locate_by_model(
     if not config.calibrate and locating.KEY not in run.stored[0].extra:
         promise += " by the model's own variances, which nothing tested (calibrate=0)"
     promise += f"; {float(locator.cells.volume.sum()):.3g} m2 were searched"
+    beyond = int(beyond_box(heard.place, locator.cells.box()).sum()) if placed else 0
+    promise += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
@@ -163,6 +180,7 @@ def locate_by_model(
     inside = np.array([one.posterior.mass_above(at) <= level for one, at in pairs]) if placed else None
     places = np.array([one.place for one in located])
     about = dict[str, list[Any]](area_m2=[at.area for at in located], modes=[at.modes for at in located])
+    about["doubt"] = [at.doubt for at in located]
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count}
     known = method.name, places, heard, trained, origin, placed, about

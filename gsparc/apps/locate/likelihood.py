@@ -6,6 +6,7 @@ between snapshots is taken out: the phase of a carrier, a device's offset in dec
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -59,6 +60,7 @@ class Trust:
         tail: degrees of freedom.
         spread: standard deviation of recorded places about the likelihood's along each axis [m].
         level: mass of the area that holds the promised share of places.
+        worst: largest misfit at the likeliest place of any snapshot that was left out (see `Search.misfit`).
     """
 
     inflation: float = 1.0
@@ -66,6 +68,14 @@ class Trust:
     tail: float = 4.0
     spread: float = 0.0
     level: float = 0.9
+    worst: float = math.inf
+
+    def __str__(self) -> str:
+        return (
+            f"variances times {self.inflation:.2g}, {self.temperature:.1%} of values counted as independent, "
+            f"t distribution of {self.tail:.2g} degrees of freedom, places recorded to {self.spread:.2g} m; "
+            f"areas have {self.level:.1%} of the probability"
+        )
 
     def log_likelihood(self, misfit: Misfit) -> Tensor:
         """(n, G), up to a constant of each snapshot."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsparc.apps.locate.cells import cover_box
-from gsparc.apps.locate.locator import MOST, Located, Locator, restore_trust, to_world
+from gsparc.apps.locate.locator import FURTHER, MOST, Located, Locator, restore_trust, to_world
 from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import snapshots_of_values
@@ -60,5 +60,5 @@ def _locator(
     site = predictor.site
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
     trust = restore_trust(predictor.extra, unknown, share)
-    cells = cover_box(local, MOST, places is not None)
-    return Locator(SiteField(predictor), cells, unknown, trust, share)
+    cells, wider = (cover_box(local, MOST, places is not None, beyond=beyond) for beyond in (0, FURTHER))
+    return Locator(SiteField(predictor), cells, wider, unknown, trust, share)

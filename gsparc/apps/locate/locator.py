@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
-from gsparc.apps.locate.cells import Cells
+from gsparc.apps.locate.cells import Cells, beyond_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.posterior import Posterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
@@ -31,6 +31,8 @@ HALVED = 16  # cells that are halved at a time
 KEPT = 0.9  # of the mass: cells beyond it stay as they are
 LEVELS = 8  # halvings of a cell
 ENOUGH = 32  # cells of one size that hold this mass need not be halved
+FURTHER = 0.5  # of its sides, that a larger box reaches beyond the trained places
+DOUBTS = {"beyond": "beyond the trained places", "unlike": "unlike all rows that were left out"}
 KEY = "locate"  # in a checkpoint's `extra`
 
 
@@ -44,6 +46,8 @@ class Located:
         modes: parts of that area that are apart, each of some mass.
         posterior: masses of cells.
         seconds: that it took.
+        doubt: why its area promises nothing: it lies beyond the places that were learned from, or the
+            snapshot fits no place; empty: neither.
     """
 
     place: np.ndarray
@@ -51,6 +55,7 @@ class Located:
     modes: int
     posterior: Posterior
     seconds: float
+    doubt: str = ""
 
     @classmethod
     def from_posterior(cls, posterior: Posterior, mass: float, place: np.ndarray, seconds: float = 0) -> Self:
@@ -67,6 +72,7 @@ class Locator:
     Attributes:
         field: what would be heard.
         cells: of a coarse grid.
+        wider: of a larger box, for what is likeliest at the edge of `cells`.
         unknown: what differs by chance between snapshots.
         trust: see there.
         share: of places that an area holds.
@@ -74,6 +80,7 @@ class Locator:
 
     field: SiteField
     cells: Cells
+    wider: Cells
     unknown: Nuisances
     trust: Trust
     share: float = 0.9
@@ -104,12 +111,23 @@ class Locator:
     def locate(self, heard: Snapshots) -> list[Located]:
         """Each of n snapshots on its own."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
+        further, box = replace(self, cells=self.wider), self.cells.box()
 
         def one(number: int) -> Located:
-            started = time.perf_counter()
-            posterior = self.search_cells(heard.subset(np.array([number])), self.trust).posterior(self.trust)
+            started, one, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
+            search = self.search_cells(one, self.trust)
+            unlike = search.least_misfit(self.trust) > self.trust.worst
+            volume = search.cells.volume
+            likely = search.cells.subset(densest_cells(search.log_density(self.trust), volume, KEPT))
+            # What may be as likely beyond the edge touches it; 1 % for rounding.
+            if unlike or beyond_box(likely.centre, box, 0.51 * likely.edge).any():
+                doubt = DOUBTS["unlike"] * unlike
+                wide = further.search_cells(one, self.trust)
+                if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
+                    search, doubt = wide, DOUBTS["beyond"]
+            posterior = search.posterior(self.trust)
             located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
-            return replace(located, seconds=time.perf_counter() - started)
+            return replace(located, seconds=time.perf_counter() - started, doubt=doubt)
 
         return run_all(one, range(len(heard)), "snapshots")
 

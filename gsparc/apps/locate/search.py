@@ -40,6 +40,10 @@ class Search:
         log_like, log_size = trust.log_likelihood(self.misfit)[0], torch.from_numpy(np.log(self.cells.volume))
         return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
 
+    def least_misfit(self, trust: Trust) -> float:
+        """Return the squared error by the variance, a mean over the values, at the likeliest cell."""
+        return float(self.misfit.squared[0, self.log_density(trust).argmax()] / self.misfit.count[0])
+
     def posterior(self, trust: Trust) -> Posterior:
         """Return what is known of the place."""
         return Posterior(self.cells, self.log_density(trust), trust.spread)

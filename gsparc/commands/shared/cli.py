@@ -26,6 +26,7 @@ from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release_folders
 from gsparc.data.files import check_yaml
 from gsparc.data.instantiate import GROUPS, plugins
+from gsparc.evaluation import console
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
 from gsparc.models import registry
 
@@ -64,6 +65,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
     interrupts: list[int] = []
+    console.ConsoleHandler.read.clear()
     try:
         with _noting(interrupts):
             for folder in (given.config_dir, given.config_path):

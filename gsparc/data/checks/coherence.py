@@ -129,7 +129,8 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of rows (P, A, K) each with each, (P,) complex, and what both measured (P, 2) of power."""
     both = (a != 0) & (b != 0)
     size = np.stack([(np.abs(one) ** 2 * both).sum((1, 2)) for one in (a, b)], 1).clip(1e-300)
-    return (a * b.conj()).sum((1, 2)) / np.sqrt(size.prod(1)), size
+    # Roots first: of two rows without power the product of sizes is 0.
+    return (a * b.conj()).sum((1, 2)) / np.sqrt(size).prod(1), size
 
 
 def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
-from gsparc.data.errors import list_first
+from gsparc.data.errors import Severe, list_first
 from gsparc.data.schema import Measurements
 
 NAMED = 5  # wild rows that a station may have, however few its rows
@@ -38,7 +38,7 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    warnings = level_warnings(levels.level_db) + duplicate_warnings(levels)
+    warnings = [*map(Severe, level_warnings(levels.level_db)), *duplicate_warnings(levels)]
     return [*warnings, *outlier_row_warnings(levels), *step_warnings(levels, steps), *gap_warnings(levels)]
 
 

@@ -15,7 +15,7 @@ from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import Caution, DataError, Problems
+from gsparc.data.errors import Caution, DataError, Problems, Severe
 from gsparc.data.files import read_text
 from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
@@ -72,7 +72,7 @@ class Campaign(DataModule):
         for warning in _implausible(reading.data):
             log.warning("%s: %s", self.file, warning)
         for hint in unit_warnings(reading.data):
-            log.warning("%s: units? %s", self.file, hint)
+            log.warning("%s: %s", self.file, Severe(f"units? {hint}"))
         return reading.data
 
 
@@ -86,7 +86,9 @@ def _implausible(data: Measurements) -> list[str]:
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data)
-    return convention_warnings(data) if levels is None else sanity_warnings(levels, find_level_steps(levels))
+    if levels is None:
+        return [Severe(warning) for warning in convention_warnings(data)]
+    return sanity_warnings(levels, find_level_steps(levels))
 
 
 class StandIn(Protocol):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.checks.plausibility import degree_warnings
-from gsparc.data.errors import Caution, list_first, name_row_ranges
+from gsparc.data.errors import Caution, Severe, list_first, name_row_ranges
 from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
 from gsparc.data.own_checks import Checker
 from gsparc.data.selection import take_rows
@@ -121,7 +121,7 @@ def _in_metres(check: Checker) -> Georeference | None:
                 arrays[f"{name}_height"] = np.array(0.0)
                 check.notes.append(f"no {name}_height: taken as 0 m")
             del arrays[f"{prefix}latitude"], arrays[f"{prefix}longitude"]
-    check.notes += map(Caution, degree_warnings(*places[""]))
+    check.notes += map(Severe, degree_warnings(*places[""]))
     where = f"{origin.latitude:g}, {origin.longitude:g} degrees"
     check.notes.append(f"positions are metres east and north of {where}")
     return origin

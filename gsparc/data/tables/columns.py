@@ -137,7 +137,8 @@ def choose_columns(
     used = {column.head for columns in chosen.values() for column in columns}
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
-        notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}")
+        timed = heads.SHEET["times"] * any(LISTS["time"] & set(words_of(head)) for head in unused)
+        notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
     return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
 
 

@@ -44,6 +44,7 @@ BESIDE_COLUMNS = (
 OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
+GIVEN = {"newrf", "directional_gp", "calibrated_raytracer"}  # methods that learn from more than places
 PROBLEM = ["dataset", "split"]
 GROUP = [*PROBLEM, "budget_s", "method"]
 CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
@@ -218,6 +219,9 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
+    if GIVEN & set(block.method):
+        given = "newrf, directional_gp and gsparc were given directions of arrival of training rows"
+        lines.append(f"{given}, calibrated_raytracer the scene's walls, all others places alone")
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
     if old:

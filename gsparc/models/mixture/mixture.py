@@ -42,6 +42,8 @@ from gsparc.training.cost import Cost
 from gsparc.training.time_budget import worst_clock
 
 log = logging.getLogger(__name__)
+# Of fields, in words.
+PARTS = {"power": "a trend of levels", "residual": "a process of what is left"}
 
 
 class Mixture(LearnsTogether, ClosedForm):
@@ -295,8 +297,8 @@ class Mixture(LearnsTogether, ClosedForm):
     @property
     def description(self) -> str:
         """See `Method`."""
-        terms = ", ".join(self.terms) or "a process alone"
-        return f"{self.started.replace('+', ' + ')} in closed form: {terms}"
+        terms = ", ".join(PARTS.get(term, term) for term in self.terms) or PARTS["residual"]
+        return f"{self.started.replace('+', ' + ')} in closed form, made of {terms}"
 
     def count_components(self) -> int:
         """Return the number of Gaussians of all members."""

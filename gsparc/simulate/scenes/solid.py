@@ -66,5 +66,4 @@ def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: floa
 def write_walls(triangles: np.ndarray, path: Path) -> None:
     """Write triangles (n, 3, 3) [m], world, for `init=scene`, whole or not at all; none without area."""
     lines = [f"- {corners}" for corners in np.round(triangles, MILLIMETRES).tolist()]
-    write_whole(path, "
-".join(["walls:", *lines, ""]))
+    write_whole(path, "\n".join(["walls:", *lines, ""]))

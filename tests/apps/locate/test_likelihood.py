@@ -68,3 +68,9 @@ def test_heavy_tail_forgives_a_bad_snapshot():
     found = level_misfit(values, mean, torch.ones(2, 20).double())
     light, heavy = (Trust(1.0, 1.0, tail).log_likelihood(found)[0] for tail in (1e6, 2.0))
     assert light[1] - light[0] > 100 and 0 < heavy[1] - heavy[0] < 10
+
+
+def test_the_log_showed_trust_as_an_object():
+    said = str(Trust(0.05, 0.14, 16.0, 0.1, 0.99))
+    assert said.startswith("variances times 0.05, 14.0% of values counted as independent, t distribution")
+    assert said.endswith("places recorded to 0.1 m; areas have 99.0% of the probability")

@@ -1,6 +1,7 @@
 """`locate`: places from values in the units and shapes of predictions."""
 
 import logging
+import shutil
 
 import numpy as np
 import pytest
@@ -45,6 +46,15 @@ def test_areas_are_those_that_were_calibrated(trained, caplog):
     assert after.area > 2 * before.area
     with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
         locate(gsparc.load(trained), spectrum, share=0.5)
+
+
+def test_a_snapshot_unlike_all_that_were_left_out_had_an_area_as_any_other(trained, tmp_path):
+    path = shutil.copy(trained, tmp_path / "model.ckpt")
+    checkpoint.update_extra(path, trust_state(Trust(worst=2.0), Nuisances(), 0.9))
+    predictor = gsparc.load(path)
+    like = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
+    unlike = np.roll(np.asarray(like), like.shape[-1] // 2, -1)[..., ::-1, :].copy()
+    assert [bool(one.doubt) for one in locate(predictor, np.concatenate([like, unlike]))] == [False, True]
 
 
 def test_missing_and_silent_stations_are_no_values(tmp_path):

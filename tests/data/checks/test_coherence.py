@@ -71,3 +71,10 @@ def test_the_setting_wins_over_the_verdict(caplog):
     assert set_freedom(own, "none").site.freedom == "none"
     with pytest.raises(SettingError, match=r"dataset\.align=level"):
         set_freedom(data, "level")
+
+
+@pytest.mark.filterwarnings("error")
+def test_rows_without_power_divided_by_zero():
+    data = waves(0)
+    data.target[:30] = 0
+    assert estimate_coherence(data).freedom == "none"

@@ -243,3 +243,10 @@ def test_the_csv_file_had_other_signs_than_the_console():
     assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
     assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
     assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(gsparc.score_error_db)
+
+
+def test_what_methods_were_given_besides_places_was_not_said():
+    (block,) = split_by_problem(average_cells([*FOUND[:1], filled("newrf", 29.0, 0, 60.0)], {}))
+    assert any("gsparc were given directions of arrival" in line for line in remarks(block, "gsparc"))
+    (block,) = split_by_problem(average_cells(FOUND[:1], {}))
+    assert not any("were given" in line for line in remarks(block, "gsparc"))
