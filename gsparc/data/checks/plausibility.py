@@ -126,7 +126,8 @@ def duplicate_warnings(levels: LinkLevels) -> list[str]:
     warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        warnings.append(f"copies (same place, station and level): {list_first(same)}; leave them out")
+        advice = "fine if measured twice (rows of a place stay on one side of a split), else leave them out"
+        warnings.append(f"copies (same place, station and level): {list_first(same)}; {advice}")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
         warnings.append(
@@ -231,7 +232,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
             often = count >= FEW * len(used) and len(around) > 0
             (faint if often and np.median(around) < weak else plain)[name] = count
     warnings = [
-        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: an outage; "
+        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: off, or unlisted; "
         "these rows are not used"
         for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2])
     ]
