@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # Checks of the CUDA backend on one GPU: bench/gpu.sh FOLDER [stage ...]
-# Stages: build tests hard sanitize train (all by default). Leaves a log of each stage in FOLDER, also where one fails; in ten
-# minutes at a time: "build tests", "sanitize", "hard train". WHEELS: a folder of what is missing here (bench/wheels.sh).
+# Stages: build tests hard sanitize bench train (all by default). Leaves a log of each stage in FOLDER, also where one fails; in
+# ten minutes at a time: "build tests hard sanitize", "bench train". WHEELS: a folder of what is missing here (bench/wheels.sh).
 set -uo pipefail
 cd "$(dirname "$0")/.."
 OUT=$(mkdir -p "${1:?usage: bench/gpu.sh FOLDER [stage ...]}" && cd "$1" && pwd)
 shift
-STAGES=${*:-build tests hard sanitize train}
+STAGES=${*:-build tests hard sanitize bench train}
 PYTHON=${PYTHON:-$([ -x .venv/bin/python ] && echo .venv/bin/python || echo python3)}
 export PYTHONUNBUFFERED=1
 FAILED=""
@@ -23,16 +23,11 @@ if [ -n "${WHEELS:-}" ]; then
   export PYTHONPATH="$SPARE${PYTHONPATH:+:$PYTHONPATH}"
 fi
 
-# Where gsparc is not installed (-P: the folders here are not the package), lay its rooms out under their installed names and build the CPU kernels there.
+# Where gsparc is not installed (-P: the folders here are not the package), it is installed beside these sources.
 if ! "$PYTHON" -P -c "import gsparc.ops._native" 2>/dev/null; then
-  SITE="$PWD/build/site"
-  rm -rf "$SITE" && mkdir -p "$SITE/gsparc" build/cpu
-  cp -rs "$PWD"/gsparc/. "$SITE/gsparc/"
-  for room in ops callbacks conf; do cp -rs "$PWD/$room" "$SITE/gsparc/"; done
-  (cmake -S . -B build/cpu -DCMAKE_BUILD_TYPE=Release -DPython_EXECUTABLE="$(command -v "$PYTHON")" &&
-    cmake --build build/cpu --parallel) >"$OUT/cpu-kernels.log" 2>&1 || tail -5 "$OUT/cpu-kernels.log"
-  cp build/cpu/ops/csrc/_native*.so "$SITE/gsparc/ops/"
-  export PYTHONPATH="$SITE${PYTHONPATH:+:$PYTHONPATH}"
+  "$PYTHON" -m pip install --quiet --no-index --no-deps --no-build-isolation --upgrade --target "$PWD/build/site" . \
+    >"$OUT/install.log" 2>&1 || tail -5 "$OUT/install.log"
+  export PYTHONPATH="$PWD/build/site${PYTHONPATH:+:$PYTHONPATH}"
 fi
 
 stage() { # stage NAME LIMIT_S COMMAND...
@@ -65,12 +60,18 @@ train() { # the splatted field, on the GPU and on the CPU: the figures of both s
       model.effects.array=false model.effects.phase=false hydra.run.dir="$OUT/train-$accelerator" || return
   done
 }
-export -f sanitize train
+bench() { # the same kernels on the GPU and on all cores of the CPU
+  for device in cuda cpu; do
+    "$PYTHON" -P -m gsparc bench device=$device "counts=[1000,10000,62000,1000000]" hydra.run.dir="$OUT/bench-$device" || return
+  done
+}
+export -f sanitize bench train
 export PYTHON OUT
 
 stage build 300 "$PYTHON" -P -m gsparc.ops.cuda_library
 stage tests 240 "$PYTHON" -P -m pytest tests/cuda tests/ops -q --maxfail=20 -k "gpu or test_device" -p no:cacheprovider
 stage hard 240 "$PYTHON" -P -m pytest tests/hard_cases -q --maxfail=20 -m "not slow" -k "cuda and not shim" -p no:cacheprovider
 stage sanitize 290 bash -c sanitize
+LINES_SHOWN=130 stage bench 290 bash -c bench
 stage train 290 bash -c train
 [ -z "$FAILED" ] || { echo "failed:$FAILED"; exit 1; }

@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.evaluation.table import Column, Table
+from gsparc.ops.backends import backend_named
 from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
 from gsparc.prediction.timing import ClockSettings, time_interleaved
 
@@ -24,9 +25,11 @@ REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
 def task(config: DictConfig) -> dict[str, Any]:
     """Time all kernels; return the facts of `summary.json`, the table is also `bench.csv`."""
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
-    every = [case for of in product(config.counts, config.projections) for case in kernel_cases(*of)]
+    device = config.device
+    backend_named(device)  # where there is no such device, its reason comes first
+    every = [case for of in product(config.counts, config.projections) for case in kernel_cases(*of, device)]
     # Emission and channels are the same under every projection: a dictionary keeps one of each.
-    every += [loss_case(), *map(training_step_case, config.projections)]
+    every += [loss_case(device), *(training_step_case(of, device=device) for of in config.projections)]
     chosen = {(case.name, case.size): case for case in every}
     rows, facts = [], {}
     for (name, size), case in chosen.items():

@@ -42,6 +42,7 @@ DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
 DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, TypeError, KeyError),
+    TokenError,  # of a header that ends within a quotation, from Python 3.12 on
     *(RuntimeError, ArithmeticError, MemoryError),  # the first includes NotImplementedError
 )
 

@@ -148,11 +148,12 @@ def gaussian_vectors(model: GaussianModel, rx: Pose) -> Tensor:
     assert isinstance(response, ArrayResponse) and model.site.grid is not None
     # Queries may come in inference mode, in which nothing is differentiated.
     with torch.inference_mode(False), torch.enable_grad():
-        field = torch.zeros(1, 2, model.site.grid.height, model.site.grid.width, requires_grad=True)
+        shape, device = (1, 2, model.site.grid.height, model.site.grid.width), model.gaussians.means.device
+        field = torch.zeros(shape, device=device, requires_grad=True)
         parts = torch.view_as_real(response.array_vectors(field)).flatten()
         by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
         means, quats, scales, opacities = (part.detach() for part in model.gaussians.geometry())
-        emitted = torch.zeros(count, len(parts), requires_grad=True)
+        emitted = torch.zeros(count, len(parts), device=device, requires_grad=True)
         plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # perhaps made in inference mode
         image = ops.composite(plan, means, quats, scales, opacities, emitted).image
         (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))

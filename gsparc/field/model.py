@@ -19,6 +19,7 @@ from gsparc.field.encoding import PositionEncoding, Prior, unknown_share
 from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
 from gsparc.field.response import ArrayResponse, ChannelResponse, ResponseSettings
 from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
+from gsparc.ops.transforms import full_precision
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 
@@ -173,14 +174,14 @@ class GaussianModel(nn.Module):
         """Whether the emission's features tell what training positions leave unknown."""
         return self.site.kind == "spectrum" and self.emission.encoding.tells_share
 
-    @torch.autocast("cpu", enabled=False)
+    @full_precision
     def unknown_shares(self, tx: Tensor, rx: Pose) -> Tensor | None:
         """Return unknown shares f^2 (B,) of the field's variance; None where features do not tell."""
         if not self.tells_unknown:
             return None
         return unknown_share(self.emission.encoding(self.site.moving(tx, rx)))
 
-    @torch.autocast("cpu", enabled=False)  # a kernel expansion cancels: half precision costs 8 dB
+    @full_precision  # a kernel expansion cancels: half precision costs 8 dB
     def emissions(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
         distance = self.relative_distances(tx)

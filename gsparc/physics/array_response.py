@@ -50,7 +50,8 @@ def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tenso
         grid: its solid angles are the weights of the sum.
         pattern: (H, W) element amplitude; None for isotropic elements.
     """
-    weight = grid.solid_angles() if pattern is None else grid.solid_angles() * pattern
+    weight = grid.solid_angles().to(waves.device)
+    weight = weight if pattern is None else weight * pattern
     return (waves * weight.to(waves.real.dtype)).flatten(1) @ matrix.T
 
 

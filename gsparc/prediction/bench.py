@@ -43,7 +43,9 @@ class Case:
     reference: Call | None = None
 
 
-def random_model(count: int, projection: Projection, backend: str | None = None) -> GaussianModel:
+def random_model(
+    count: int, projection: Projection, backend: str | None = None, device: str = "cpu"
+) -> GaussianModel:
     """Return a room of `count` Gaussians of all shapes, from nearly transparent to nearly opaque (seeded)."""
     site = Site(
         name="bench", kind="spectrum", static_end="tx", grid=GRID, array=None, carrier_hz=None,
@@ -62,17 +64,18 @@ def random_model(count: int, projection: Projection, backend: str | None = None)
         # Normal numbers, once they are normalised, are uniform rotations.
         field.quats.copy_(torch.randn_like(field.quats))
         field.opacity_logits.copy_(1.5 * torch.randn_like(field.opacity_logits) - 1)
-    return model
+    return model.to(device)
 
 
-def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
+def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Iterator[Case]:
     """Yield the kernels of a field of N Gaussians, two real channels wide."""
     means, quats, scales, opacities = (
-        t.detach() for t in random_model(count, projection).gaussians.geometry()
+        t.detach() for t in random_model(count, projection, device=device).gaussians.geometry()
     )
     geometry = means, quats, scales, opacities
-    pose, draw = Pose.identity(torch.tensor([0.5, -0.5, 0.2])), torch.Generator().manual_seed(0)
-    features = torch.rand(1, count, 2, generator=draw)
+    pose = Pose.identity(torch.tensor([0.5, -0.5, 0.2])).to(device)
+    draw = torch.Generator().manual_seed(0)
+    features = torch.rand(1, count, 2, generator=draw).to(device)
     size = f"{count} {projection}"
 
     def make_case(name: str, call: Callable[[str | None], object]) -> Case:
@@ -113,20 +116,20 @@ def kernel_cases(count: int, projection: Projection) -> Iterator[Case]:
     yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), reference)
     yield make_case("forward and gradients", backward)
     yield make_case("weights of channels", weights)
-    yield from _network_cases(count, draw)
+    yield from _network_cases(count, draw, device)
 
 
-def _network_cases(count: int, generator: torch.Generator) -> Iterator[Case]:
+def _network_cases(count: int, generator: torch.Generator, device: str) -> Iterator[Case]:
     """What stands beside the rasterizer: networks of emission and the sum of a channel."""
-    emission = random_model(count, "tangent").emission
+    emission = random_model(count, "tangent", device=device).emission
     layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
-    encoded = emission.encoding(torch.randn(BATCH, 3, generator=generator))
+    encoded = emission.encoding(torch.randn(BATCH, 3, generator=generator).to(device))
     of = f"{count} x {BATCH}"
     yield Case("emission", of, lambda: networks(encoded, *layers), lambda: plain_networks(encoded, *layers))
-    steering = torch.randn(count, ANTENNAS, 2, generator=generator)
+    steering = torch.randn(count, ANTENNAS, 2, generator=generator).to(device)
     # Up to 100 ns, as in a room, and in float64: at 2.4 GHz these are 240 turns.
-    delays = 1e-7 * torch.rand(count, generator=generator, dtype=torch.float64)
-    gains = torch.randn(1, count, 2, generator=generator)
+    delays = 1e-7 * torch.rand(count, generator=generator, dtype=torch.float64).to(device)
+    gains = torch.randn(1, count, 2, generator=generator).to(device)
     yield Case(
         "channel", f"{count} to {ANTENNAS} x {SUBCARRIERS}",
         lambda: channels(gains, steering, delays, *TONES, SUBCARRIERS),
@@ -134,10 +137,12 @@ def _network_cases(count: int, generator: torch.Generator) -> Iterator[Case]:
     )  # fmt: skip
 
 
-def loss_case() -> Case:
+def loss_case(device: str = "cpu") -> Case:
     """Return L1 and SSIM of a batch of spectra with their gradient."""
     draw = torch.Generator().manual_seed(0)
-    target, shown = (torch.rand((BATCH, GRID.height, GRID.width), generator=draw) for _ in range(2))
+    target, shown = (
+        torch.rand((BATCH, GRID.height, GRID.width), generator=draw).to(device) for _ in range(2)
+    )
     shown.requires_grad_()
 
     def convolved() -> Tensor:
@@ -152,20 +157,23 @@ def loss_case() -> Case:
                 gradient(convolved))  # fmt: skip
 
 
-def training_step_case(projection: Projection, count: int = STEPPED) -> Case:
+def training_step_case(projection: Projection, count: int = STEPPED, device: str = "cpu") -> Case:
     """Return a training step: emission, plan, blending, loss, gradients and Adam."""
-    ours, plain = (_make_step(random_model(count, projection, backend)) for backend in (None, "reference"))
+    ours, plain = (
+        _make_step(random_model(count, projection, backend, device)) for backend in (None, "reference")
+    )
     return Case("training step", f"{count} {projection} x {BATCH}", ours, plain)
 
 
 def _make_step(model: GaussianModel) -> Callable[[], Tensor]:
     optimizer, draw = optimizer_for(model, OptimizerSettings()), torch.Generator().manual_seed(0)
-    target = torch.rand((BATCH, GRID.height, GRID.width), generator=draw)
-    tx = torch.randn(BATCH, 3, generator=draw)
+    device = model.gaussians.means.device
+    target = torch.rand((BATCH, GRID.height, GRID.width), generator=draw).to(device)
+    tx, rx = torch.randn(BATCH, 3, generator=draw).to(device), torch.zeros(3, device=device)
 
     def call() -> Tensor:
         optimizer.zero_grad(set_to_none=True)
-        image = model.rasterize(model.emissions(tx, Pose.identity(tx)), Pose.identity(torch.zeros(3))).image
+        image = model.rasterize(model.emissions(tx, Pose.identity(tx)), Pose.identity(rx)).image
         result = spectrum_loss(image.squeeze(1), target).mean()
         result.backward()
         optimizer.step()

@@ -31,6 +31,13 @@ def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
     assert len(error.value.problems) == 3
 
 
+def test_a_header_with_an_open_bracket_ended_in_a_traceback(tmp_path, refused):
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,".ljust(117) + b"\n"
+    with zipfile.ZipFile(tmp_path / "own.npz", "w") as archive:
+        archive.writestr("rssi_db.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    refused("own.npz, rssi_db: damaged or not an npz file", load_own, tmp_path / "own.npz")
+
+
 def _set(name, value):
     return lambda arrays: arrays | {name: value}
 

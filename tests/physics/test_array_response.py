@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
@@ -72,3 +73,14 @@ def test_sites_without_an_array_are_named(campaign):
     assert "no antenna array" in campaign("spectrum", 4).site.array_problem
     assert "csi" in campaign("csi", 4).site.array_problem
     assert "receiver moves" in campaign("spectrum", 4, "tx").site.array_problem
+
+
+@pytest.mark.parametrize("pattern", [False, True])
+def test_weights_of_directions_stayed_on_the_cpu(pattern):
+    """A GPU's arrays met them there; fake tensors tell devices apart without one."""
+    grid = SphereGrid.hemisphere(4, 8)
+    with FakeTensorMode():
+        waves = torch.zeros(2, 4, 8, dtype=torch.complex64, device="cuda")
+        matrix = torch.zeros(3, 32, dtype=torch.complex64, device="cuda")
+        elements = torch.zeros(4, 8, dtype=torch.float64, device="cuda") if pattern else None
+        assert array_response.array_output(waves, matrix, grid, elements).device.type == "cuda"

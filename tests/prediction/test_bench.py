@@ -1,12 +1,15 @@
 """The kernels that are timed compute what their references do, and the command leaves one table."""
 
 import json
+import re
 
 import pytest
 import torch
 from campaigns import compose
 
 from gsparc.commands import bench
+from gsparc.ops import cuda_library
+from gsparc.ops.backends import BackendUnavailable
 from gsparc.prediction import bench as timed
 from gsparc.prediction.bench import kernel_cases, loss_case, training_step_case
 
@@ -33,7 +36,9 @@ def test_kernels_compute_what_their_references_do(projection):
 def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "run_directory", lambda: tmp_path)
     monkeypatch.setattr(
-        bench, "training_step_case", lambda projection: training_step_case(projection, count=5)
+        bench,
+        "training_step_case",
+        lambda projection, device: training_step_case(projection, count=5, device=device),
     )
     bench.task(compose("counts=[20]", "projections=[tangent]", "rounds=2", "budget_s=0", config="bench"))
     facts = json.loads((tmp_path / "summary.json").read_text())
@@ -41,3 +46,11 @@ def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch,
     assert len(seconds) == 9 and min(seconds.values()) > 0
     assert "faster" in capsys.readouterr().out  # "times" is on the line above where numbers are long
     assert (tmp_path / "bench.csv").read_text().count("\n") == 10
+
+
+def test_a_device_that_is_not_here_says_why():
+    reason = cuda_library.missing_device()
+    if reason is None:
+        pytest.skip("there is a GPU here")
+    with pytest.raises(BackendUnavailable, match=re.escape(reason)):
+        bench.task(compose("counts=[20]", "device=cuda", config="bench"))

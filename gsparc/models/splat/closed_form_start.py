@@ -27,6 +27,7 @@ from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat.left_out_images import LeftOut, means_and_variances
 from gsparc.models.target_rows import to_real, training_targets
 from gsparc.ops import Pose
+from gsparc.ops.transforms import full_precision
 from gsparc.processes.factor import Factor
 from gsparc.processes.features import Features, whitened_features
 from gsparc.processes.kernel import Kernel
@@ -107,7 +108,7 @@ class ImageEmissions:
 
 
 @torch.no_grad()
-@torch.autocast("cpu", enabled=False)  # a Gram matrix rounded to half precision has no Cholesky factor
+@full_precision  # a Gram matrix rounded to half precision has no Cholesky factor
 def solve_emissions(
     model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, process: Process
 ) -> LeftOut | None:
