@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.making import predict_map
@@ -78,7 +79,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     promise = read_or_gather(str(config.ckpt), settings)
     field = predict_map(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
-    lines = map_notes(field, coverage)
+    ends = None if promise is None else covered_between(field, predictor, promise, settings["other_end"])
+    lines = map_notes(field, coverage, ends)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
@@ -102,10 +104,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
         "promise/calibrated": int(promise is not None), **peak_memory(),
     }  # fmt: skip
-    if coverage is not None and promise is not None:
+    if coverage is not None and promise is not None and ends is not None:
         reach = promise.calibration(how.share).reach
-        # NaN alone differs from itself: figures that these rows do not tell are left out.
-        facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items() if value == value}
+        facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items()}
+        facts |= {"map/covered_low": ends[0], "map/covered_high": ends[1]}
         facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
     before = f"{facts['map/cells']} squares, {facts['map/stations']} station(s)"
     if field.calibrated:

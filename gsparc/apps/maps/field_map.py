@@ -50,6 +50,7 @@ class FieldMap:
         azimuth: (T,) that sectors face [deg from north], NaN of others.
         bands: (T,) carriers of the stations; () of one.
         site: (T,) int64 of the stations.
+        number: (T,) int64 of the stations in the model.
     """
 
     grid: Grid
@@ -73,6 +74,7 @@ class FieldMap:
     azimuth: np.ndarray = field(default_factory=lambda: np.zeros(0))
     bands: tuple[str, ...] = ()
     site: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    number: np.ndarray = field(default_factory=lambda: np.zeros(1, np.int64))
 
     @property
     def refused(self) -> np.ndarray:
@@ -152,32 +154,28 @@ def best_server(power_db: np.ndarray) -> np.ndarray:
 
 
 def server_chance(
-    power_db: np.ndarray, error_db: np.ndarray, usual_db: np.ndarray, floor_db: np.ndarray,
-    alike: np.ndarray | float = 0.0,
-) -> np.ndarray:  # fmt: skip
+    power_db: np.ndarray, error_db: np.ndarray, floor_db: np.ndarray, alike: np.ndarray | float = 0.0
+) -> np.ndarray:
     """Probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
 
     Errors are taken for normal. Given the strongest's own level its rivals are taken for independent: who
     beats one station is likelier to beat another, and the product of all chances alone is far too small.
 
     Args:
-        power_db, error_db: predicted, and expected errors; NaN where unknown.
-        usual_db: (T, 2) mean and deviation that a station has where it is unknown; NaN: it is left out there.
+        power_db, error_db: predicted, and expected errors; NaN where unknown, which counts as weaker: far
+            from where a station was measured it is some 25 dB below its usual level.
         floor_db: (T,) power below which a station is not told from noise; -inf: any is.
         alike: (T, n) correlations of errors with the strongest's: sectors of a site share its shadowing.
 
     Returns:
         NaN where no power is known.
     """
-    number, known = best_server(power_db), np.isfinite(power_db)
+    number = best_server(power_db)
     first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
     mean, spread = power_db[first, cell], error_db[first, cell]
-    # A station unknown in a cell may be heard all the same: as likely as it usually is.
-    rival, wrong = (np.where(known, one, usual_db[:, k, None]) for k, one in enumerate((power_db, error_db)))
     above = ndtr((mean - floor_db[first]) / spread)
     z = ndtri(1 - np.maximum(above, 1e-12) * SHARES)  # equally likely levels above the floor
-    # A station that nothing is known of anywhere is left out: it counts as beaten.
-    beaten = _chance_all_below(mean + spread * z, rival, wrong, alike, z, first)
+    beaten = _chance_all_below(mean + spread * z, power_db, error_db, alike, z, first)
     return np.where(number == REFUSED, np.nan, above * beaten).astype(np.float32)
 
 
@@ -186,8 +184,8 @@ def outage_probability(
 ) -> np.ndarray:
     """Probability (n,) that all of (T, n) powers lie below a threshold: who misses one may hear another.
 
-    Errors are normal; given the strongest's level its rivals are independent, as in `server_chance`. What is
-    unknown counts as below.
+    Errors are normal; given the strongest's level its rivals are independent, and what is unknown counts as
+    below, as in `server_chance`.
 
     Args:
         power_db, error_db, alike: see `server_chance`.
@@ -203,7 +201,10 @@ def _chance_all_below(
     limit: np.ndarray, rival: np.ndarray, wrong: np.ndarray, alike: np.ndarray | float, z: np.ndarray,
     first: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Chance (n,) that all of (T, n) rivals lie below limits (K, n), mean over K normal errors of `first`."""
+    """Chance (n,) that all of (T, n) rivals lie below limits (K, n), mean over K normal errors of `first`.
+
+    Unknown ones do.
+    """
     # Of a rival given the strongest: never 0, which would divide.
     left, total, cell = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), 0.0, np.arange(len(first))
     for level, error in zip(limit, z, strict=True):

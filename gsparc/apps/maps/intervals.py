@@ -21,6 +21,7 @@ MOST_BINS = 8
 PARTS = 5  # of blocks, that are calibrated without by turns
 ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
+LEAST_SPREAD = 0.1  # of the median deviation: of a station with few rows some are next to 0
 COMPLETED = 100  # passes over censored rows
 TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
 
@@ -71,6 +72,7 @@ class Calibration:
         tail: (Q,) quantiles `TAIL` of errors in expected errors; None where censored rows hide some of them.
         reach: beyond this distance nothing is said [m].
         station: (T,) what deviations of each are multiplied with before; of those not among them, 1.
+        least: deviation that smaller ones are taken for [dB].
     """
 
     share: float
@@ -80,6 +82,7 @@ class Calibration:
     tail: np.ndarray | None
     reach: float
     station: np.ndarray
+    least: float = 0.0
 
     def half_width(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
         """Half the interval (n,) [dB] at places of stations (n,); NaN out of reach."""
@@ -103,7 +106,7 @@ class Calibration:
         self, factor: np.ndarray, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray
     ) -> np.ndarray:
         own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
-        scaled = own * spread_db * np.interp(distance, self.distance, factor)
+        scaled = own * np.maximum(spread_db, self.least) * np.interp(distance, self.distance, factor)
         return np.where(distance <= self.reach, scaled, np.nan)
 
 
@@ -122,6 +125,8 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     if heard.sum() < LEAST_ROWS:
         fault = f"{heard.sum()} of them were held out, {LEAST_ROWS} at least are needed"
         raise ValueError(f"too few rows to test intervals ({fault}); promised=false draws without a promise")
+    least = LEAST_SPREAD * float(np.median(used.spread_db))
+    used = replace(used, spread_db=np.maximum(used.spread_db, least))
     blocks = len(np.unique(used.block))
     level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
     station = _of_stations(used, level)
@@ -143,7 +148,8 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
         tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
         apart = 1e-9 * max(float(np.abs(used.error).max()), 1.0)
         tail = tail + np.arange(len(tail)) * apart  # no two are equal
-    return Calibration(share, middle, half, rms, tail, float(np.quantile(used.distance, REACH)), station)
+    reach = float(np.quantile(used.distance, REACH))
+    return Calibration(share, middle, half, rms, tail, reach, station, least)
 
 
 def error_distribution(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
@@ -200,68 +206,41 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
 
 
 def interval_coverage(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Chances (n,) that a measurement lies in its interval, and widths (n,) [dB], NaN where nothing is said.
-
-    Of what was measured they are 0 or 1; a censored row's is that of the errors which its level allows.
-    """
+    """Tell whether measured levels (n,) lie in their intervals; widths (n,) [dB], NaN out of reach."""
     half = calibration.half_width(evidence.spread_db, evidence.distance, evidence.station)
-    return _inside(calibration, evidence, half), 2 * half
-
-
-def _inside(calibration: Calibration, evidence: Evidence, half: np.ndarray) -> np.ndarray:
-    side, mean = evidence.side, evidence.mean_db
-    expected = calibration.expected_error(evidence.spread_db, evidence.distance, evidence.station)
-    levels = mean - half, mean + half, evidence.level_db
-    low, high, bound = (calibration.probability_below(level, mean, expected) for level in levels)
-    allowed = np.where(side > 0, bound, 1 - bound)
-    both = np.where(side > 0, np.minimum(high, bound) - low, high - np.maximum(low, bound))
-    chance = np.clip(np.divide(both, allowed, out=np.zeros_like(both), where=allowed > 0), 0.0, 1.0)
-    measured = np.abs(evidence.level_db - mean) <= half
-    return np.where(np.isfinite(half), np.where(side == 0, measured, chance), 0.0)
+    return np.abs(evidence.level_db - evidence.mean_db) <= half, 2 * half
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often a promise held on blocks that its own calibration did not see.
+    """How often a promise held on measured rows of blocks that its own calibration did not see.
+
+    Rows beyond a level have none that an interval could hold.
 
     Attributes:
         share: of the rows in reach, that lay in their interval.
         width_db: mean width of intervals [dB].
-        reached: share of all rows that lay in reach.
         rows, blocks: tried.
-        own_share, own_width_db: of the intervals that the model states by itself.
-        heard_share, silent_share: of the rows with a level, and of those beyond one; NaN of none.
     """
 
     share: float
     width_db: float
-    reached: float
     rows: int
     blocks: int
-    own_share: float
-    own_width_db: float
-    heard_share: float
-    silent_share: float
 
 
 def cross_validate(evidence: Evidence, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
     part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
-    inside, own, width = (np.full(len(evidence), fill) for fill in (0.0, 0.0, np.nan))
-    half = float(norm.ppf((1 + share) / 2)) * evidence.spread_db
+    heard = evidence.side == 0
+    inside, width = np.zeros(len(evidence), bool), np.full(len(evidence), np.nan)
     for turn in range(min(PARTS, len(blocks))):
-        rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
-        calibration, own_part = calibrate(evidence.subset(rest), share), evidence.subset(tried)
-        inside[tried], width[tried] = interval_coverage(calibration, own_part)
-        own[tried] = _inside(calibration, own_part, half[tried])
+        rest, tried = np.flatnonzero(part != turn), np.flatnonzero((part == turn) & heard)
+        calibration = calibrate(evidence.subset(rest), share)
+        inside[tried], width[tried] = interval_coverage(calibration, evidence.subset(tried))
     known = np.isfinite(width)
-    return Coverage(
-        float(inside[known].mean()), float(width[known].mean()), float(known.mean()), int(known.sum()),
-        len(blocks), float(own[known].mean()), float(2 * half[known].mean()),
-        *(float(inside[part].mean()) if part.any() else np.nan
-          for part in (known & (evidence.side == 0), known & (evidence.side != 0))),
-    )  # fmt: skip
+    return Coverage(float(inside[known].mean()), float(width[known].mean()), int(known.sum()), len(blocks))
 
 
 def nearest_distances(

@@ -106,7 +106,7 @@ def predict_map(
         notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
-    usual, floor = _usual_levels(promise, numbers, noise_db)
+    floor = _hearing_floors(promise, numbers, noise_db)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
     overlap, errors_alike = np.full(grid.inside.size, np.nan, np.float32), alike.reshape(len(names), -1)
     for cells in _chunks(every, BANDS):
@@ -128,7 +128,7 @@ def predict_map(
         part = {
             "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
             "best_server": best, "sinr_db": sinr(power, load_of, noise_db, carrier),
-            "server_chance": server_chance(power, error, usual, floor, alike_here),
+            "server_chance": server_chance(power, error, floor, alike_here),
             "outage": field_map.outage_probability(power, error, threshold_db, alike_here, below),
         }  # fmt: skip
         for name, layer in part.items():
@@ -290,26 +290,19 @@ def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None, 
     return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
 
 
-def _usual_levels(
-    promise: Promise | None, numbers: np.ndarray, noise_db: float | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and deviation (T, 2) of each station's measured levels, and its floor (T,) [dB].
-
-    The floor is the level below which it is not heard, else the weakest but for 1 % that was measured of it.
-    """
-    least = -np.inf if noise_db is None else noise_db
-    usual, floor = np.full((len(numbers), 2), np.nan), np.full(len(numbers), least)
+def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: float | None) -> np.ndarray:
+    """Levels (T,) below which stations are not heard, else the weakest but for 1 % measured [dB]."""
+    floor = np.full(len(numbers), -np.inf if noise_db is None else noise_db)
     if promise is None:
-        return usual, floor
+        return floor
     for row, number in enumerate(numbers):
         own = promise.evidence.subset(np.flatnonzero(promise.evidence.station == number))
         if len(own):
-            usual[row] = own.level_db.mean(), own.level_db.std()
             quiet = own.level_db[own.side > 0]
             # The least level: those of lists are of their weakest cells, far above what is heard.
             # 1 %, not the least: one faulty row would place the floor anywhere.
-            floor[row] = max(least, quiet.min() if len(quiet) else np.quantile(own.level_db, 0.01))
-    return usual, floor
+            floor[row] = max(floor[row], quiet.min() if len(quiet) else np.quantile(own.level_db, 0.01))
+    return floor
 
 
 def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
@@ -326,4 +319,5 @@ def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
         "azimuth": np.zeros(0) if stations.sector is None else stations.sector[numbers, 0],
         "bands": tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier) if several else (),
         "site": number_sites(stations, stations.position)[numbers],
+        "number": numbers,
     }

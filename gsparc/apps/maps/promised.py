@@ -6,8 +6,6 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.intervals import Coverage
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
@@ -63,27 +61,27 @@ def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
     return learned
 
 
-def map_notes(field: FieldMap, coverage: Coverage | None) -> list[str]:
-    """Return what a reader of the map must know."""
+def map_notes(
+    field: FieldMap, coverage: Coverage | None, covered: tuple[float, float] | None = None
+) -> list[str]:
+    """Return what a reader of the map must know; `covered` is of `covered_between`."""
     notes = [*field.notes]
     figures = field.summarise()
     if (unsure := figures["map/server_unsure"]) and len(field.stations) > 1:
         notes.append(f"best_server: in {unsure:.1%} of squares (hatched) it is more likely another, or none")
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
-        notes.append(f"{1 - float(outage):.1%} of the predicted squares with {level}")
+        ends = "" if covered is None else " (90 % interval {:.1%} to {:.1%})".format(*covered)
+        notes.append(f"{1 - float(outage):.1%}{ends} of the predicted squares with {level}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
         own = "they are the model's own deviations, and no place is refused as too far from data"
         return [*notes, f"intervals are not tested: {own}"]
-    silent = f"unlisted rows have no level: the model itself expects {coverage.silent_share:.1%}, not a test"
-    apart = f" (of heard rows {coverage.heard_share:.1%}; {silent})"
-    apart = "" if np.isnan(coverage.silent_share) else apart
-    ours = f"{coverage.share:.1%} of them held{apart}, {coverage.width_db:.1f} dB wide in the mean"
-    own = f"uncalibrated {coverage.own_share:.1%}, {coverage.own_width_db:.1f} dB"
-    tested = f"tested on {coverage.rows} rows of {coverage.blocks} held-out blocks"
-    notes.append(f"{field.share:.0%} intervals, {tested}: {ours}; {own}")
+    tested = f"tested on {coverage.rows} heard rows of {coverage.blocks} held-out blocks"
+    held = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in their mean"
+    of_map = f"in the map {figures['map/width_db']:.1f} dB, the strongest's over predicted squares"
+    notes.append(f"{field.share:.0%} intervals, {tested}: {held}; {of_map}")
     if figures["map/refused"]:
         squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"
         notes.append(f"{squares} are refused: too far from what was measured")

@@ -126,7 +126,8 @@ def duplicate_warnings(levels: LinkLevels) -> list[str]:
     warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        warnings.append(f"copies (same place, station and level): {list_first(same)}; leave them out")
+        advice = "fine if measured twice (rows of a place stay on one side of a split), else leave them out"
+        warnings.append(f"copies (same place, station and level): {list_first(same)}; {advice}")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
         warnings.append(

@@ -1,0 +1,78 @@
+"""How surely a share of a map's squares is covered: near squares share their errors, and all share some."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.making import query_ends
+from gsparc.apps.maps.promise import Promise
+from gsparc.data.blocks import evenly_spaced
+from gsparc.prediction.predictor import Predictor
+
+SQUARES, STRONGEST, DRAWS = 300, 4, 400  # drawn together: squares, stations in each, times
+ENDS = (0.05, 0.95)
+
+
+def covered_between(
+    field: FieldMap, predictor: Predictor, promise: Promise, other_end: Sequence[float] | None = None
+) -> tuple[float, float]:
+    """Return the ends of the 90 % interval of the share of predicted squares that some station covers.
+
+    Errors of the strongest stations in a thinned grid are drawn together by the model's own covariance, each
+    as large as held-out blocks say.
+
+    Args:
+        field: a map with `threshold_db`.
+        predictor, promise, other_end: that it was made with, see `predict_map`.
+    """
+    level, error = (one.reshape(len(one), -1) for one in (field.power_db, field.expected_error_db))
+    known = np.flatnonzero(np.isfinite(level).any(0))
+    square = known[evenly_spaced(len(known), SQUARES)]
+    few = np.nan_to_num(level[:, square].astype(np.float64), nan=-np.inf)
+    station = np.argsort(-few, axis=0)[:STRONGEST]
+    rank, at = np.nonzero(np.isfinite(np.take_along_axis(few, station, axis=0)))
+    station = station[rank, at]
+    places, spread = field.grid.places(square)[at], error[station, square[at]]
+    covariance = _pair_covariance(predictor, places, field.number[station], promise.block_m, other_end)
+    covariance *= np.outer(spread, spread)
+    # The mean of all errors is known no better than the blocks tell it: the covariances hold none of it.
+    covariance += mean_error_variance(promise) + 1e-6 * spread.max() ** 2 * np.eye(len(at))
+    rng = np.random.default_rng(0)
+    drawn = few[station, at][:, None] + np.linalg.cholesky(covariance) @ rng.normal(size=(len(at), DRAWS))
+    best = np.full((len(square), DRAWS), -np.inf)
+    np.maximum.at(best, at, drawn)
+    share = (best >= field.threshold_db).mean(0)
+    low, high = np.quantile(share, ENDS) - share.mean() + 1 - np.nanmean(field.outage)
+    return max(float(low), 0.0), min(float(high), 1.0)
+
+
+def mean_error_variance(promise: Promise) -> float:
+    """Return the squared standard error of the mean error of measured rows, over held-out blocks [dB^2]."""
+    heard = promise.evidence.subset(np.flatnonzero(promise.evidence.side == 0))
+    error, block = heard.level_db - heard.mean_db, np.unique(heard.block, return_inverse=True)[1]
+    total = np.bincount(block.reshape(-1), error - error.mean())
+    return float((total**2).sum() / len(error) ** 2 * len(total) / max(len(total) - 1, 1))
+
+
+def _pair_covariance(
+    predictor: Predictor, places: np.ndarray, number: np.ndarray, block_m: float,
+    other_end: Sequence[float] | None,
+) -> np.ndarray:  # fmt: skip
+    """Covariance (n, n) of errors of stations (n,) at places (n, 3), in deviations of single measurements."""
+    if (joint := predictor.predict_joint(places[None], number)) is not None:
+        covariance, variance = joint.covariance[0] - np.diag(joint.noise), joint.covariance[0].diagonal()
+    else:
+        covariance, variance = np.zeros((len(places), len(places))), np.ones(len(places))
+        for one in np.unique(number):
+            own, stations = np.flatnonzero(number == one), predictor.site.stations
+            asking = predictor if stations is None else predictor.select_station(stations.name[one])
+            try:
+                left, noise = asking.covariance(**query_ends(asking.site, places[own], other_end))
+            except ValueError:  # no process: alike over half a block, as by shadowing of that length
+                left, noise = np.exp(-2 / block_m * cdist(places[own], places[own])), 0.0
+            covariance[np.ix_(own, own)], variance[own] = left, left.diagonal() + noise
+    return covariance / np.sqrt(np.outer(variance, variance))
