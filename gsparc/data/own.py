@@ -180,7 +180,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
         station=links.station, place=links.place, censored=links.censored, run=links.run,
-        position_std=position_std,
+        position_std=position_std, file_rows=raw.arrays["file_row"].tolist(),
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":

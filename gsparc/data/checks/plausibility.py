@@ -15,7 +15,9 @@ import numpy as np
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.data.errors import Severe, list_first
 from gsparc.data.schema import Measurements
+from gsparc.data.selection import FROM_ROW
 
+UNNAMED = "the station"  # a single one, of a file without stations
 NAMED = 5  # wild rows that a station may have, however few its rows
 SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
@@ -176,14 +178,10 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
             f"{rows[step.last]} and {rows[step.first]}"
             for step in own
         )
-        after = [rows[step.first].partition(" ") for step in own]
-        named = all(what == "row" and number.isdigit() for what, _, number in after) and len(names) > 1
-        setting = f"{{{names[t]}:[{','.join(number for *_, number in after)}]}}"
-        warnings.append(
-            f"{who} {said}, which the places do not explain: another gain or antenna? "
-            f"dataset.level_steps={setting if named else '{STATION:[ROW]}'} makes it another station from "
-            "there on"
-        )
+        first = ",".join(str(levels.file_rows[step.first]) for step in own)
+        setting = f"'dataset.level_steps={{{names[t]}:[{first}]}}' (rows from 0) makes it another station"
+        setting = "" if names[t] == UNNAMED else f" {setting} from there on"
+        warnings.append(f"{who} {said}, which the places do not explain: another gain or antenna?{setting}")
     return warnings
 
 
@@ -269,6 +267,7 @@ class LinkLevels:
         station: (n,) int64.
         level_db: (n,) [dB], NaN where there is no value.
         rows: (n,) what messages call the row of the file.
+        file_rows: (n,) its number from 0.
         names: (T,) of the stations.
         station_position: (T, 3), in the world [m]; None where it is not known.
     """
@@ -277,6 +276,7 @@ class LinkLevels:
     station: np.ndarray
     level_db: np.ndarray
     rows: list[str]
+    file_rows: Sequence[int]
     names: list[str]
     station_position: np.ndarray | None
 
@@ -304,6 +304,12 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     # What was not heard is known to be weak; a file with a station for each place has no empty cells.
     if data.censored is None and len(first) < len(data):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
+    parts = [] if stations is None else [name.split(FROM_ROW) for name in stations.name]
+    for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
+        # A part of a station is not absent before its first row or after its last.
+        at, own = absent // count, which[station == t]
+        within = (at > own.min(initial=len(first))) & (at < own.max(initial=0))
+        absent = absent[(absent % count != t) | within]
     order = np.argsort(np.concatenate([rows, first[absent // count]]), kind="stable")
     of_row = np.concatenate([rows, first[absent // count]])[order]
     of_link = np.concatenate([station[rows], absent % count])[order]
@@ -312,5 +318,6 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     known = None if site.static_position is None else site.static_position[None]
     known = known if stations is None else stations.position
     known = None if known is None else known + site.origin
-    names = ["the station"] if stations is None else list(stations.name)
-    return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, names, known)
+    names = [UNNAMED] if stations is None else list(stations.name)
+    number = np.array(data.file_rows or range(len(data)))[of_row].tolist()
+    return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, number, names, known)

@@ -11,6 +11,7 @@ from gsparc.data.checks import plausibility
 from gsparc.data.checks.level_steps import detect_level_steps
 from gsparc.data.checks.plausibility import LinkLevels, link_levels
 from gsparc.data.checks.unit_warnings import unit_warnings
+from gsparc.data.datasets.own import read_any
 from gsparc.data.own import from_arrays
 
 
@@ -31,7 +32,8 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     rows, count = level_db.shape
     return LinkLevels(
         np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
-        [f"row {i // count}" for i in range(rows * count)], names, station_position,
+        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count).tolist(), names,
+        station_position,
     )  # fmt: skip
 
 
@@ -211,3 +213,26 @@ def test_a_station_for_each_place_is_no_outage_of_the_others():
     links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
     posts = np.array([[*station, 5.0], [0.0, 0, 5]])
     assert not warnings_of(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))
+
+
+def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
+    """Warnings name lines, the setting counts rows: `{STATION:[ROW]}` was left to be filled in."""
+    place, level, station = walk(4, 200)
+    place, other = place + 1e-3 * np.arange(200)[:, None], walk(3, 400)[1]
+    place, level = np.concatenate([place, place + 0.5]), np.concatenate([level, level + 20])
+    text = "# a remark\nx,y,A,B\n" + "".join(
+        f"{x:.2f},{y:.2f},{a:.2f},{b:.2f}\n" for (x, y), a, b in zip(place, level, other, strict=True)
+    )
+    posts = f"name,x,y\nA,{station[0]:.1f},{station[1]:.1f}\nB,0,0\n"
+    (tmp_path / "walk.csv").write_text(text)
+    (tmp_path / "posts.csv").write_text(posts)
+    reading = read_any(tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv")
+    levels = link_levels(reading.data)
+    steps = plausibility.find_level_steps(levels)
+    said = plausibility.step_warnings(levels, steps)[0]
+    first = levels.file_rows[steps[0][1].first]
+    assert f"and line {first + 3}," in said and f"'dataset.level_steps={{A:[{first}]}}'" in said
+    # Once it is set, rows before and after the step were called outages of its parts.
+    parted = read_any(tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv", level_steps={"A": [first]})
+    assert f"A from row {first}" in parted.data.site.stations.name
+    assert plausibility.gap_warnings(link_levels(parted.data)) == []
