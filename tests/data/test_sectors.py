@@ -53,6 +53,9 @@ def test_a_list_of_sites_is_read_whole(tmp_path):
     unread = [note for note in reading.notes if "not read: column 'Vendor'" in note]
     assert len(unread) == 1 and isinstance(unread[0], Caution)
     assert not any("Height" in note and "not used" in note for note in reading.notes)
+    matched = [note for note in reading.notes if "stations are matched by" in note]
+    assert len(matched) == 1 and matched[0].endswith("sites by 'Site'"), matched
+    assert "'Cell Name'" in matched[0] and "'PCI+DL EARFCN'" in matched[0]
 
 
 def test_a_cell_number_that_two_listed_stations_share_is_named(tmp_path):
@@ -125,3 +128,13 @@ def test_levels_without_the_suffix_of_the_others_are_named(tmp_path):
     notes = [note for note in read_any(drive).notes if isinstance(note, Caution)]
     said = "columns 'c' and 'd' hold values like these levels and are not used: of stations, too?"
     assert any(note.startswith(said) for note in notes), notes
+
+
+def test_stations_without_heights_stood_at_0_m_with_no_warning(tmp_path):
+    """The note was one of a dozen."""
+    _, drive, heads, sites = drive_of(tmp_path)
+    flat = heads.index("Antenna Height [m]")
+    heads, sites = heads[:flat] + heads[flat + 1 :], [row[:flat] + row[flat + 1 :] for row in sites]
+    reading = read_any(drive, stations_file=write(tmp_path / "sites.csv", heads, sites))
+    said = next(note for note in reading.notes if "no height of the stations: taken as 0 m" in note)
+    assert isinstance(said, Caution)

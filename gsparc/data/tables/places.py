@@ -236,7 +236,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     notes += more
     sites = number_sites(sheet)
     if sites is not None:
-        sectors["station_site"] = sites
+        sectors["station_site"] = sites[1]
     if coordinates is not None and coordinates.height is None and "height" in sectors:
         coordinates = replace(coordinates, height=np.nan_to_num(sectors["height"], nan=UNKNOWN_HEIGHT))
     if coordinates is None:
@@ -245,11 +245,15 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         return None, notes
     names = sheet.joined(c.head for c in chosen["station"])
     every = {"+".join(heads): _named(sheet, heads) for heads in aliases}
-    other = [each for each in every.values() if len(set(each)) == len(each)]
+    unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
+    other = [*unique.values()]
     repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
+    by = ["+".join(c.head or "" for c in chosen["station"]), *unique]
     # Names that repeat, like sites in a list of sectors, give way to those of a column without copies.
     if other and len(set(names.tolist())) < len(names) and (names != "").all():
-        names = np.array(other[0])
+        names, by = np.array(other[0]), by[1:]
+    of_sites = "" if sites is None else f", sites by {sites[0]!r}"
+    notes.append(f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}")
     for i in np.flatnonzero(names == ""):
         sheet.problems.add(f"{sheet.source}, {sheet.rows[i]}", "no name; expected the station's")
     values, counts = np.unique(names, return_counts=True)

@@ -391,7 +391,8 @@ class Builder:
         """Add positions [m], or degrees and heights."""
         height = where.height
         if height is None:
-            self.notes.append(f"no height of the {ENDS.get(name, 'stations')}: taken as {UNKNOWN_HEIGHT:g} m")
+            said = f"no height of the {ENDS.get(name, 'stations')}: taken as {UNKNOWN_HEIGHT:g} m"
+            self.notes.append(said if name in ENDS else Caution(said))
         # Equal heights are kept as one: schema arrays of shape () hold for all rows.
         elif len(np.unique(height)) == 1:
             height = height[:1]

@@ -79,13 +79,13 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     return found, notes
 
 
-def number_sites(sheet: Sheet) -> np.ndarray | None:
-    """Number (T,) float64 the sites that a column of the list names; None where none does."""
+def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:
+    """Return the head of a column that names the sites of a list, and their numbers (T,) float64, if any."""
     for head in sheet.heads:
         words = sheet.words(head) if " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)
         number, names = pd.factorize(words)
         if 1 < len(names) < len(words) and (words != "").all():
-            return number.astype(np.float64)
+            return head, number.astype(np.float64)
     return None
 
 
