@@ -221,7 +221,9 @@ def _foreign(
     # The same rows under another name or seed of split.
     if same and hash_indices(before.folds) == hash_indices(chosen.folds):
         return None, 0, trained
-    learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
+    tested, learned = np.concatenate([fold.test for fold in chosen.folds]), 0
+    unlisted = int((data.censored_side(tested) > 0).sum())
+    listed = f" ({len(tested) - unlisted} listed, {unlisted} unlisted)" * (unlisted > 0)
     for old, fold in zip(before.folds, chosen.folds, strict=True):
         # Rows of `val` decide steps and weights: they count as learned.
         rows = np.concatenate([old.train, old.val])
@@ -233,7 +235,7 @@ def _foreign(
             learned += int((gaps < SAME_ROW_M).sum())
     what += f" ({before.name})" * same
     how = "were" if same else "are at places that were"
-    return f"{what}: {learned} of these {count} test rows {how} TRAINED on", learned, trained
+    return f"{what}: {learned} of these {len(tested)} test rows{listed} {how} TRAINED on", learned, trained
 
 
 def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[Measurements, Split] | None:

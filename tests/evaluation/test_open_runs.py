@@ -9,8 +9,9 @@ import pytest
 import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.splits import Fold, Split, SplitSettings, make_split
 from gsparc.data.tables.read import parse_table
+from gsparc.evaluation import open_runs
 from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.open_runs import Opened, align_to_site, open_files
 from gsparc.evaluation.scores import score_methods
@@ -101,6 +102,19 @@ def test_places_in_degrees_were_said_to_be_apart_from_a_model_s_of_an_unknown_or
     own = {"name": "own", "file": str(tmp_path / "drive.npz")}
     run = open_files([tmp_path / "model.ckpt"], own, {"name": "random"})
     assert run.learned is None and "about an unknown origin" in run.foreign
+
+
+def test_test_rows_of_a_drive_counted_unlisted_cells_as_lines(tmp_path, monkeypatch):
+    """`5400 test rows` of a file of 1,800 lines."""
+    level = np.linspace(-90, -50, 80)
+    gsparc.fit(rx=WALK, rssi=level, model="mean", save=tmp_path / "model.ckpt")
+    level[:30] = -np.inf
+    np.savez(tmp_path / "drive.npz", rx_position=WALK, rssi_db=level, sensitivity_db=np.array(-95.0))
+    own = {"name": "own", "file": str(tmp_path / "drive.npz")}
+    all_rows = Split("all", (Fold(np.arange(80), np.arange(0), np.arange(0)),), "")
+    monkeypatch.setattr(open_runs, "_trained", lambda stored, data: (data, all_rows))
+    said = open_runs.open_files([tmp_path / "model.ckpt"], own, None, others_whole=True).foreign
+    assert "80 of these 80 test rows (50 listed, 30 unlisted) are at places" in said
 
 
 def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations():
