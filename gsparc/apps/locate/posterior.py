@@ -112,8 +112,8 @@ class Posterior:
                 break
         return place
 
-    def modes(self, share: float) -> list[np.ndarray]:
-        """Cells of each connected part of the area that holds a share of the mass, heaviest first."""
+    def count_modes(self, share: float) -> int:
+        """Return how many connected parts the area that holds a share of the mass has."""
         some = densest_cells(self.log_density, self.cells.volume, share)
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
@@ -124,5 +124,4 @@ class Posterior:
         graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some)))
         part = connected_components(graph, directed=False)[1]
         mass = np.bincount(part, self.mass[some])
-        order = [one for one in np.argsort(-mass) if one == mass.argmax() or mass[one] >= MODE]
-        return [some[part == one] for one in order]
+        return max(int((mass >= MODE).sum()), 1)

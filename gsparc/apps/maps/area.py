@@ -44,11 +44,6 @@ class Grid:
     step: float
     inside: np.ndarray
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(ny, nx)."""
-        return len(self.y), len(self.x)
-
     def places(self, cells: np.ndarray | None = None) -> np.ndarray:
         """World places (n, 3) [m] of `cells` (n,), numbers into the flat map; None: of those inside."""
         chosen = np.flatnonzero(self.inside) if cells is None else cells

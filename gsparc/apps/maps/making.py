@@ -87,7 +87,7 @@ def predict_map(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
-    values: dict[str, Any] = field_map.empty_layers(len(names), grid.shape)
+    values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     stride = _stride(grid, promise, tolerance_db)
     every, computed = np.flatnonzero(grid.inside), 0
     joint = joint_levels(predictor, grid.places(every[:1]), numbers) is not None
@@ -97,7 +97,7 @@ def predict_map(
         chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
         ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
         parts, count = sample_adaptively(ask, grid.inside, stride, tolerance_db)
-        parts = parts.reshape(-1, size, *grid.shape)
+        parts = parts.reshape(-1, size, *grid.inside.shape)
         values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
         alike[chosen] = parts[2] if joint else 0.0
         computed += count * size
@@ -113,12 +113,12 @@ def predict_map(
         mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
         far = np.zeros(mean.shape)
         if promise is not None:
-            local = to_local(site, grid.places(cells), other_end, site.static_end is None)
+            local = to_local(site, grid.places(cells), other_end)
             far = np.stack([promise.distance(local, number) for number in numbers])
-        half = calibration.half_width(spread, far, numbers[:, None])
+        half, error = calibration.half_and_error(spread, far, numbers[:, None])
         # The strongest before anything is refused, to which `alike` is the correlation.
         first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
-        error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
+        error = np.where(np.isfinite(mean), error, np.nan)
         # To float32 before comparing: what is stored decides the best server.
         power, error = mean.astype(np.float32), error.astype(np.float32)
         best = best_server(power)
@@ -137,7 +137,7 @@ def predict_map(
     if promise is not None and not np.isfinite(values["power_db"]).any():
         fault = f"every square lies more than {calibration.reach:.3g} m from what was measured"
         raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
-    extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.shape)}
+    extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.inside.shape)}
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
         grid, **values, share=share, calibrated=promise is not None,
@@ -266,28 +266,23 @@ def query_ends(
     return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other_end), places.shape)}
 
 
-def read_place(name: str, value: Any) -> np.ndarray:
-    """(3,) [m] of the setting `name`; `DataError` where it is no place."""
+def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
+    """(3,) [m] of the setting `name`, with 2 `axes` also (2,); `DataError` where it is no place."""
     place = finite_array(value)
-    if place.shape != (3,):
-        raise DataError(f"{name}={value}: three finite numbers [m] are needed")
+    if place.shape not in ((axes,), (3,)):
+        raise DataError(f"{name}={value}: {('two', 'three')[axes - 2]} finite numbers [m] are needed")
     return place
 
 
-def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None, both: bool) -> np.ndarray:
-    """World places (n, 3) of the moving end as local ones, (n, 6) of transmitter and receiver if `both` [m].
+def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) -> np.ndarray:
+    """World places (n, 3) of the moving end as local ones, (n, 6) of both ends where both moved [m].
 
     Raises:
-        DataError: both are needed, and nobody says where the other end stands.
+        DataError: both moved, and nobody says where the other end stands.
     """
-    local = places - site.origin
-    if not both:
-        return local
-    if site.static_position is None and other_end is None:
-        raise DataError(OTHER_END)
-    still = np.asarray(other_end) - site.origin if site.static_position is None else site.static_position
-    pair = np.broadcast_to(still, local.shape), local
-    return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
+    ends = query_ends(site, places, other_end)
+    moved = [end for end in ("tx", "rx") if end in ends]
+    return np.hstack([ends[end] - site.origin for end in moved])
 
 
 def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: float | None) -> np.ndarray:

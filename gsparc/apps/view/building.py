@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,13 +15,10 @@ from gsparc.apps.view.answer import SILENT_DB, Answer
 from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly_spaced
-from gsparc.data.schema import LIGHT, Site
+from gsparc.data.schema import ENDS, LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
 
-log = logging.getLogger(__name__)
-
-WORDS = ("transmitter", "receiver")  # that stand still
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
 DOT = 0.01  # width of a measured place, of the extent of the site
@@ -42,8 +38,8 @@ VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "r
 
 def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
-    points = [viewed.box()]  # where was measured, and the ends that stand
-    points += [place[None] for name in viewed.stations if (place := viewed.static_place(name)) is not None]
+    stands = {name: at for name in viewed.stations if (at := viewed.static_place(name)) is not None}
+    points = [viewed.box(), *(at[None] for at in stands.values())]
     if viewed.site.static_end is None:
         points.append(viewed.site.box + viewed.site.origin)
     frame = Frame.around(np.concatenate(points))
@@ -58,12 +54,10 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
         parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
     if seen is not None:
         parts.append(_measured_part(seen, legends, extent))
-    for name in viewed.stations:
-        place = viewed.static_place(name)
-        if place is not None:
-            named = len(viewed.stations) <= MOST_NAMES or name == station
-            text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
-            parts.append(Mark(f"station {name or ''}".strip(), place, text))
+    for name, place in stands.items():
+        named = len(viewed.stations) <= MOST_NAMES or name == station
+        text = (name or ENDS[viewed.site.static_end or "tx"]) if named else ""
+        parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin
     for number, plane in enumerate(objects.planes):

@@ -54,7 +54,7 @@ def wait(until, seconds=20.0):
 
 
 def settle(session):
-    assert wait(lambda: not len(session.work)), "work is left"
+    assert wait(lambda: not session.work._jobs), "work is left"
 
 
 def objects():
@@ -213,7 +213,7 @@ def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
         assert wait(lambda: set(server.sessions) == {one.number})
         one.drag([40.0, 10.0, 1.5])
         assert wait(lambda: "receiver at 40.00, 10.00" in one.session.answer_text.content)
-        assert wait(lambda: not len(server.work)) and server.address.startswith("http://127.0.0.1:")
+        assert wait(lambda: not server.work._jobs) and server.address.startswith("http://127.0.0.1:")
     finally:
         server.stop()
 

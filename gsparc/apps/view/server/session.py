@@ -18,10 +18,11 @@ from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, dr
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import Plane, plane_sheet, refine_plane, weakest_place
-from gsparc.apps.view.reasons import ENDS, answer_markdown, explain_level, legend_html
+from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html
 from gsparc.apps.view.scene import EXTENT, Points
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView
+from gsparc.data.schema import ENDS
 
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
