@@ -156,7 +156,5 @@ def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: flo
     lags = np.arange(len(tones_hz))
     values = np.array([(unit[:, lag:] * unit[:, : len(tones_hz) - lag].conj()).mean() for lag in lags])
     step = float(np.diff(np.sort(tones_hz)).min())
-    wanted = np.arange(count) * spacing_hz
-    real, imaginary = (np.interp(wanted, lags * step, part) for part in (values.real, values.imag))
     # By lag 0, where `values` is 1 up to rounding and masked tones.
-    return (real + 1j * imaginary) / values[0].real
+    return np.interp(np.arange(count) * spacing_hz, lags * step, values) / values[0].real

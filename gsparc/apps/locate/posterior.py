@@ -75,9 +75,8 @@ class Posterior:
     @cached_property
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
-        blurred = np.zeros(len(self.cells), bool)
-        blurred[densest_cells(self.sharp, self.cells.volume, BLURRED)] = True
-        return blurred
+        densest = densest_cells(self.sharp, self.cells.volume, BLURRED)
+        return np.isin(np.arange(len(self.cells)), densest)
 
     def _density(self, places: np.ndarray) -> np.ndarray:
         """Of the cells that are blurred, at places (m, 3)."""

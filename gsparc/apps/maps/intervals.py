@@ -140,8 +140,6 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     tail = None
     if heard.all():
         tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
-        apart = 1e-9 * max(float(np.abs(used.error).max()), 1.0)
-        tail = tail + np.arange(len(tail)) * apart  # no two are equal
     reach = float(np.quantile(used.distance, REACH))
     return Calibration(share, middle, half, rms, tail, reach, station, least)
 

@@ -33,7 +33,6 @@ CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
 BANDS = 1 << 16  # cells at a time of what follows from predictions
-OTHER_END = "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
 
 
 def predict_map(
@@ -88,8 +87,10 @@ def predict_map(
         grid, promise = replace(grid, inside=first), None
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
-    stride = _stride(grid, promise, tolerance_db)
-    every, computed = np.flatnonzero(grid.inside), 0
+    every, computed, stride = np.flatnonzero(grid.inside), 0, 1
+    if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
+        # Cells asked about everywhere are no farther apart than what was measured.
+        stride = max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
     joint = joint_levels(predictor, grid.places(every[:1]), numbers) is not None
     alike = np.zeros_like(values["power_db"])
     size = len(names) if joint else 1  # stations that are asked about at once
@@ -198,13 +199,6 @@ def _chunks(rows: np.ndarray, size: int) -> list[np.ndarray]:
     return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
-def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
-    """Cells between those that are asked about everywhere: no farther apart than what was measured."""
-    if tolerance_db <= 0 or grid.inside.sum() <= ALL_CELLS or promise is None:
-        return 1
-    return max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
-
-
 def _asker(
     predictor: Predictor, joint: bool, grid: Grid, other_end: Sequence[float] | None,
     names: Sequence[str], numbers: np.ndarray,
@@ -262,7 +256,7 @@ def query_ends(
             raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
         return {site.moving_end: places}
     if other_end is None:
-        raise DataError(OTHER_END)
+        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
     return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other_end), places.shape)}
 
 

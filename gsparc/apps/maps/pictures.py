@@ -276,8 +276,7 @@ def draw_measurement_plan(
 ) -> None:
     """Expected error before and after, the chosen places, and how it falls."""
     left, right, low, high = batch.grid.extent
-    wide = (right - left) / max(right - left, high - low)
-    tall = (high - low) / max(right - left, high - low)
+    wide, tall = np.array([right - left, high - low]) / max(right - left, high - low)
     figure, ((before, after, curve),) = panels(
         11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
     )

@@ -53,7 +53,10 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
         edges = corners[1] - corners[0], corners[3] - corners[0]
         parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
     if seen is not None:
-        parts.append(_measured_part(seen, legends, extent))
+        chosen = evenly_spaced(len(seen.places), MOST_POINTS)
+        legends[VALUES] = legend = Legend.over(seen.label, seen.values[chosen])
+        colours = legend.to_colours(seen.values[chosen])
+        parts.append(Points(VALUES, seen.places[chosen], colours, DOT * extent))
     for name, place in stands.items():
         named = len(viewed.stations) <= MOST_NAMES or name == station
         text = (name or ENDS[viewed.site.static_end or "tx"]) if named else ""
@@ -67,7 +70,9 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
         parts.append(_mesh(f"box {number}", box_faces(*box), BOX, 0.35))
     cloud = model_gaussians(viewed, station, seen)
     if cloud is not None:
-        parts.append(_cloud_part(cloud, legends, extent))
+        legends[GAUSSIANS], colours = cloud_colours(cloud)
+        size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
+        parts.append(Points(GAUSSIANS, cloud.means, colours, size))
     faces = np.array(box_faces(*viewed.box()))
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
     parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
@@ -75,19 +80,6 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
     return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
-
-
-def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
-    chosen = evenly_spaced(len(measured.places), MOST_POINTS)
-    places, values = measured.places[chosen], measured.values[chosen]
-    legends[VALUES] = Legend.over(measured.label, values)
-    return Points(VALUES, places, legends[VALUES].to_colours(values), DOT * extent)
-
-
-def _cloud_part(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> Part:
-    legends[GAUSSIANS], colours = cloud_colours(cloud)
-    size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
-    return Points(GAUSSIANS, cloud.means, colours, size)
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:

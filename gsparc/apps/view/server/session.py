@@ -38,7 +38,6 @@ class Session:
         self.station = self.chosen_station = view.viewed.stations[0]
         self.one = view.station(self.station)
         self.places = {end: np.asarray(at, float) for end, at in view.initial_places(self.station).items()}
-        self.answers = 0  # that were shown
         self.plane: Plane | None = None
         self.visited: list[np.ndarray] = []  # weak places of it, one after another
         self.power: Legend | None = None  # of the plane, where it is predicted
@@ -214,7 +213,6 @@ class Session:
             self.answer_text.content = f"**{error}**"
             return
         self._show(answer)
-        self.answers += 1
         # The picture has a key of its own: a later answer replaces it before it is drawn.
         self.work.put((self.client.client_id, "panel"), partial(self._panel_of, answer))
         yield
