@@ -48,7 +48,7 @@ class Posterior:
         if not self.spread:
             return self.sharp
         # Cells beyond the blurred ones stay sharp: blurring them all would cost G^2.
-        density = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
+        density = self._parts(self.cells.centre)[0].sum(1) + np.where(self._blurred, 0.0, np.exp(self.sharp))
         logarithm = np.log(density + LEAST)
         # Normalised again: densities at centres do not sum to 1, and a blur leaves the site.
         return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.volume))
@@ -64,7 +64,7 @@ class Posterior:
         if not self.spread:
             return float(self.sharp[here])
         rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
-        return float(np.log(self._density(place[None])[0] + rest + LEAST))
+        return float(np.log(self._parts(place[None])[0].sum() + rest + LEAST))
 
     def mass_above(self, place: np.ndarray) -> float:
         """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
@@ -77,10 +77,6 @@ class Posterior:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
         densest = densest_cells(self.sharp, self.cells.volume, BLURRED)
         return np.isin(np.arange(len(self.cells)), densest)
-
-    def _density(self, places: np.ndarray) -> np.ndarray:
-        """Of the cells that are blurred, at places (m, 3)."""
-        return np.asarray(self._parts(places)[0].sum(1))
 
     def _parts(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What b blurred cells add to the density at places (m, b), their centres and precisions (b, d)."""

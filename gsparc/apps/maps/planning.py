@@ -135,7 +135,7 @@ def plan_measurements(
     before, before_db = mean_error(unknown), _expected(unknown, wanted)
     chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour)
     walk = (walkable is not None if route is None else route) or route_m is not None
-    order = np.array([chosen.index(one) for one in tour.stops], np.int64) if walk else np.arange(len(chosen))
+    order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if walk else chosen)], np.int64)
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if walk else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
