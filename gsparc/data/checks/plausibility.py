@@ -232,7 +232,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
             often = count >= FEW * len(used) and len(around) > 0
             (faint if often and np.median(around) < weak else plain)[name] = count
     warnings = [
-        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: an outage; "
+        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: off, or not listed; "
         "these rows are not used"
         for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2])
     ]

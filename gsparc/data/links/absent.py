@@ -8,6 +8,7 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.plausibility import find_marks
+from gsparc.data.errors import Severe
 from gsparc.data.links.strongest import StrongestLists, number_lists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
@@ -33,8 +34,11 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
     check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
 
 
-def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
-    """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out."""
+def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) -> None:
+    """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out.
+
+    Not `wanted`, lists of the strongest are said to flatter the figures of what they list.
+    """
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
     whole = levels.ndim == 1 and "mask" not in arrays
@@ -45,7 +49,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
-    if not lists.are_strongest():
+    strongest = lists.are_strongest()
+    if not wanted:
+        flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
+        said = f"lists of the {lists.length} strongest of {count} stations with dataset.absent=unknown"
+        check.notes += [Severe(f"{said}: {flattered}; leave absent out")] if strongest else []
+        return
+    if not strongest:
         # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
         said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
         found = None if said else lists.below_floor()
