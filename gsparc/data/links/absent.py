@@ -52,8 +52,8 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
     strongest = lists.are_strongest()
     if not wanted:
         flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
-        said = f"lists of the {lists.length} strongest of {count} stations with dataset.absent=unknown"
-        check.notes += [Severe(f"{said}: {flattered}; leave absent out")] if strongest else []
+        unknown = f"lists of the {lists.length} strongest of {count} stations with dataset.absent=unknown"
+        check.notes += [Severe(f"{unknown}: {flattered}; leave absent out")] if strongest else []
         return
     if not strongest:
         # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
