@@ -19,19 +19,28 @@ UNLISTED_EACH = 2  # rows of what is not listed for one that is
 
 
 def add_absent(check: Checker, measured: str, count: int) -> None:
-    """Add a row that was not heard for each place and station, of `count`, without one."""
+    """Say that each of `count` stations without a level at a place where others have one was not heard."""
     if measured != "rssi_db":
         return check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
     arrays = check.raw.arrays
+    if arrays["rssi_db"].ndim != 1:
+        return None  # refused where values are read
     _, first, of_place = np.unique(arrays["place"], return_index=True, return_inverse=True)
+    of_place = of_place.reshape(-1)
+    known = ~np.isnan(arrays["rssi_db"])
+    some = np.bincount(of_place, known) > 0
     # Links are numbered place by station, so that those without a row are a set difference.
-    lost = np.setdiff1d(np.arange(len(first) * count), of_place.reshape(-1) * count + arrays["station"])
+    lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + arrays["station"])
+    lost = lost[some[lost // count]]
     floor = _floors(arrays, count)
     # Minus infinity lies below whatever turns out to be the limit of hearing.
     _repeat(check, np.r_[: len(of_place), first[lost // count]], lost % count)
     if floor is not None and floor.ndim:
         check.raw.arrays["sensitivity_db"][len(of_place) :] = floor[lost % count]
-    check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
+    empty = np.flatnonzero(~known & some[of_place])  # cells of a wide table
+    check.raw.arrays["rssi_db"][empty] = -np.inf
+    silent = len(lost) + len(empty)
+    check.notes.append(f"{silent} links without a level were not heard, as dataset.absent=silent says")
 
 
 def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) -> None:
