@@ -162,19 +162,15 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
     """
     before = stored.configuration.get(group)
     before = before if isinstance(before, dict) else {}
-    now = overrides or {}
-    other = now.get("name") not in (None, before.get("name"))
-    settings = _replace({} if now.get("_target_") is not None or other else before, now)
+    now = {key: value for key, value in (overrides or {}).items() if value is not None}
+    if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
+        before = {}
+    settings = {**before, **now}
+    for key in [key for key in now if now[key] and isinstance(before.get(key), dict)]:
+        settings[key] = {**before[key], **now[key]}  # such as columns; an empty group replaces all of it
     if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")
     return settings
-
-
-def _replace(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """`before` with what is not null in `now`, and so within groups; an empty one replaces a whole one."""
-    given = {key: value for key, value in now.items() if value is not None}
-    groups = {key: before[key] for key in given if isinstance(before.get(key), dict) and given[key]}
-    return {**before, **given, **{key: _replace(group, given[key]) for key, group in groups.items()}}
 
 
 def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:

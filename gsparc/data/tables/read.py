@@ -360,9 +360,7 @@ class Builder:
         assert self.listed is not None
         index = pd.Index(self.listed.names).get_indexer(words)
         self.arrays |= self.listed.extra
-        heard = set(index.tolist())
-        silent = [name for i, name in enumerate(self.listed.names) if i not in heard]
-        self._note_silent("in no row, and kept", silent)
+        self._note_silent("in no row, and kept", np.delete(self.listed.names, index).tolist())
         return replace(self.listed, index=index)
 
     def _note_silent(self, where: str, names: list[str]) -> None:
