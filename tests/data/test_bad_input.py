@@ -258,7 +258,7 @@ def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     assert "own.npz, " in said and "set_int_max_str_digits" not in said
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     ("dtype", "unit"),
     [(np.complex128, unit) for unit in (1e-310, 1e-200, 1e200, 1e300)]
@@ -272,7 +272,7 @@ def test_channels_in_units_at_the_edge_of_numbers(csi_arrays, dtype, unit):
     assert np.abs(tiny.target - plain.target).max() < tolerance * np.abs(plain.target).max()
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("value", [1e39, 1.7e308])
 def test_a_channel_beyond_float32_is_refused_without_a_warning_before(csi_arrays, value):
     channels = csi_arrays["csi"].astype(np.complex64)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.field_map import FieldMap
@@ -12,6 +13,7 @@ from gsparc.apps.maps.making import query_ends
 from gsparc.apps.maps.promise import Promise
 from gsparc.data.blocks import evenly_spaced
 from gsparc.prediction.predictor import Predictor
+from gsparc.processes.factor import Factor
 
 SQUARES, STRONGEST, DRAWS = 300, 4, 400  # drawn together: squares, stations in each, times
 ENDS = (0.05, 0.95)
@@ -42,7 +44,8 @@ def covered_between(
     # The mean of all errors is known no better than the blocks tell it: the covariances hold none of it.
     covariance += mean_error_variance(promise) + 1e-6 * spread.max() ** 2 * np.eye(len(at))
     rng = np.random.default_rng(0)
-    drawn = few[station, at][:, None] + np.linalg.cholesky(covariance) @ rng.normal(size=(len(at), DRAWS))
+    lower = Factor.from_gram(torch.from_numpy(covariance)).lower.numpy()
+    drawn = few[station, at][:, None] + lower @ rng.normal(size=(len(at), DRAWS))
     best = np.full((len(square), DRAWS), -np.inf)
     np.maximum.at(best, at, drawn)
     share = (best >= field.threshold_db).mean(0)

@@ -73,7 +73,7 @@ def test_the_setting_wins_over_the_verdict(caplog):
         set_freedom(data, "level")
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_rows_without_power_divided_by_zero():
     data = waves(0)
     data.target[:30] = 0
