@@ -251,7 +251,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
     if plain:
         warnings.append(
             f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}, few or beside strong "
-            "ones: lost rather than not heard; they are not used"
+            "ones: lost or not listed; they are not used"
         )
     return warnings
 
