@@ -32,6 +32,7 @@ from gsparc.prediction.predictor import Predictor
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
+NEAR_DB = 1.0  # above the lowest level measured: next to nothing lies below
 BANDS = 1 << 16  # cells at a time of what follows from predictions
 
 
@@ -86,6 +87,12 @@ def predict_map(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
+    # Of what was not heard the level that it lies below.
+    lowest = -np.inf if promise is None else float(promise.evidence.level_db.min())
+    if threshold_db <= lowest + NEAR_DB:
+        asked, lowest = threshold_db + level.raised_db, lowest + level.raised_db
+        said = f"threshold_db={asked:g} is at or below what was measured (lowest {lowest:.4g})"
+        notes.append(f"{said}: the share above it says nothing of weaker places")
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     every, computed, stride = np.flatnonzero(grid.inside), 0, 1
     if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
