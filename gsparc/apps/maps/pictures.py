@@ -86,8 +86,8 @@ class Layer:
         every = np.arange(len(self.words)) if self.group is None else self.group
         number = np.unique(every, return_inverse=True)[1]
         where = np.append(number, np.nan)[np.nan_to_num(self.values, nan=len(number)).astype(int)]
-        colours = np.asarray(colormaps["tab10"](assign_colours(where, int(number.max()) + 1)[number]))
-        rank = np.tril(number[:, None] == number, -1).sum(1)
+        tint = assign_colours(where, int(number.max()) + 1)[number]  # fewer than plain stations
+        colours, rank = np.asarray(colormaps["tab10"](tint)), np.tril(tint[:, None] == tint, -1).sum(1)
         shade = np.array(SHADES)[rank % len(SHADES)][:, None]
         # A positive share goes to white, a negative one to black.
         colours[:, :3] += np.abs(shade) * ((shade > 0) - colours[:, :3])
