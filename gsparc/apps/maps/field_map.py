@@ -306,6 +306,8 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
             # GeoTIFF rows go from north to south, ours from south to north.
             file.write(np.flipud(values).astype(np.float32), number)
             file.set_band_description(number, name)
+            unit = raster.unit if name.startswith(("power", "lower", "upper")) else "dB"
+            file.set_band_unit(number, unit if "_db" in name else "")
             if name == "best_server":
                 file.update_tags(number, **{str(i): one for i, one in enumerate(raster.stations)})
 

@@ -35,6 +35,8 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
     write_geotiff(tmp_path / "map.tif", found, ORIGIN)
     with rasterio.open(tmp_path / "map.tif") as file:
         assert file.descriptions[0] == "power_db" and file.count == 11
+        units = dict(zip(file.descriptions, file.units, strict=True))
+        assert units["upper_db"] == found.unit and units["sinr_db"] == "dB" and not units["outage"]
         named = file.tags(1 + file.descriptions.index("best_server"))
         assert [named[str(i)] for i in range(len(found.stations))] == list(found.stations)
         power = file.read(1)
