@@ -167,10 +167,9 @@ def locate_by_model(
         if config.store:
             update_extra(config.ckpt, locating.trust_state(trust, unknown, share))
     located, trained, origin = locator.locate(heard), group_snapshots(data, learned), data.site.origin
-    level, promise = locator.trust.level, f"{locator.share:.0%} are promised"
-    if not config.calibrate and locating.KEY not in run.stored[0].extra:
-        promise += " by the model's own variances, which nothing tested (calibrate=0)"
-    promise += f"; {float(locator.cells.volume.sum()):.3g} m2 were searched"
+    own, level = "by the model's own variances, which nothing tested (calibrate=0)", locator.trust.level
+    own = "are promised" if config.calibrate or locating.KEY in run.stored[0].extra else own
+    promise = f"{locator.share:.0%} {own}; {float(locator.cells.volume.sum()):.3g} m2 were searched"
     beyond = int(beyond_box(heard.place, locator.cells.box()).sum()) if placed else 0
     promise += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
