@@ -315,9 +315,8 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     of_link = np.concatenate([station[rows], absent % count])[order]
     levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
     of_file = [called[i].partition(", station")[0] for i in of_row]
-    known = None if site.static_position is None else site.static_position[None]
-    known = known if stations is None else stations.position
-    known = None if known is None else known + site.origin
+    known = site.static_position if stations is None else stations.position
+    known = None if known is None else np.atleast_2d(known) + site.origin
     names = [UNNAMED] if stations is None else list(stations.name)
     number = np.array(data.file_rows or range(len(data)))[of_row].tolist()
     return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, number, names, known)

@@ -246,12 +246,11 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     names = sheet.joined(c.head for c in chosen["station"])
     every = {"+".join(heads): _named(sheet, heads) for heads in aliases}
     unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
-    other = [*unique.values()]
     repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
     by = ["+".join(c.head or "" for c in chosen["station"]), *unique]
     # Names that repeat, like sites in a list of sectors, give way to those of a column without copies.
-    if other and len(set(names.tolist())) < len(names) and (names != "").all():
-        names, by = np.array(other[0]), by[1:]
+    if unique and len(set(names.tolist())) < len(names) and (names != "").all():
+        names, by = np.array(unique[by[1]]), by[1:]
     of_sites = "" if sites is None else f", sites by {sites[0]!r}"
     notes.append(f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}")
     for i in np.flatnonzero(names == ""):
@@ -262,7 +261,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
     facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
     extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
-    listed = StationList(tuple(map(str, names)), coordinates, extra, None, tuple(other), repeated)
+    listed = StationList(tuple(map(str, names)), coordinates, extra, None, tuple(unique.values()), repeated)
     return listed, notes
 
 

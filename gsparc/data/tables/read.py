@@ -400,11 +400,10 @@ class Builder:
             before = "station_" if name == "station" else ""
             self.arrays[f"{before}latitude"] = where.across[:, 0]
             self.arrays[f"{before}longitude"] = where.across[:, 1]
-            self.arrays[f"{name}_height"] = np.asarray(flat)
-            return
-        values = where.all()
-        self.arrays[f"{name}_position"] = values[0] if still else values
-        if where.height is None:
+        else:
+            values = where.all()
+            self.arrays[f"{name}_position"] = values[0] if still else values
+        if where.degrees or height is None:
             self.arrays[f"{name}_height"] = np.asarray(flat)
 
     def _of_rows(self, role: str) -> np.ndarray | None:
