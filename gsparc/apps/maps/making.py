@@ -32,7 +32,6 @@ from gsparc.prediction.predictor import Predictor
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
-NEAR_DB = 1.0  # above the lowest level measured: next to nothing lies below
 BANDS = 1 << 16  # cells at a time of what follows from predictions
 
 
@@ -87,11 +86,11 @@ def predict_map(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
-    # Of what was not heard the level that it lies below.
+    # Of what was not heard the level that it lies below; to whole decibels, as next to nothing lies between.
     lowest = -np.inf if promise is None else float(promise.evidence.level_db.min())
-    if threshold_db <= lowest + NEAR_DB:
-        asked, lowest = threshold_db + level.raised_db, lowest + level.raised_db
-        said = f"threshold_db={asked:g} is at or below what was measured (lowest {lowest:.4g})"
+    if threshold_db <= np.ceil(lowest):
+        said = f"threshold_db={threshold_db + level.raised_db:g} is at or below what was measured"
+        said += f" (lowest {lowest + level.raised_db:.4g})"
         notes.append(f"{said}: the share above it says nothing of weaker places")
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     every, computed, stride = np.flatnonzero(grid.inside), 0, 1
@@ -242,7 +241,7 @@ def predict_levels(
     for part in _chunks(places, CHUNK):
         ends = query_ends(predictor.site, part, other_end, station)
         parts.append(predicted_levels(predictor.predict_linear(**ends), predictor.site.kind))
-    level, spread = (np.concatenate(values) for values in zip(*parts, strict=True))
+    level, spread = np.concatenate(parts, axis=1)
     return level, spread
 
 
@@ -282,8 +281,7 @@ def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) 
         DataError: both moved, and nobody says where the other end stands.
     """
     ends = query_ends(site, places, other_end)
-    moved = [end for end in ("tx", "rx") if end in ends]
-    return np.hstack([ends[end] - site.origin for end in moved])
+    return np.hstack([ends[end] - site.origin for end in ("tx", "rx") if end in ends])
 
 
 def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: float | None) -> np.ndarray:

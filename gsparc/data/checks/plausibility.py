@@ -318,5 +318,5 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     known = site.static_position if stations is None else stations.position
     known = None if known is None else np.atleast_2d(known) + site.origin
     names = [UNNAMED] if stations is None else list(stations.name)
-    number = np.array(data.file_rows or range(len(data)))[of_row].tolist()
+    number = [data.file_rows[i] for i in of_row]
     return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, number, names, known)
