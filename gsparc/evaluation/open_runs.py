@@ -398,7 +398,8 @@ def calibrate_and_store(
         share = np.mean(evidence.scores[kind_used] >= threshold)
         of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
         from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
-        return stored, f"{kind_changed}{from_there}: {of}, which fails in {guarantee.delta:.0%} of cases"
+        of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {path}"
+        return stored, f"{kind_changed}{from_there}: {of}"
     wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
     effect = design_effect(wrong, number_patches(evidence.position)) if spatial else 1.0
     bad = float(wrong.mean())
