@@ -81,8 +81,8 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
 def repeated_warnings() -> list[str]:
     """Return a command's last lines on warnings: severe ones, and where its log's file has others."""
     screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
-    more = [(len(texts), *texts) for one in screens for texts in one.warned.values() if len(texts) > 1]
-    again = [f"{n} like '{shorten(re.sub(PATH, '', a), AGAIN, placeholder='')} ...'" for n, a, *_ in more]
+    more = [list(texts) for one in screens for texts in one.warned.values() if len(texts) > 1]
+    again = [f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'" for a in more]
     severe = dict.fromkeys(text for one in screens for text in one.severe)
     return [*severe, *([f"warnings shown by their first: {', '.join(again)}"] if again else [])]
 
