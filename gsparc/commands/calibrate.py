@@ -82,7 +82,7 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     bad = f"bad (an error above {facts['promise/limit_db']:g} dB)"
     trials = "Trials of the promise, each of a threshold set on some rows and tried on others"
     promise = f"{trials}: more than {facts['promise/alpha']:.0%} of accepted answers {bad} are too many"
-    note = f"Trials accept fewer: {SHARES[1]:.0%} of the rows calibrate, for storing {1 - SHARES[0]:.0%}"
+    note = f"Trials may accept fewer: {SHARES[1]:.0%} of the rows calibrate, for storing {1 - SHARES[0]:.0%}"
     return [
         Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
         Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row], note=note),

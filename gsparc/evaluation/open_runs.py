@@ -395,7 +395,7 @@ def calibrate_and_store(
     else:
         confidence.store_trusted(path, stored)
     if np.isfinite(threshold):
-        share = np.mean(evidence.scores[kind_used] >= threshold)
+        share = np.mean(evidence.scores[kind_used] >= choice.value)
         of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
         from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
         of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {path}"

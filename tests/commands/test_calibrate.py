@@ -14,6 +14,7 @@ from gsparc.commands.train import train
 from gsparc.evaluation import open_runs as command
 from gsparc.evaluation.open_runs import collect_evidence
 from gsparc.evaluation.pictures import draw_calibration
+from gsparc.prediction.confidence import as_confidence
 from gsparc.prediction.risk import (
     Evidence,
     Guarantee,
@@ -240,7 +241,7 @@ def test_trials_beside_a_promise_of_other_trials_read_as_a_broken_one() -> None:
     at = heads.index("too many bad, of all trials")
     told = ["promised of all trials: at most", "too many bad, of accepting trials: no promise"]
     assert heads[at + 1 :] == told
-    assert trials.note == "Trials accept fewer: 40% of the rows calibrate, for storing 80%"
+    assert trials.note == "Trials may accept fewer: 40% of the rows calibrate, for storing 80%"
 
 
 def _trained(folder, *more: str, run: str = "run"):
@@ -309,6 +310,15 @@ def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest
     assert facts["split/foreign"] is None  # nothing of it was learned from
     trusted, _ = command.calibrate_and_store(path, other, {}, Guarantee(), "distance", False, 0)
     assert len(trusted.known) == 32 and trusted.covers(evidence.position).all()
+
+
+def test_a_threshold_of_distances_accepted_none_of_the_test_positions(tmp_path) -> None:
+    """`accepted from 0.9933, 0% of 64`: minus metres were compared with a confidence."""
+    path = str(_trained(tmp_path).checkpoints[0])
+    evidence, _ = collect_evidence([path], {}, {})
+    trusted, said = command.calibrate_and_store(path, {}, {}, Guarantee(60, 0.4, 0.4), "distance", False, 0)
+    accepted = np.mean(as_confidence("distance", evidence.scores["distance"]) >= trusted.threshold)
+    assert accepted > 0 and f", {accepted:.0%} of {len(evidence)} test positions" in said
 
 
 def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
