@@ -105,6 +105,9 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     cells = table_of_cells(filled)
     if cells.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
+    # Draws with the same test rows are seeds.
+    drawn = cells.groupby(PROBLEM)[["draw", "seed"]].transform("nunique")
+    cells["draws"] &= (drawn["draw"] > 1) | (drawn["seed"] == 1)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
     means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()

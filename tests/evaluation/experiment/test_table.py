@@ -250,3 +250,14 @@ def test_what_methods_were_given_besides_places_was_not_said():
     assert any("gsparc were given directions of arrival" in line for line in remarks(block, "gsparc"))
     (block,) = split_by_problem(average_cells(FOUND[:1], {}))
     assert not any("were given" in line for line in remarks(block, "gsparc"))
+
+
+def test_draws_with_the_same_test_rows_had_a_standard_error():
+    """`split=random, draws: 3` of a release that names its test rows gave three copies of one split."""
+    same = {"split/test_sha256": "t", "drawn": True}
+    found = [filled("gp", 30.0 + draw, draw, **same) for draw in range(3)]
+    (block,) = split_by_problem(average_cells(found, {}))
+    (row,) = block.itertuples()
+    assert not row.draws and row.seeds == 3 and "draws" not in title_of(block)
+    (block,) = split_by_problem(average_cells(found[:1], {}))
+    assert title_of(block).endswith("one draw")
