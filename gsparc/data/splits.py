@@ -57,6 +57,11 @@ class Split:
     sha256: str
     of_release: bool = False
 
+    @property
+    def title(self) -> str:
+        """Return its name, and that no seed draws the test rows where the release names them."""
+        return self.name + " (the release's test rows)" * self.of_release
+
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""
         for i, fold in enumerate(self.folds):
