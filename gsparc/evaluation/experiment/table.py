@@ -188,7 +188,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if len(rows) > 1 and (lead := leads[rows[1].method]):
         before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
-        lines[0] += "" if lead.sure or lead.same else ": they are not told apart"
+        lines[0] += "" if lead.same else f": they are {'' if lead.sure else 'not '}told apart"
     own = next((row for row in rows if row.method == ours), None)
     lead = None if own is None else leads.get(own.method)
     figure = heading_of(first.figure)
@@ -233,10 +233,13 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:
-    """Return a block as a table, the row of `ours` bold, without columns that no row fills."""
+    """Return a block as a table without columns that no row fills; bold: the first, where told apart.
+
+    `ours` is marked.
+    """
     figure, draws, value = block.figure.iloc[0], block.draws.any(), value_with_error("value", "value_error")
     columns = [
-        (True, Column("method", "", of=lambda row: row["method"] + row["label"])),
+        (True, Column("method", "", of=lambda row: _name(row, ours))),
         (True, Column(score_heading(figure), ".2f", of=_score)),
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
@@ -245,15 +248,19 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
-    own = block[block.method == ours]
-    bold = {"bold": str((own.method + own.label).iloc[0])} if len(own) else {}
-    shown = [column for there, column in columns if there]
-    return Table.from_rows(title_of(block), shown, block.to_dict("records"), **bold)  # type: ignore[arg-type]
+    shown, rows = [column for there, column in columns if there], block.to_dict("records")
+    lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None
+    bold = _name(rows[0], ours) if lead and lead.sure else None
+    return Table.from_rows(title_of(block), shown, rows, bold=bold)  # type: ignore[arg-type]
 
 
 def shown(figure: str, score_db: float) -> float:
     """Return a score as a reader knows it: of figures of which less is better, without its turned sign."""
     return -score_db if lower_is_better(figure) else score_db
+
+
+def _name(row: Mapping[str, Any], ours: str) -> str:
+    return f"{row['method']}{row['label']}{' (ours)' * (row['method'] == ours)}"
 
 
 def _score(row: Mapping[str, Any]) -> Interval:
