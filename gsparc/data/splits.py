@@ -198,13 +198,12 @@ def make_split(
     absent = np.zeros(0, np.int64) if isinstance(left, int) else rows_to_leave_out(left, outliers, rows)
     rows_left = np.setdiff1d(np.arange(rows), absent)
     # Files of the release are its published split; `redraw` is for drawing others.
-    its_own = settings.name == "random" and release_split is not None and not settings.redraw
+    named = release_split if settings.name == "random" and not settings.redraw else None
     # Of the rows that stand for their places, and the place of each row.
     first = which = np.arange(len(rows_left))
     if settings.name in ("stations", "runs"):
         local_folds = _whole(None if station is None else station[rows_left], settings)
     else:
-        named = release_split if its_own else None
         if named is not None:
             # Rows were renumbered when some were left out: from numbers of the file to those that remain.
             train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
@@ -216,7 +215,7 @@ def make_split(
         pairs = enumerate(_pairs(where, settings, named))
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
     folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
-    return Split(settings.name, folds, hash_indices(folds), its_own)
+    return Split(settings.name, folds, hash_indices(folds), named is not None)
 
 
 def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:

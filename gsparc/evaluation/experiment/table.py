@@ -42,6 +42,7 @@ BESIDE_COLUMNS = (
     Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2"),
 )  # fmt: skip
 OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
+LITTLE = 2 / 3  # share of a budget below which a longer one is proposed
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 GIVEN = {"newrf", "directional_gp", "calibrated_raytracer"}  # methods that learn from more than places
@@ -209,14 +210,15 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
-    spent = [
-        f"{row.method} {row.train_cpu_s:.3g}"
-        for row in rows
-        # False for NaN: methods without a budget.
-        if abs(row.train_cpu_s - row.budget_s) > OTHERWISE * row.budget_s
-    ]
-    if spent:
-        lines.append(f"spent of {block.budget_s.max():g} processor seconds: {', '.join(spent)}")
+    budget, share = block.budget_s.max(), block.train_cpu_s / block.budget_s  # NaN without a budget
+    otherwise = block[(share - 1).abs() > OTHERWISE].itertuples()
+    if spent := ", ".join(f"{row.method} {row.train_cpu_s:.3g}" for row in otherwise):
+        lines.append(f"spent of {budget:g} processor seconds: {spent}")
+    # Beside a method that used it whole; one that used next to nothing has ended by itself.
+    for row in block[share.between(OTHERWISE, LITTLE) & (share.max() > 1 - OTHERWISE)].itertuples():
+        more = f"budgets=[{{seconds: {budget**2 / row.train_cpu_s:.2g}, seeds: [0]}}]"
+        used = f"{row.method} used {row.train_cpu_s / budget:.0%} of its budget"
+        lines[-1] += f"; {used}: {more} gives it as much, unless it ended by itself"
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
@@ -226,8 +228,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         given = "newrf, directional_gp and gsparc were given directions of arrival of training rows"
         lines.append(f"{given}, calibrated_raytracer the scene's walls, all others places alone")
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
-    old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
-    if old:
+    if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another program (at commit): {old}")
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
@@ -239,7 +240,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
     """
     figure, draws, value = block.figure.iloc[0], block.draws.any(), value_with_error("value", "value_error")
     columns = [
-        (True, Column("method", "", of=lambda row: _name(row, ours))),
+        (True, Column("method", "", of="named")),
         (True, Column(score_heading(figure), ".2f", of=_score)),
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
@@ -248,19 +249,17 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
-    shown, rows = [column for there, column in columns if there], block.to_dict("records")
+    mark = np.where(block.method == ours, " (ours)", "")
+    rows = block.assign(named=block.method + block.label + mark).to_dict("records")
+    shown = [column for there, column in columns if there]
     lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None
-    bold = _name(rows[0], ours) if lead and lead.sure else None
+    bold = rows[0]["named"] if lead and lead.sure else None
     return Table.from_rows(title_of(block), shown, rows, bold=bold)  # type: ignore[arg-type]
 
 
 def shown(figure: str, score_db: float) -> float:
     """Return a score as a reader knows it: of figures of which less is better, without its turned sign."""
     return -score_db if lower_is_better(figure) else score_db
-
-
-def _name(row: Mapping[str, Any], ours: str) -> str:
-    return f"{row['method']}{row['label']}{' (ours)' * (row['method'] == ours)}"
 
 
 def _score(row: Mapping[str, Any]) -> Interval:
