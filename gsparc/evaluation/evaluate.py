@@ -218,7 +218,7 @@ def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measure
         "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
         # Of what was measured, not of stored targets: channels and spectra have errors in these units.
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
-        **scores.samples,
+        **scores.samples, **paired_values(scores.samples),
     }  # fmt: skip
     if data.site.kind == "rssi":
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
