@@ -29,7 +29,7 @@ ARROWS = {
     "prediction": "data field models ops physics processes training",
     "apps.locate": "data evaluation prediction",
     "evaluation": "conf data models prediction processes simulate training",
-    "apps.maps": "data evaluation models prediction",
+    "apps.maps": "data evaluation models prediction processes",
     "apps.export": "data field models ops physics prediction processes training",
     "apps.link": "data evaluation models physics prediction simulate",
     "apps.view": "apps.maps data evaluation prediction",

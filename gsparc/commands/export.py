@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 import gsparc.ops
 from gsparc.apps.export.along import deepmimo
 from gsparc.apps.export.along.taps import Trajectory, write_taps
-from gsparc.apps.export.compiled.blob import write_form
+from gsparc.apps.export.compiled.blob import pack_form
 from gsparc.apps.export.compiled.make import FIGURES, compile_model
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
@@ -51,14 +51,15 @@ def task(config: DictConfig) -> dict[str, Any]:
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
     result = compile_model(predictor, int(config.places))
     origin = np.asarray(predictor.site.origin)
-    size = write_form(folder / "field.gsparc", result.form, origin, result.error, result.worst)
+    blob = pack_form(result.form, origin, result.error, result.worst)
+    (folder / "field.gsparc").write_bytes(blob)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)
-    facts: dict[str, Any] = {"export/bytes": size, "export/form": result.form.kind}
+    facts: dict[str, Any] = {"export/bytes": len(blob), "export/form": result.form.kind}
     facts |= {"export/error": result.error}
     facts |= {"export/worst": result.worst, "export/figure": FIGURES[predictor.site.kind]}
     build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
-    return facts, [result.summary, f"{size / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
+    return facts, [result.summary, f"{len(blob) / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
 
 
 def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:

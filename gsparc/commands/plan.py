@@ -51,7 +51,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
     }  # fmt: skip
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
-    before += "" if predictor is None or predictor.site.stations is None else " of all stations"
+    if predictor is not None and predictor.site.stations is not None:
+        before += " of all stations alike (a map shows the strongest)"
     if walk:
         kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
         before += f", a way of {plan.length_m:.0f} m, {kind}"

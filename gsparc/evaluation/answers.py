@@ -281,10 +281,9 @@ def _in_order(
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
         known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*taken}]
         if role is not None and known:
-            # Coordinates as they were written: 48.191910 is no 48.19191 to a join.
-            given = axis not in ("station", "row_name")
-            taken.append(known[0])
-            ordered[head if given else known[0]] = words[predictions.place] if given else columns[known[0]]
+            # As they were written: 48.191910 is no 48.19191 to a join. A column `cell` replaces the list's.
+            taken += [known[0]] + ["cell"] * (head == "cell")
+            ordered[head] = words[predictions.place]
         elif role is None:
             # A user's own column called like one of ours keeps its words under another head.
             ordered[f"{head} (given)" if head in columns else head] = words[predictions.place]

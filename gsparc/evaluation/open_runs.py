@@ -166,6 +166,8 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
     if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
         before = {}
     settings = {**before, **now}
+    for key in [key for key in now if now[key] and isinstance(before.get(key), dict)]:
+        settings[key] = {**before[key], **now[key]}  # such as columns; an empty group replaces all of it
     if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")
     return settings

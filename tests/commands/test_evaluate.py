@@ -59,6 +59,28 @@ def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path
     assert np.isfinite(gsparc.load(tmp_path / "run" / "model.ckpt").rssi(rx=[1.0, 1.0, 1.0]))
 
 
+def test_evaluate_took_no_settings_of_the_data(tmp_path):
+    """`dataset.absent` and columns of another file were no settings of its configuration."""
+    town = towns.town_file(tmp_path / "town.npz", rows=60)
+    with np.load(town) as stored:
+        places, level = stored["rx_position"], stored["rssi_db"][:, 0]
+    for name, head in (("first", "power"), ("second", "rx_level")):
+        rows = [f"{x},{y},{one}" for (x, y, _), one in zip(places, level, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([f"a,b,{head}", *rows]))
+    heads = "dataset.columns={x:a,y:b,z:1.5,rssi_db:power}"
+    ckpt = towns.trained(tmp_path / "first.csv", "idw", heads, "threads=1")
+
+    def evaluated(*more):
+        given = f"ckpt={ckpt}", f"hydra.run.dir={tmp_path / 'run'}", "threads=1", "baselines=[]", *more
+        return knock(COMMANDS["evaluate"].run, "evaluate", given)
+
+    second = f"dataset.file={tmp_path / 'second.csv'}", "dataset.columns.rssi_db=rx_level"
+    assert (done := evaluated(*second, "dataset.absent=unknown", "dataset.max_rows=40")).status == 0, done
+    facts = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert facts["dataset/rows"] == 40
+    assert_refused(evaluated("dataset.absnt=unknown"), "dataset=own; did you mean 'absent'")
+
+
 def test_the_traceback_comes_when_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate", f"hydra.run.dir={tmp_path}", "ckpt=none.ckpt"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")

@@ -68,7 +68,8 @@ def test_the_promise_stays_with_the_model(mapped, model):
 def test_a_plan_from_the_model(mapped, model, tmp_path):
     done = run("plan", f"ckpt={model}", "count=6", "route=true", "area=[-20,0,80,60]", folder=tmp_path)
     assert done.status == 0, done
-    assert any("6 places: expected error" in line and "a way of" in line for line in done.out), done
+    (said,) = [line for line in done.out if "6 places: expected error" in line]
+    assert "a way of" in said and "of all stations alike (a map shows the strongest)" in said
     facts = json.loads((tmp_path / "summary.json").read_text())
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     lines = (tmp_path / "plan.csv").read_text().splitlines()

@@ -117,6 +117,16 @@ def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path
     assert town.select_station("B-1").site.static_position is not None
 
 
+@pytest.mark.parametrize("labels", [None, ("A-1", "A-2", "B-1")])
+def test_a_column_of_cells_was_renamed(town, tmp_path, monkeypatch, labels):
+    """A column `cell` came back as `station`, with the model's names in it."""
+    monkeypatch.setitem(vars(town.site.stations), "label", labels)
+    asked = "mast" if labels is None else "B-1"
+    (row,) = answered(town, tmp_path, ["x", "y", "z", "cell"], [[5, 5, 1.5, asked]])
+    assert [*row][:5] == ["x", "y", "z", "cell", "rssi_db"] and row["cell"] == asked
+    assert "station" not in row
+
+
 def test_coordinates_were_written_anew_under_other_heads(valley, tmp_path):
     """Latitude came back as latitude, 47.003000 as 47.003."""
     (row,) = answered(
@@ -144,7 +154,7 @@ def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
     heads = ["x", "y", "z", "cell"]
     table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "roof-0"]]
     found = answered(town, tmp_path, heads, table)
-    assert [row["station"] for row in found] == ["mast", "roof-1", "mast", "roof-0"]
+    assert [row["cell"] for row in found] == ["mast", "roof-1", "mast", "roof-0"]
     assert column(answered(town, tmp_path, heads, table, station="mast"), "x").tolist() == [5, 7]
     places = [row[:3] for row in table]
     one = answered(town, tmp_path, "xyz", places, station="roof-1")

@@ -29,7 +29,6 @@ class Rates:
         oracle_bps, chosen_bps: (n,) throughput with the transport blocks that arrive [bit/s].
         best_bps: (n,) of the MCS that carries most, were the channel known [bit/s].
         fails: (n,) block error rate of the chosen MCS.
-        regret_bps: (n,) throughput that the choice is expected to miss.
         outage: (n,) bool, the oracle's transport blocks mostly fail.
         care: share of `SLOW_DECIBEL` that the choice allowed for.
     """
@@ -41,7 +40,6 @@ class Rates:
     chosen_bps: np.ndarray
     best_bps: np.ndarray
     fails: np.ndarray
-    regret_bps: np.ndarray
     outage: np.ndarray
     care: float
 
@@ -106,7 +104,7 @@ class Adaptation:
         # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
         loud = band.expected_power.mean(1).clamp_min(1e-30)
         doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
-        chosen, regret = self._carries_most(guess, care * doubt)
+        chosen = self._carries_most(guess, care * doubt)
         # Infinite where there is no such MCS: it carries nothing, as one that always fails.
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 
@@ -116,7 +114,7 @@ class Adaptation:
         return Rates(
             10 * math.log10(band.median_power / noise), oracle.numpy(), chosen.numpy(),
             gathered(delivered, oracle), gathered(delivered, chosen), delivered.max(1).values.numpy(),
-            gathered(fails.clamp_max(1), chosen), regret.numpy(), gathered(fails, oracle) > OUTAGE, care,
+            gathered(fails.clamp_max(1), chosen), gathered(fails, oracle) > OUTAGE, care,
         )  # fmt: skip
 
     def _effective_db(self, sinr: Tensor) -> Tensor:
@@ -143,22 +141,16 @@ class Adaptation:
         lowest = torch.where(fails.isfinite(), number, 28).min(1).values
         return torch.where(good >= 0, good, lowest)
 
-    def _carries_most(self, effective_db: Tensor, spread_db: Tensor) -> tuple[Tensor, Tensor]:
-        """The MCS (n,) of the largest expected throughput, and what it is expected to miss (n,) [bit/s].
-
-        Of equal ones, as where all fail, the lowest.
-        """
+    def _carries_most(self, effective_db: Tensor, spread_db: Tensor) -> Tensor:
+        """The MCS (n,) of the largest expected throughput; of equal ones, as where all fail, the lowest."""
         carried = torch.zeros(effective_db.shape, dtype=torch.float64)
-        most = torch.zeros(len(effective_db), dtype=torch.float64)
         # Gauss-Hermite with 9 nodes is exact for polynomials to degree 17 under a normal density.
         for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
             fails = self._fails(effective_db + node * spread_db[:, None])
-            delivered = self.full_bps * (1 - fails.clamp_max(1))
-            carried += weight * delivered
-            most += weight * delivered.max(1).values
+            carried += weight * self.full_bps * (1 - fails.clamp_max(1))
         lowest = torch.where(fails.isfinite(), torch.arange(28), 28).min(1).values
         best = carried.max(1)
-        return torch.where(best.values > 0, best.indices, lowest), most - best.values
+        return torch.where(best.values > 0, best.indices, lowest)
 
     def _of_every_mcs(self, count: int, **arguments: Tensor) -> tuple[Tensor, ...]:
         """Sionna's PHY abstraction of every MCS of the table at `count` positions."""

@@ -23,7 +23,6 @@ STYLES = {
     "predicted_pilots": ("prediction corrected by pilots, all", PALETTE[6], ":"),
     "fallback": ("predicted, else LMMSE pilots, all", PALETTE[4], "--"),
 }
-SHORT = ("perfect", "lmmse", "predicted", "predicted_pilots")  # by acceptance
 RATES = {
     "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
     "chosen_bps": ("b--o", "from the predicted one"),
@@ -80,7 +79,7 @@ def draw_acceptance(acceptance: Mapping[str, tuple[float, pd.DataFrame]], share:
     """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
     figure, grid = panels(5.5 * len(acceptance), 4, 1, len(acceptance))
     for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
-        for name in filter(rates.__contains__, SHORT):
+        for name in rates:
             label, colour, _ = STYLES[f"{name}@accepted"]
             axis.plot(rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted"))
         axis.axvline(share, color="grey", linestyle=":", label="accepted under the promise")

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 import torch
+from scipy.linalg import toeplitz
 from torch import Tensor
 
 from gsparc.apps.link.adaptation import Band
@@ -119,9 +120,7 @@ class _Wiener:
         self.comb = (full[self.symbols[0]].abs() > 0).nonzero().flatten()
         self.pilots = full[self.symbols][:, self.comb]
         # R(-k) = conj R(k): the correlation matrix is Hermitian, and Toeplitz.
-        lag = np.arange(mask.shape[1])[:, None] - np.arange(mask.shape[1])
-        whole = np.where(lag >= 0, correlation[np.abs(lag)], correlation[np.abs(lag)].conj())
-        self.whole = torch.from_numpy(whole).to(torch.complex128)
+        self.whole = torch.from_numpy(toeplitz(correlation[: mask.shape[1]])).to(torch.complex128)
         self.prior = prior
 
     def __call__(self, y: Tensor, no: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,7 +156,5 @@ def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: flo
     lags = np.arange(len(tones_hz))
     values = np.array([(unit[:, lag:] * unit[:, : len(tones_hz) - lag].conj()).mean() for lag in lags])
     step = float(np.diff(np.sort(tones_hz)).min())
-    wanted = np.arange(count) * spacing_hz
-    real, imaginary = (np.interp(wanted, lags * step, part) for part in (values.real, values.imag))
     # By lag 0, where `values` is 1 up to rounding and masked tones.
-    return (real + 1j * imaginary) / values[0].real
+    return np.interp(np.arange(count) * spacing_hz, lags * step, values) / values[0].real

@@ -24,13 +24,13 @@ LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 d
 def find_crossing(rate: pd.Series, target: float = 0.1) -> float | None:
     """Return where a curve over its index first falls below `target`, linear in its logarithm, or None."""
     # No error in all blocks sent: its logarithm is cut at 1e-6.
-    x, floor = rate.index.to_numpy(), np.maximum(rate.to_numpy(), 1e-6)
-    for i in range(len(x) - 1):
-        if floor[i] > target >= floor[i + 1]:
-            # Curves fall exponentially: linear in log(rate) between two points.
-            share = np.log(floor[i] / target) / np.log(floor[i] / floor[i + 1])
-            return float(x[i] + share * (x[i + 1] - x[i]))
-    return None
+    x, below = rate.index.to_numpy(), np.log(target / np.maximum(rate.to_numpy(), 1e-6))
+    falls = np.flatnonzero((below[:-1] < 0) & (below[1:] >= 0))
+    if not len(falls):
+        return None
+    # Curves fall exponentially: linear in log(rate) between two points.
+    ends = slice(falls[0], falls[0] + 2)
+    return float(np.interp(0, below[ends], x[ends]))
 
 
 def beam_gain(true: Tensor, predicted: Tensor) -> Tensor:
@@ -131,28 +131,12 @@ def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
             "tbler": float(one.fails[some].mean()), "off_by_more_than_2": float((miss > 2).mean()),
         } if some.any() else {}  # fmt: skip
         facts |= {key + name: value for key, value in own.items()}
-    return facts | _by_regret(one)
+    return facts
 
 
 def _shortfall(chosen: np.ndarray, oracle: np.ndarray) -> float | None:
     """Share of the oracle's throughput that is missed; None where nothing can be carried."""
     return float(1 - chosen.mean() / oracle.mean()) if len(oracle) and oracle.mean() > 0 else None
-
-
-def _by_regret(one: Rates) -> dict[str, float | None]:
-    """`shortfall_calm_<share>`: of the positions whose choice is expected to miss least; `..._fallback`: of
-    all positions when the others send pilots. What a rate needs to know is not how large an error is, but
-    whether it crosses a step."""
-    facts: dict[str, float | None] = {}
-    # Stable, so that equal regrets keep the order of positions in every run.
-    order = np.argsort(one.regret_bps, kind="stable")
-    for share in np.arange(0.3, 1.01, 0.1):
-        calm = np.zeros(len(order), bool)
-        calm[order[: round(share * len(order))]] = True
-        together = np.where(calm, one.chosen_bps, one.oracle_bps)
-        facts[f"shortfall_calm_{share:.0%}"] = _shortfall(one.chosen_bps[calm], one.oracle_bps[calm])
-        facts[f"shortfall_calm_{share:.0%}_fallback"] = _shortfall(together, one.oracle_bps)
-    return facts
 
 
 def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int]) -> pd.DataFrame:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -38,9 +39,8 @@ class Cells:
 
     def halve(self) -> Cells:
         """Return the cells halved along every axis."""
-        corners = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), -1).reshape(-1, 3)
         live = self.edge.max(0) > 0
-        corners = np.unique(np.where(live, corners, 0.0), axis=0)
+        corners = np.array([*product(*((-0.25, 0.25) if one else (0.0,) for one in live))])
         centre = self.centre[:, None] + corners * self.edge[:, None]
         edge = np.broadcast_to(self.edge[:, None] / 2, centre.shape)
         return Cells(centre.reshape(-1, 3), edge.reshape(-1, 3))

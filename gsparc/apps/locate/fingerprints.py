@@ -56,4 +56,4 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
 def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:
     """Return rows as snapshots of powers."""
     values = torch.from_numpy(rows.level).double()
-    return Snapshots("rssi", values, None, rows.position, np.arange(len(values)))
+    return Snapshots("rssi", values, None, rows.position)

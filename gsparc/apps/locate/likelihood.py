@@ -70,13 +70,6 @@ class Trust:
     level: float = 0.9
     worst: float = math.inf
 
-    def __str__(self) -> str:
-        return (
-            f"variances times {self.inflation:.2g}, {self.temperature:.1%} of values counted as independent, "
-            f"t distribution of {self.tail:.2g} degrees of freedom, places recorded to {self.spread:.2g} m; "
-            f"areas have {self.level:.1%} of the probability"
-        )
-
     def log_likelihood(self, misfit: Misfit) -> Tensor:
         """(n, G), up to a constant of each snapshot."""
         squared = self.temperature / self.inflation * misfit.squared

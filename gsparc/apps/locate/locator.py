@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -56,13 +56,6 @@ class Located:
     posterior: Posterior
     seconds: float
     doubt: str = ""
-
-    @classmethod
-    def from_posterior(cls, posterior: Posterior, mass: float, place: np.ndarray, seconds: float = 0) -> Self:
-        """Return what is known at a place (3,) [m, local], with the area of cells of a `mass`."""
-        volume = posterior.cells.volume
-        area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
-        return cls(place, area, len(posterior.modes(mass)), posterior, seconds)
 
 
 @dataclass(frozen=True)
@@ -125,9 +118,10 @@ class Locator:
                 wide = further.search_cells(one, self.trust)
                 if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
                     search, doubt = wide, DOUBTS["beyond"]
-            posterior = search.posterior(self.trust)
-            located = Located.from_posterior(posterior, self.trust.level, posterior.peak())
-            return replace(located, seconds=time.perf_counter() - started, doubt=doubt)
+            posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
+            area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
+            known = posterior.peak(), area, posterior.count_modes(mass), posterior
+            return Located(*known, time.perf_counter() - started, doubt)
 
         return run_all(one, range(len(heard)), "snapshots")
 

@@ -48,7 +48,7 @@ class Posterior:
         if not self.spread:
             return self.sharp
         # Cells beyond the blurred ones stay sharp: blurring them all would cost G^2.
-        density = self._density(self.cells.centre) + np.where(self._blurred, 0.0, np.exp(self.sharp))
+        density = self._parts(self.cells.centre)[0].sum(1) + np.where(self._blurred, 0.0, np.exp(self.sharp))
         logarithm = np.log(density + LEAST)
         # Normalised again: densities at centres do not sum to 1, and a blur leaves the site.
         return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.volume))
@@ -64,7 +64,7 @@ class Posterior:
         if not self.spread:
             return float(self.sharp[here])
         rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
-        return float(np.log(self._density(place[None])[0] + rest + LEAST))
+        return float(np.log(self._parts(place[None])[0].sum() + rest + LEAST))
 
     def mass_above(self, place: np.ndarray) -> float:
         """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
@@ -75,13 +75,8 @@ class Posterior:
     @cached_property
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
-        blurred = np.zeros(len(self.cells), bool)
-        blurred[densest_cells(self.sharp, self.cells.volume, BLURRED)] = True
-        return blurred
-
-    def _density(self, places: np.ndarray) -> np.ndarray:
-        """Of the cells that are blurred, at places (m, 3)."""
-        return np.asarray(self._parts(places)[0].sum(1))
+        densest = densest_cells(self.sharp, self.cells.volume, BLURRED)
+        return np.isin(np.arange(len(self.cells)), densest)
 
     def _parts(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What b blurred cells add to the density at places (m, b), their centres and precisions (b, d)."""
@@ -112,8 +107,8 @@ class Posterior:
                 break
         return place
 
-    def modes(self, share: float) -> list[np.ndarray]:
-        """Cells of each connected part of the area that holds a share of the mass, heaviest first."""
+    def count_modes(self, share: float) -> int:
+        """Return how many connected parts the area that holds a share of the mass has."""
         some = densest_cells(self.log_density, self.cells.volume, share)
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
@@ -124,5 +119,4 @@ class Posterior:
         graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some)))
         part = connected_components(graph, directed=False)[1]
         mass = np.bincount(part, self.mass[some])
-        order = [one for one in np.argsort(-mass) if one == mass.argmax() or mass[one] >= MODE]
-        return [some[part == one] for one in order]
+        return max(int((mass >= MODE).sum()), 1)

@@ -23,14 +23,12 @@ class Snapshots:
         values: (n, P) float64 spectra, or complex128 channels, or decibels; NaN where missing.
         floor: (n, P) levels [dB] of powers that were too weak to be heard, NaN of the rest; None without any.
         place: (n, 3) [m, local], where they were heard.
-        rows: (n,) first row of the measurements of each.
     """
 
     kind: Kind
     values: Tensor
     floor: Tensor | None
     place: np.ndarray
-    rows: np.ndarray
 
     def __len__(self) -> int:
         return len(self.values)
@@ -39,7 +37,7 @@ class Snapshots:
         """Return the snapshots `chosen`."""
         index = torch.from_numpy(np.asarray(chosen))
         floor = None if self.floor is None else self.floor[index]
-        return Snapshots(self.kind, self.values[index], floor, self.place[chosen], self.rows[chosen])
+        return Snapshots(self.kind, self.values[index], floor, self.place[chosen])
 
 
 def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
@@ -66,7 +64,7 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     quiet = torch.zeros(values.shape, dtype=torch.bool)
     quiet[which, station] = (side > 0)[:, None]
     own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
-    return Snapshots(site.kind, *own, data.moving[rows][first], rows[first])
+    return Snapshots(site.kind, *own, data.moving[rows][first])
 
 
 def snapshots_of_values(
@@ -99,7 +97,7 @@ def snapshots_of_values(
     flat = (scaled if count is None or site.kind == "rssi" else scaled.flatten(0, 1)).contiguous()
     own = _decibels(flat) if site.kind == "rssi" else flatten_targets(flat).reshape(len(heard), -1)
     parts = _without_silence(own, None if silent is None else torch.as_tensor(silent))
-    return Snapshots(site.kind, *parts, np.full((len(heard), 3), np.nan), np.arange(len(heard)))
+    return Snapshots(site.kind, *parts, np.full((len(heard), 3), np.nan))
 
 
 def flatten_targets(targets: Tensor) -> Tensor:

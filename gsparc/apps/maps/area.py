@@ -44,11 +44,6 @@ class Grid:
     step: float
     inside: np.ndarray
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(ny, nx)."""
-        return len(self.y), len(self.x)
-
     def places(self, cells: np.ndarray | None = None) -> np.ndarray:
         """World places (n, 3) [m] of `cells` (n,), numbers into the flat map; None: of those inside."""
         chosen = np.flatnonzero(self.inside) if cells is None else cells
@@ -94,10 +89,8 @@ def lay_grid(
         )
     nx, ny = (max(int(n), 1) for n in count)
     x, y = (low[i] + step * (0.5 + np.arange(n)) for i, n in enumerate((nx, ny)))
-    inside = np.ones((ny, nx), bool)
-    if contains is not None:
-        for row in range(ny):  # by rows: a million places at once would be a copy of the map
-            inside[row] = contains(np.column_stack([x, np.full(nx, y[row])]))
+    rows = (np.column_stack([x, np.full(nx, one)]) for one in y)  # a million places at once take memory
+    inside = np.ones((ny, nx), bool) if contains is None else np.array([contains(row) for row in rows])
     if not inside.any():
         raise DataError(f"area={area}: no centre of a cell of {step:g} m lies in it; take a smaller step_m")
     return Grid(x, y, height, step, inside)
@@ -152,5 +145,4 @@ def _height(site: Site | None, height_m: float | None) -> float:
     known = usual_heights(site).get(site.moving_end)
     if known is not None:
         return known
-    low, high = site.moving_box[:, -1] + site.origin[2]
-    return float((low + high) / 2)
+    return float(site.moving_box[:, -1].mean() + site.origin[2])

@@ -66,10 +66,9 @@ def error_covariances(
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()
             spread = predict_levels(asking, places, other_end)[1]
-            local = to_local(asking.site, places, other_end, asking.site.static_end is None)
-            far = promise.distance(local, number)
+            far = promise.distance(to_local(asking.site, places, other_end), number)
             inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
-            error = calibration.expected_error(spread, inside, np.full(len(far), number))
+            _, error = calibration.half_and_error(spread, inside, np.full(len(far), number))
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
         covariances.append(ErrorCovariance(covariance, noise, weight))

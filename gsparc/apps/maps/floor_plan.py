@@ -41,11 +41,6 @@ class FloorPlan:
         world = self.scale * pixel + self.shift
         return np.column_stack([world.real, world.imag])
 
-    def matrix(self) -> tuple[float, float, float, float, float, float]:
-        """(a, b, c, d, e, f): x = a column + c row + e and y = b column + d row + f [m]."""
-        one, two = self.scale, -1j * self.scale
-        return one.real, one.imag, two.real, two.imag, self.shift.real, self.shift.imag
-
     def is_open(self, places: np.ndarray) -> np.ndarray:
         """Return whether there is open floor (m,), a light pixel, at world places (m, 2) [m]."""
         pixel = (places[:, 0] + 1j * places[:, 1] - self.shift) / self.scale

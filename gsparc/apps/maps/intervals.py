@@ -84,13 +84,14 @@ class Calibration:
     station: np.ndarray
     least: float = 0.0
 
-    def half_width(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
-        """Half the interval (n,) [dB] at places of stations (n,); NaN out of reach."""
-        return self._of(self.half, spread_db, distance, station)
-
-    def expected_error(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
-        """Root mean square error (n,) [dB]; NaN out of reach."""
-        return self._of(self.rms, spread_db, distance, station)
+    def half_and_error(
+        self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Half the interval and the root mean square error (n,) [dB] of stations (n,); NaN out of reach."""
+        own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
+        scaled = np.where(distance <= self.reach, own * np.maximum(spread_db, self.least), np.nan)
+        half, rms = (scaled * np.interp(distance, self.distance, factor) for factor in (self.half, self.rms))
+        return half, rms
 
     def probability_below(
         self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray
@@ -101,13 +102,6 @@ class Calibration:
             return norm.cdf(standard)
         chance = np.interp(standard, self.tail, TAIL)
         return np.where(np.isfinite(standard), chance, np.nan)
-
-    def _of(
-        self, factor: np.ndarray, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray
-    ) -> np.ndarray:
-        own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
-        scaled = own * np.maximum(spread_db, self.least) * np.interp(distance, self.distance, factor)
-        return np.where(distance <= self.reach, scaled, np.nan)
 
 
 def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
@@ -146,8 +140,6 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     tail = None
     if heard.all():
         tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
-        apart = 1e-9 * max(float(np.abs(used.error).max()), 1.0)
-        tail = tail + np.arange(len(tail)) * apart  # no two are equal
     reach = float(np.quantile(used.distance, REACH))
     return Calibration(share, middle, half, rms, tail, reach, station, least)
 
@@ -207,7 +199,7 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
 
 def interval_coverage(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
     """Tell whether measured levels (n,) lie in their intervals; widths (n,) [dB], NaN out of reach."""
-    half = calibration.half_width(evidence.spread_db, evidence.distance, evidence.station)
+    half = calibration.half_and_error(evidence.spread_db, evidence.distance, evidence.station)[0]
     return np.abs(evidence.level_db - evidence.mean_db) <= half, 2 * half
 
 

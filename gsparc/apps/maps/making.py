@@ -33,7 +33,6 @@ CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
 BANDS = 1 << 16  # cells at a time of what follows from predictions
-OTHER_END = "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
 
 
 def predict_map(
@@ -87,9 +86,11 @@ def predict_map(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
-    values: dict[str, Any] = field_map.empty_layers(len(names), grid.shape)
-    stride = _stride(grid, promise, tolerance_db)
-    every, computed = np.flatnonzero(grid.inside), 0
+    values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
+    every, computed, stride = np.flatnonzero(grid.inside), 0, 1
+    if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
+        # Cells asked about everywhere are no farther apart than what was measured.
+        stride = max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
     joint = joint_levels(predictor, grid.places(every[:1]), numbers) is not None
     alike = np.zeros_like(values["power_db"])
     size = len(names) if joint else 1  # stations that are asked about at once
@@ -97,7 +98,7 @@ def predict_map(
         chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
         ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
         parts, count = sample_adaptively(ask, grid.inside, stride, tolerance_db)
-        parts = parts.reshape(-1, size, *grid.shape)
+        parts = parts.reshape(-1, size, *grid.inside.shape)
         values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
         alike[chosen] = parts[2] if joint else 0.0
         computed += count * size
@@ -113,12 +114,12 @@ def predict_map(
         mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
         far = np.zeros(mean.shape)
         if promise is not None:
-            local = to_local(site, grid.places(cells), other_end, site.static_end is None)
+            local = to_local(site, grid.places(cells), other_end)
             far = np.stack([promise.distance(local, number) for number in numbers])
-        half = calibration.half_width(spread, far, numbers[:, None])
+        half, error = calibration.half_and_error(spread, far, numbers[:, None])
         # The strongest before anything is refused, to which `alike` is the correlation.
         first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
-        error = np.where(np.isfinite(mean), calibration.expected_error(spread, far, numbers[:, None]), np.nan)
+        error = np.where(np.isfinite(mean), error, np.nan)
         # To float32 before comparing: what is stored decides the best server.
         power, error = mean.astype(np.float32), error.astype(np.float32)
         best = best_server(power)
@@ -137,7 +138,7 @@ def predict_map(
     if promise is not None and not np.isfinite(values["power_db"]).any():
         fault = f"every square lies more than {calibration.reach:.3g} m from what was measured"
         raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
-    extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.shape)}
+    extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.inside.shape)}
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
         grid, **values, share=share, calibrated=promise is not None,
@@ -198,13 +199,6 @@ def _chunks(rows: np.ndarray, size: int) -> list[np.ndarray]:
     return [rows[start : start + size] for start in range(0, len(rows), size)]
 
 
-def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
-    """Cells between those that are asked about everywhere: no farther apart than what was measured."""
-    if tolerance_db <= 0 or grid.inside.sum() <= ALL_CELLS or promise is None:
-        return 1
-    return max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
-
-
 def _asker(
     predictor: Predictor, joint: bool, grid: Grid, other_end: Sequence[float] | None,
     names: Sequence[str], numbers: np.ndarray,
@@ -262,32 +256,27 @@ def query_ends(
             raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
         return {site.moving_end: places}
     if other_end is None:
-        raise DataError(OTHER_END)
+        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
     return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other_end), places.shape)}
 
 
-def read_place(name: str, value: Any) -> np.ndarray:
-    """(3,) [m] of the setting `name`; `DataError` where it is no place."""
+def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
+    """(3,) [m] of the setting `name`, with 2 `axes` also (2,); `DataError` where it is no place."""
     place = finite_array(value)
-    if place.shape != (3,):
-        raise DataError(f"{name}={value}: three finite numbers [m] are needed")
+    if place.shape not in ((axes,), (3,)):
+        raise DataError(f"{name}={value}: {('two', 'three')[axes - 2]} finite numbers [m] are needed")
     return place
 
 
-def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None, both: bool) -> np.ndarray:
-    """World places (n, 3) of the moving end as local ones, (n, 6) of transmitter and receiver if `both` [m].
+def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) -> np.ndarray:
+    """World places (n, 3) of the moving end as local ones, (n, 6) of both ends where both moved [m].
 
     Raises:
-        DataError: both are needed, and nobody says where the other end stands.
+        DataError: both moved, and nobody says where the other end stands.
     """
-    local = places - site.origin
-    if not both:
-        return local
-    if site.static_position is None and other_end is None:
-        raise DataError(OTHER_END)
-    still = np.asarray(other_end) - site.origin if site.static_position is None else site.static_position
-    pair = np.broadcast_to(still, local.shape), local
-    return np.hstack(pair[::-1] if site.static_end == "rx" else pair)
+    ends = query_ends(site, places, other_end)
+    moved = [end for end in ("tx", "rx") if end in ends]
+    return np.hstack([ends[end] - site.origin for end in moved])
 
 
 def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: float | None) -> np.ndarray:

@@ -152,7 +152,7 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
         own, names = field.power_db[its], tuple(np.array(field.stations)[its].tolist())
         if not np.isfinite(own).any():
             continue
-        strongest = best_server(own.reshape(len(own), -1)).reshape(field.grid.shape)
+        strongest = best_server(own.reshape(len(own), -1)).reshape(field.grid.inside.shape)
         level = np.take_along_axis(own, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
         yield Layer(f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level))
         where = np.where(strongest == REFUSED, np.nan, strongest)
@@ -249,8 +249,9 @@ def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **
 def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
     """Draw the floor plan, where it lies."""
     height, width = plan.image.shape[:2]
-    a, b, c, d, e, f = plan.matrix()
-    turn = Affine2D.from_values(a, b, c, d, e, f) + axis.transData
+    along, at = plan.scale, plan.shift  # rows go down: their step is -j times that of columns
+    matrix = along.real, along.imag, along.imag, -along.real, at.real, at.imag
+    turn = Affine2D.from_values(*matrix) + axis.transData
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
@@ -275,8 +276,7 @@ def draw_measurement_plan(
 ) -> None:
     """Expected error before and after, the chosen places, and how it falls."""
     left, right, low, high = batch.grid.extent
-    wide = (right - left) / max(right - left, high - low)
-    tall = (high - low) / max(right - left, high - low)
+    wide, tall = np.array([right - left, high - low]) / max(right - left, high - low)
     figure, ((before, after, curve),) = panels(
         11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
     )
@@ -285,7 +285,7 @@ def draw_measurement_plan(
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
     done = f"after these {len(batch.places)}"
     for axis, values, title in ((before, batch.error_before, "now"), (after, batch.error_after, done)):
-        image = np.full(batch.grid.shape, np.nan)
+        image = np.full(batch.grid.inside.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
         from_above.set_bounds(axis, (left, low), (right, high), ylabel="", title=title)

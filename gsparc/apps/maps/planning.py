@@ -17,11 +17,11 @@ from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
-from gsparc.apps.maps.making import choose_stations
+from gsparc.apps.maps.making import choose_stations, read_place
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, finite_array, number, or_null, whole
+from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 
@@ -128,14 +128,14 @@ def plan_measurements(
     else:
         names, _ = choose_stations(predictor, stations)
         unknown = error_covariances(predictor, places, names, promise, other_end)
-    begin = np.zeros((0, 2)) if start is None else _start(start)
+    begin = np.zeros((0, 2)) if start is None else read_place("start", start, 2)[None, :2]
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
     before, before_db = mean_error(unknown), _expected(unknown, wanted)
     chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour)
     walk = (walkable is not None if route is None else route) or route_m is not None
-    order = np.array([chosen.index(one) for one in tour.stops], np.int64) if walk else np.arange(len(chosen))
+    order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if walk else chosen)], np.int64)
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if walk else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
@@ -153,7 +153,7 @@ def coarse_grid(
     fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
-        far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.shape)
+        far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.inside.shape)
         # No farther than a promise reaches: where nothing is said, measuring cannot be weighed.
         fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
     left, right, low, high = fine.extent
@@ -240,10 +240,3 @@ def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:
 
 def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
     return float(np.sqrt(np.mean(mean_error(unknown)[wanted] ** 2)))
-
-
-def _start(value: Sequence[float]) -> np.ndarray:
-    place = finite_array(value)
-    if place.shape not in ((2,), (3,)):
-        raise DataError(f"start={value}: [x,y] in metres is needed")
-    return place[None, :2]

@@ -107,11 +107,6 @@ class Tour:
         self.walk = np.array([nowhere if start is None else start, nowhere])
 
     @property
-    def stops(self) -> np.ndarray:
-        """Return the places (n,) in the order of the walk."""
-        return self.walk[1:-1]
-
-    @property
     def metres(self) -> np.ndarray:
         """Return what has been walked at each stop (n,) [m]."""
         return np.cumsum(self.length[self.walk[:-2], self.walk[1:-1]])

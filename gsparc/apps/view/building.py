@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,13 +15,10 @@ from gsparc.apps.view.answer import SILENT_DB, Answer
 from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly_spaced
-from gsparc.data.schema import LIGHT, Site
+from gsparc.data.schema import ENDS, LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
 
-log = logging.getLogger(__name__)
-
-WORDS = ("transmitter", "receiver")  # that stand still
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
 DOT = 0.01  # width of a measured place, of the extent of the site
@@ -42,8 +38,8 @@ VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "r
 
 def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None) -> Scene:
     """Everything that stands still, with the measurements and the Gaussians of one station."""
-    points = [viewed.box()]  # where was measured, and the ends that stand
-    points += [place[None] for name in viewed.stations if (place := viewed.static_place(name)) is not None]
+    stands = {name: at for name in viewed.stations if (at := viewed.static_place(name)) is not None}
+    points = [viewed.box(), *(at[None] for at in stands.values())]
     if viewed.site.static_end is None:
         points.append(viewed.site.box + viewed.site.origin)
     frame = Frame.around(np.concatenate(points))
@@ -57,13 +53,14 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
         edges = corners[1] - corners[0], corners[3] - corners[0]
         parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
     if seen is not None:
-        parts.append(_measured_part(seen, legends, extent))
-    for name in viewed.stations:
-        place = viewed.static_place(name)
-        if place is not None:
-            named = len(viewed.stations) <= MOST_NAMES or name == station
-            text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
-            parts.append(Mark(f"station {name or ''}".strip(), place, text))
+        chosen = evenly_spaced(len(seen.places), MOST_POINTS)
+        legends[VALUES] = legend = Legend.over(seen.label, seen.values[chosen])
+        colours = legend.to_colours(seen.values[chosen])
+        parts.append(Points(VALUES, seen.places[chosen], colours, DOT * extent))
+    for name, place in stands.items():
+        named = len(viewed.stations) <= MOST_NAMES or name == station
+        text = (name or ENDS[viewed.site.static_end or "tx"]) if named else ""
+        parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin
     for number, plane in enumerate(objects.planes):
@@ -73,7 +70,9 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
         parts.append(_mesh(f"box {number}", box_faces(*box), BOX, 0.35))
     cloud = model_gaussians(viewed, station, seen)
     if cloud is not None:
-        parts.append(_cloud_part(cloud, legends, extent))
+        legends[GAUSSIANS], colours = cloud_colours(cloud)
+        size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
+        parts.append(Points(GAUSSIANS, cloud.means, colours, size))
     faces = np.array(box_faces(*viewed.box()))
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
     parts.append(Lines("box of measurements", sides, np.full((len(sides), 3), 150, np.uint8)))
@@ -81,19 +80,6 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
     return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
-
-
-def _measured_part(measured: Measured, legends: dict[str, Legend], extent: float) -> Part:
-    chosen = evenly_spaced(len(measured.places), MOST_POINTS)
-    places, values = measured.places[chosen], measured.values[chosen]
-    legends[VALUES] = Legend.over(measured.label, values)
-    return Points(VALUES, places, legends[VALUES].to_colours(values), DOT * extent)
-
-
-def _cloud_part(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> Part:
-    legends[GAUSSIANS], colours = cloud_colours(cloud)
-    size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
-    return Points(GAUSSIANS, cloud.means, colours, size)
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:

@@ -40,9 +40,6 @@ class LatestJobQueue:
             for key in [key for key in self._jobs if isinstance(key, tuple) and key[0] == client]:
                 del self._jobs[key]
 
-    def __len__(self) -> int:
-        return len(self._jobs)
-
     def close(self) -> None:
         """End after the present step."""
         with self._wake:

@@ -43,11 +43,10 @@ def refine_plane(
 
     `other_end` (3,) is the transmitter's world place [m] where both ends move.
     """
-    ny, nx = grid.shape
-    level = np.full(grid.shape, np.nan)
-    stride = 1 << max(0, int(np.ceil(np.log2(max(np.sqrt(nx * ny / FIRST), 1.0)))))
-    row, column = np.mgrid[0:ny, 0:nx]
-    done, chunk = np.zeros(grid.shape, bool), LEAST
+    level = np.full(grid.inside.shape, np.nan)
+    stride = 1 << max(0, int(np.ceil(np.log2(max(np.sqrt(level.size / FIRST), 1.0)))))
+    row, column = np.indices(grid.inside.shape)
+    done, chunk = np.zeros(grid.inside.shape, bool), LEAST
     while stride:
         chosen = (row % stride == 0) & (column % stride == 0) & ~done & grid.inside
         cells, start = np.flatnonzero(chosen), 0
@@ -59,16 +58,10 @@ def refine_plane(
             chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
             yield None
         done |= chosen
-        yield Plane(grid, _spread(level, stride, grid), stride)
+        block = level[row - row % stride, column - column % stride]
+        every = np.where(np.isfinite(level), level, block)
+        yield Plane(grid, np.where(grid.inside, every, np.nan), stride)
         stride //= 2
-
-
-def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
-    """Every cell with the level of the asked one whose block it is in."""
-    ny, nx = grid.shape
-    coarse = level[::stride, ::stride]
-    repeated = np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[:ny, :nx]
-    return np.where(grid.inside, np.where(np.isfinite(level), level, repeated), np.nan)
 
 
 def plane_sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:

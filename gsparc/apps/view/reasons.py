@@ -12,6 +12,7 @@ from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.apps.view.building import SURFACES
 from gsparc.apps.view.scene import Faces, Part
+from gsparc.data.schema import ENDS
 
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
 
@@ -52,9 +53,6 @@ def _paths(answer: Answer) -> list[str]:
             how = "cancel each other" if gap < 0 else "add up"
             lines.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")
     return lines
-
-
-ENDS = {"tx": "transmitter", "rx": "receiver"}
 
 
 def summarise_answer(answer: Answer, unit: str = "dB") -> str:

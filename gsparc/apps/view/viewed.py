@@ -12,6 +12,7 @@ import numpy as np
 
 from gsparc.apps.maps import levels
 from gsparc.apps.maps.making import choose_stations
+from gsparc.apps.maps.promise import station_numbers
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.open_runs import align_to_site, open_files
 from gsparc.prediction.operating_point import load
@@ -88,20 +89,13 @@ class Viewed:
         # Outwards to the centimetre, so that the slider reaches floor and ceiling.
         return float(np.floor(100 * low) / 100), float(np.ceil(100 * high) / 100)
 
-    def rows(self, station: str | None) -> np.ndarray:
-        """Return rows of a station."""
-        if self.data is None:
-            return np.zeros(0, np.int64)
-        if station is None or self.data.station is None or self.site.stations is None:
-            return np.arange(len(self.data))
-        number = self.site.stations.name.index(station)
-        return np.flatnonzero(self.data.station == number)
-
     def measured_at(self, station: str | None) -> Measured | None:
         """Return values of a station; None without data."""
         if self.data is None:
             return None
-        data, rows = self.data, self.rows(station)
+        data, stations = self.data, self.site.stations
+        number = 0 if station is None or stations is None else stations.name.index(station)
+        rows = np.flatnonzero(station_numbers(data, np.arange(len(data))) == number)
         places = data.moving[rows][:, -3:] + data.site.origin
         if data.site.kind == "spectrum":
             chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))

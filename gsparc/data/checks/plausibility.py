@@ -126,8 +126,8 @@ def duplicate_warnings(levels: LinkLevels) -> list[str]:
     warnings = []
     same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
     if same:
-        advice = "fine if measured twice (rows of a place stay on one side of a split), else leave them out"
-        warnings.append(f"copies (same place, station and level): {list_first(same)}; {advice}")
+        fine = "fine if measured twice (rows of a place stay on one side of a split), as are repeats near by"
+        warnings.append(f"copies (same place, station and level): {list_first(same)}; {fine}, else leave out")
     spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
     if len(spreads):
         warnings.append(
@@ -232,7 +232,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
             often = count >= FEW * len(used) and len(around) > 0
             (faint if often and np.median(around) < weak else plain)[name] = count
     warnings = [
-        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: an outage; "
+        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: off, or not listed; "
         "these rows are not used"
         for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2])
     ]
@@ -243,15 +243,15 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         # First of all: what is not heard and not said so leaves weak stations far too strong.
         warnings.insert(
             0,
-            "not heard? then say dataset.absent=silent (where they have no row) or "
-            f"dataset.columns.sensitivity_db={floor:g} (for empty cells): {sum(faint.values())} levels are "
+            "not heard? then say dataset.absent=silent (of empty cells also "
+            f"dataset.columns.sensitivity_db={floor:g} does): {sum(faint.values())} levels are "
             f"missing{_of([*faint], len(names))}, beside the weakest ones; left out, weak levels are "
             "predicted too high",
         )
     if plain:
         warnings.append(
             f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}, few or beside strong "
-            "ones: lost rather than not heard; they are not used"
+            "ones: lost or not listed; they are not used"
         )
     return warnings
 

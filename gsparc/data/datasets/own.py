@@ -66,7 +66,7 @@ def apply_settings(
     Args:
         raw: as it was read.
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
-        absent: `silent`: a station without a row at a place where others have one was not heard there;
+        absent: `silent`: a station without a level at a place where others have one was not heard there;
             `auto`: one that a list of the strongest leaves out is below its weakest, levels that are missing
             beside weak ones alone are below their station's; `unknown`: neither.
         saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where it

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.plausibility import find_marks
+from gsparc.data.errors import Severe
 from gsparc.data.links.strongest import StrongestLists, number_lists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
@@ -18,23 +19,35 @@ UNLISTED_EACH = 2  # rows of what is not listed for one that is
 
 
 def add_absent(check: Checker, measured: str, count: int) -> None:
-    """Add a row that was not heard for each place and station, of `count`, without one."""
+    """Say that each of `count` stations without a level at a place where others have one was not heard."""
     if measured != "rssi_db":
         return check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
     arrays = check.raw.arrays
+    if arrays["rssi_db"].ndim != 1:
+        return None  # refused where values are read
     _, first, of_place = np.unique(arrays["place"], return_index=True, return_inverse=True)
+    of_place = of_place.reshape(-1)
+    known = ~np.isnan(arrays["rssi_db"])
+    some = np.bincount(of_place, known) > 0
     # Links are numbered place by station, so that those without a row are a set difference.
-    lost = np.setdiff1d(np.arange(len(first) * count), of_place.reshape(-1) * count + arrays["station"])
+    lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + arrays["station"])
+    lost = lost[some[lost // count]]
     floor = _floors(arrays, count)
     # Minus infinity lies below whatever turns out to be the limit of hearing.
     _repeat(check, np.r_[: len(of_place), first[lost // count]], lost % count)
     if floor is not None and floor.ndim:
         check.raw.arrays["sensitivity_db"][len(of_place) :] = floor[lost % count]
-    check.notes.append(f"{len(lost)} links without a row were not heard, as dataset.absent=silent says")
+    empty = np.flatnonzero(~known & some[of_place])  # cells of a wide table
+    check.raw.arrays["rssi_db"][empty] = -np.inf
+    silent = len(lost) + len(empty)
+    check.notes.append(f"{silent} links without a level were not heard, as dataset.absent=silent says")
 
 
-def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
-    """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out."""
+def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) -> None:
+    """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out.
+
+    Not `wanted`, lists of the strongest are said to flatter the figures of what they list.
+    """
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
     whole = levels.ndim == 1 and "mask" not in arrays
@@ -45,7 +58,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End) -> None:
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
-    if not lists.are_strongest():
+    strongest = lists.are_strongest()
+    if not wanted:
+        flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
+        unknown = f"lists of the {lists.length} strongest of {count} stations with dataset.absent=unknown"
+        check.notes += [Severe(f"{unknown}: {flattered}; leave absent out")] if strongest else []
+        return
+    if not strongest:
         # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
         said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
         found = None if said else lists.below_floor()

@@ -144,10 +144,10 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
         check, _selected(check, measured, stations, part) or stations, measured in POWERS
     )
     absent = check.raw.attributes.get("absent", "auto")
-    if long and absent == "silent":
+    if absent == "silent":
         add_absent(check, measured, len(stations))
-    if absent == "auto" and measured == "rssi_db":
-        add_unlisted(check, stations, static)
+    if absent != "silent" and measured == "rssi_db":
+        add_unlisted(check, stations, static, absent == "auto")
     return censor_rows(check, measured, Links(static, stations))
 
 

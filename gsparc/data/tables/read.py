@@ -325,7 +325,7 @@ class Builder:
                 self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
         if self.sheet.problems:
             return None
-        self._note_silent("without a column", silent)
+        self._note_silent("without a column, and left out", silent)
         # The list's order and that of the columns differ: levels stay, facts of stations are reordered.
         order = np.array([self.listed.names.index(label) for label in labels])
         for role in PER_STATION:
@@ -360,8 +360,7 @@ class Builder:
         assert self.listed is not None
         index = pd.Index(self.listed.names).get_indexer(words)
         self.arrays |= self.listed.extra
-        heard = set(index.tolist())
-        self._note_silent("in no row", [n for i, n in enumerate(self.listed.names) if i not in heard])
+        self._note_silent("in no row, and kept", np.delete(self.listed.names, index).tolist())
         return replace(self.listed, index=index)
 
     def _note_silent(self, where: str, names: list[str]) -> None:

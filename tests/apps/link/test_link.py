@@ -110,9 +110,9 @@ def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
 def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
     """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
     none = np.zeros(2)
-    rates = Rates(-50.0, none, none, none, none, none, none + 1, none, none == 0, 0.0)
+    rates = Rates(-50.0, none, none, none, none, none, none + 1, none == 0, 0.0)
     facts = rate_facts([rates], np.array([True, False]))
-    assert facts["mcs/-50dB/shortfall"] is None and facts["mcs/-50dB/shortfall_calm_30%"] is None
+    assert facts["mcs/-50dB/shortfall"] is None
     assert all(value is None or np.isfinite(value) for value in facts.values())
 
 
@@ -179,7 +179,7 @@ def test_without_doubt_the_choice_carries_most() -> None:
     known = Band(true, true, torch.zeros(40))
     loop = Adaptation()
     found = loop.rates(known, 0.03, 1.0)
-    assert np.allclose(found.chosen_bps, found.best_bps) and np.allclose(found.regret_bps, 0)
+    assert np.allclose(found.chosen_bps, found.best_bps)
     assert found.oracle_bps.mean() > 5e6 and (found.best_bps >= found.oracle_bps).all()
     deaf = loop.rates(known, 1e4, 1.0)
     assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6

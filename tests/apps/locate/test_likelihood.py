@@ -1,9 +1,13 @@
 """Misfits of snapshots at places against what they are by definition."""
 
+import logging
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
+from gsparc.apps.locate import judging
 from gsparc.apps.locate.likelihood import Trust, channel_misfit, level_misfit, spectrum_misfit
 
 RNG = np.random.default_rng(0)
@@ -70,7 +74,9 @@ def test_heavy_tail_forgives_a_bad_snapshot():
     assert light[1] - light[0] > 100 and 0 < heavy[1] - heavy[0] < 10
 
 
-def test_the_log_showed_trust_as_an_object():
-    said = str(Trust(0.05, 0.14, 16.0, 0.1, 0.99))
-    assert said.startswith("variances times 0.05, 14.0% of values counted as independent, t distribution")
-    assert said.endswith("places recorded to 0.1 m; areas have 99.0% of the probability")
+def test_the_log_showed_trust_as_an_object(monkeypatch, caplog, tmp_path):
+    monkeypatch.setattr(judging.locating, "learn_trust", lambda *_: (Trust(), 3))
+    run = SimpleNamespace(retraining=lambda **_: None)
+    with caplog.at_level(logging.INFO):
+        judging._trust(SimpleNamespace(seed=0, calibrate=2, calibrate_s=1), run, None, None, tmp_path)
+    assert "3 snapshots left out: areas of 90.0 %" in caplog.text and "Trust(" not in caplog.text

@@ -24,7 +24,7 @@ def hall(count, seed):
 
 def heard(values, places):
     kind = "csi" if np.iscomplexobj(values) else "rssi"
-    return Snapshots(kind, torch.from_numpy(values), None, places, np.arange(len(values)))
+    return Snapshots(kind, torch.from_numpy(values), None, places)
 
 
 @pytest.mark.parametrize("name", PLAIN)

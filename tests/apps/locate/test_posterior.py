@@ -77,5 +77,5 @@ def test_area_of_a_known_density_holds_its_share():
 
 def test_two_places_alike_are_two_modes():
     cells = cover_box(PLACES, 5_000, False)
-    assert len(gaussians(cells, [[0.8, 1.0], [3.2, 1.0]], 0.1).modes(0.9)) == 2
-    assert len(gaussians(cells, [[0.8, 1.0]], 0.1).modes(0.9)) == 1
+    assert gaussians(cells, [[0.8, 1.0], [3.2, 1.0]], 0.1).count_modes(0.9) == 2
+    assert gaussians(cells, [[0.8, 1.0]], 0.1).count_modes(0.9) == 1

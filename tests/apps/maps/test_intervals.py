@@ -42,10 +42,9 @@ def test_as_many_lie_inside_as_promised(heavy, share):
 def test_width_rises_with_distance_and_ends():
     found = calibrate(evidence())
     far = np.linspace(0, found.reach, 50)
-    half = found.half_width(np.full(50, 2.0), far, np.zeros(50, int))
+    half, _ = found.half_and_error(np.full(50, 2.0), far, np.zeros(50, int))
     assert np.isfinite(half).all() and half[-1] > 1.2 * half[0]
-    assert np.isnan(found.half_width(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
-    assert np.isnan(found.expected_error(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
+    assert np.isnan(found.half_and_error(np.array([2.0]), np.array([11.0]), np.array([0]))).all()
 
 
 def test_the_model_without_any_sense_of_distance_still_gets_wider():
@@ -66,7 +65,7 @@ def test_each_station_holds_its_own_share():
 def test_outage_follows_the_errors_and_not_a_bell():
     known = evidence(heavy=True)
     found = calibrate(known)
-    expected = found.expected_error(known.spread_db, known.distance, known.station)
+    _, expected = found.half_and_error(known.spread_db, known.distance, known.station)
     for below in (-75.0, -71.0, -65.0):
         said = np.nanmean(found.probability_below(below, known.mean_db, expected))
         assert abs(said - np.mean(known.level_db < below)) < 0.03

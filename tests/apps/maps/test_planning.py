@@ -91,7 +91,7 @@ def test_a_walk_is_not_longer_than_it_must_be():
     tour = Tour(np.abs(at - at.T) * 1.0, int(np.argmin(at)), None)
     for place in rng.permutation(np.flatnonzero(at)):
         tour.add(place)
-    assert tour.metres[-1] == pytest.approx(11) and sorted(tour.stops) == sorted(np.flatnonzero(at))
+    assert tour.metres[-1] == pytest.approx(11) and sorted(tour.walk[1:-1]) == sorted(np.flatnonzero(at))
 
 
 def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
@@ -111,7 +111,7 @@ def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
 @pytest.mark.parametrize("how, said", [
     ({"count": 0}, "at least 1"),
     ({"count": 2, "route_m": -1}, "above 0"),
-    ({"count": 2, "start": [1]}, r"\[x,y\]"),
+    ({"count": 2, "start": [1]}, "two finite numbers"),
     ({"count": 2, "least_gain_db": -1}, "at least 0"),
     ({"count": 2, "length_m": 0}, "above 0"),
     ({"count": 2, "area": None}, "nothing says where"),

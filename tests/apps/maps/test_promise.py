@@ -41,7 +41,7 @@ def test_intervals_of_thirty_towns_hold_a_measurement_as_often_as_promised_and_t
         promise = gather_promise(learned, PromiseSettings(seed=seed))
         mean, spread = predict_rows(method, data, fold.test)
         far = promise.distance(data.moving[fold.test], 0)
-        half = promise.calibration(SHARE).half_width(spread, far, np.zeros(len(far), int))
+        half, _ = promise.calibration(SHARE).half_and_error(spread, far, np.zeros(len(far), int))
         missed = (np.abs(one[fold.test] - mean) for one in (level, field))
         found = np.column_stack([far, *(miss <= half for miss in missed), np.full(len(far), seed % 2)])
         parts.append(found[np.isfinite(half)])

@@ -17,9 +17,9 @@ def work():
 
 def settle(work, seconds=5.0):
     end = time.monotonic() + seconds
-    while len(work) and time.monotonic() < end:
+    while work._jobs and time.monotonic() < end:
         time.sleep(0.005)
-    assert not len(work)
+    assert not work._jobs
 
 
 def job(done, *said, begun=None, go=None):

@@ -17,18 +17,18 @@ def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     planes = [plane for plane in refine_plane(asked, grid) if plane is not None]
     assert [plane.stride for plane in planes] == [2, 1]
     assert all(np.isfinite(plane.level_db).all() for plane in planes)
-    direct = asked.rssi(rx=grid.places()).reshape(grid.shape)
+    direct = asked.rssi(rx=grid.places()).reshape(grid.inside.shape)
     np.testing.assert_allclose(planes[-1].level_db, direct, atol=1e-4)
     first = weakest_place(planes[-1])
     np.testing.assert_array_equal(first, grid.places()[direct.argmin()])
     second = weakest_place(planes[-1], [first])
-    assert np.linalg.norm(second - first) >= 0.1 * max(grid.shape) * grid.step
+    assert np.linalg.norm(second - first) >= 0.1 * max(grid.inside.shape) * grid.step
     assert weakest_place(planes[-1], grid.places()) is None
 
 
 def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
     grid = power_view.grid
-    values = np.zeros(grid.shape)
+    values = np.zeros(grid.inside.shape)
     values[0, 0] = np.nan  # south-west
     dot = power_view.station("west").dot
     assert power_view.station("west").power is not None

@@ -91,7 +91,6 @@ def test_train(slip, file, tmp_path):
     ("eval_on=vall", "did you mean 'val'"),
     ("threads=-2", "threads=-2"),
     ("baselines=[nearst]", "did you mean 'nearest'"),
-    ("dataset.rot=x", "did you mean 'dataset.root'"),
 ])  # fmt: skip
 def test_evaluate(slip, says, tmp_path):
     given = [f"hydra.run.dir={tmp_path}", "ckpt=absent.ckpt", slip]

@@ -36,22 +36,18 @@ class Trajectory:
         if len(self.time_s) < 2 or (np.diff(self.time_s) <= 0).any():
             raise ValueError("a trajectory needs two rows or more, each later than the one before (time_s)")
 
-    @property
-    def fastest(self) -> float:
-        """[m/s]."""
-        return float((np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max())
-
     def places_at(self, time_s: np.ndarray) -> np.ndarray:
         """Places (m, 3) at times (m,)."""
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place.T], 1)
 
     def instants(self, wavelength: float) -> np.ndarray:
         """Times (T,), a part of a wavelength apart, at which a channel is to be known; four or more."""
-        length = float(self.time_s[-1] - self.time_s[0])
+        fastest = float((np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max())
+        longest = float(self.time_s[-1] - self.time_s[0]) * fastest / wavelength  # were it always that fast
         # Four at least: a cubic spline needs them.
-        count = max(int(np.ceil(length * self.fastest * PER_WAVE / wavelength)) + 1, 4)
+        count = max(int(np.ceil(longest * PER_WAVE)) + 1, 4)
         if count > MOST:
-            far = f"the trajectory is {length * self.fastest / wavelength:.0f} wavelengths long"
+            far = f"the trajectory is {longest:.0f} wavelengths long"
             raise ValueError(f"{far}, at most {MOST // PER_WAVE} are exported at once; take a part of it")
         return np.linspace(self.time_s[0], self.time_s[-1], count)
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.files import write_whole
 from gsparc.prediction.predictor import Predictor
 
 # \r\n as in PNG: a transfer as text would change it, which is then found out. 64: a cache line.
@@ -51,10 +49,3 @@ def pack_form(form: Form, origin: np.ndarray, error: float = 0.0, worst: float =
     checked = struct.pack("<qq", at, len(arrays)) + b"".join([*table, *body])
     # The sum covers sizes and all arrays, but not itself and what comes before it.
     return HEAD.pack(MAGIC, VERSION, zlib.crc32(checked), at, len(arrays))[:CHECKED] + checked
-
-
-def write_form(path: Path, form: Form, origin: np.ndarray, error: float, worst: float) -> int:
-    """Write `pack_form` whole or not at all; returns its bytes."""
-    blob = pack_form(form, origin, error, worst)
-    write_whole(path, blob)
-    return len(blob)

@@ -99,8 +99,10 @@ def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarra
     return np.stack([squared, power if model.site.kind == "csi" else np.ones(len(places))])
 
 
-_ARRAY, _IMAGE, _SUM = "an array's spectrum", "a frozen image", "a sum of sources"
-_NAMES = {1: _ARRAY, 2: _IMAGE, 3: _SUM, 4: "a process of powers", 5: "a mean of processes of powers"}
+_NAMES = dict(enumerate((
+    "an array's spectrum", "a frozen image", "a sum of sources", "a process of powers",
+    "a mean of processes of powers",
+), 1))  # fmt: skip
 
 
 def compile_exactly(method: Method, site: Site) -> Form | None:

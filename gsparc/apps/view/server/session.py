@@ -18,10 +18,11 @@ from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, dr
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import Plane, plane_sheet, refine_plane, weakest_place
-from gsparc.apps.view.reasons import ENDS, answer_markdown, explain_level, legend_html
+from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html
 from gsparc.apps.view.scene import EXTENT, Points
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView
+from gsparc.data.schema import ENDS
 
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
@@ -37,7 +38,6 @@ class Session:
         self.station = self.chosen_station = view.viewed.stations[0]
         self.one = view.station(self.station)
         self.places = {end: np.asarray(at, float) for end, at in view.initial_places(self.station).items()}
-        self.answers = 0  # that were shown
         self.plane: Plane | None = None
         self.visited: list[np.ndarray] = []  # weak places of it, one after another
         self.power: Legend | None = None  # of the plane, where it is predicted
@@ -213,7 +213,6 @@ class Session:
             self.answer_text.content = f"**{error}**"
             return
         self._show(answer)
-        self.answers += 1
         # The picture has a key of its own: a later answer replaces it before it is drawn.
         self.work.put((self.client.client_id, "panel"), partial(self._panel_of, answer))
         yield
