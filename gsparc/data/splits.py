@@ -197,8 +197,8 @@ def make_split(
     rows, left = len(positions), settings.leave_out
     absent = np.zeros(0, np.int64) if isinstance(left, int) else rows_to_leave_out(left, outliers, rows)
     rows_left = np.setdiff1d(np.arange(rows), absent)
-    # Files of the release are its published split; `redraw` is for drawing others.
-    named = release_split if settings.name == "random" and not settings.redraw else None
+    # Files of the release are its published split; `redraw` is for drawing others, and not read without.
+    named = None if settings.name != "random" or release_split is None or settings.redraw else release_split
     # Of the rows that stand for their places, and the place of each row.
     first = which = np.arange(len(rows_left))
     if settings.name in ("stations", "runs"):
