@@ -185,7 +185,7 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
         )
     if any(number >= len(split.folds) for number in numbers):
         raise ValueError(f"fold {max(numbers)} was trained, split={split.name} has {len(split.folds)} folds")
-    return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
+    return replace(split, folds=tuple(split.folds[number] for number in numbers))
 
 
 def were_trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:

@@ -62,7 +62,7 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
         ("stays", _static(data.site)),
         ("moves", _moving(data)),
         ("carrier", _carrier(data.site)),
-        ("split", f"{split.name}: {rows}"),
+        ("split", f"{split.title}: {rows}"),
     ]
 
 
