@@ -16,7 +16,7 @@ from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.evaluation.table import Column, Interval, Table
-from gsparc.prediction.risk import Guarantee, calibration_facts, explain_too_few, run_trials
+from gsparc.prediction.risk import SHARES, Guarantee, calibration_facts, explain_too_few, run_trials
 from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
@@ -71,9 +71,9 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
         Column("rows divided", "", of="how"), Column("confidence", "", of="kind"),
         Column("answers accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
         Column("trials accepting none", ".0%", of="silent"),
-        Column("too many bad, of accepting trials", ".1%", of=_broken),
         Column("too many bad, of all trials", ".1%", of="broken_of_all"),
-        Column("promised at most", ".0%", of=lambda row: facts["promise/delta"]),
+        Column("promised of all trials: at most", ".0%", of=lambda row: facts["promise/delta"]),
+        Column("too many bad, of accepting trials: no promise", ".1%", of=_broken),
     ]  # fmt: skip
     # Spatial draws are left out where the patches are too few.
     trials_of = [{"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")]
@@ -82,9 +82,10 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     bad = f"bad (an error above {facts['promise/limit_db']:g} dB)"
     trials = "Trials of the promise, each of a threshold set on some rows and tried on others"
     promise = f"{trials}: more than {facts['promise/alpha']:.0%} of accepted answers {bad} are too many"
+    note = f"Trials may accept fewer: {SHARES[1]:.0%} of the rows calibrate, for storing {1 - SHARES[0]:.0%}"
     return [
         Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
-        Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row]),
+        Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row], note=note),
     ]
 
 

@@ -37,7 +37,9 @@ def check(
     # Here: they bring torch, which --help does not need.
     from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
+    from gsparc.data.checks.outliers import outlier_warnings
     from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
+    from gsparc.data.checks.unit_warnings import unit_warnings
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 
@@ -50,7 +52,8 @@ def check(
         return False
     levels = link_levels(reading.data)
     steps = [] if levels is None else find_level_steps(levels)
-    warnings: list[str] = [note for note in reading.notes if isinstance(note, Caution)]
+    warnings = [f"units? {hint}" for hint in unit_warnings(reading.data)] + outlier_warnings(reading.data)
+    warnings += [note for note in reading.notes if isinstance(note, Caution)]
     # Channels and spectra have conventions to be tried, powers of links have levels to be plausible.
     warnings += convention_warnings(reading.data) if levels is None else sanity_warnings(levels, steps)
     topics = describe(reading.data)
@@ -61,9 +64,8 @@ def check(
     if stations is not None and stations.sector is not None and (abs(stations.sector[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
-    topics += [("warning", warning) for warning in group_warnings(warnings)]
-    doubts = sum(topic in ("warning", "units?", "outliers?") for topic, _ in topics)
-    for topic, sentence in topics:
+    doubts = group_warnings(warnings)
+    for topic, sentence in [*topics, *(("warning", doubt) for doubt in doubts)]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
@@ -80,7 +82,7 @@ def check(
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
         return False
-    verdict = f"readable, but see its {doubts} warning{'s' * (doubts > 1)}" if doubts else "good"
+    verdict = f"readable, but see its {len(doubts)} warning{'s' * (len(doubts) > 1)}" if doubts else "good"
     _line(console, f"{path}: {verdict}")
     return True
 
@@ -143,8 +145,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
     console = Console()
 
-    def picture(path: str) -> str | None:
-        return None if args.no_draw else args.draw or f"outputs/check/{Path(path).resolve().stem}.png"
+    def picture(number: int) -> str | None:
+        stems = [Path(path).resolve().stem for path in paths[: number + 1]]
+        again = stems.count(stems[-1])  # files of one stem would be drawn over one another
+        name = stems[-1] + f"-{again}" * (again > 1)
+        return None if args.no_draw else args.draw or f"outputs/check/{name}.png"
 
-    good = [check(path, console, draw=picture(path), **settings) for path in paths]
+    good = [check(path, console, draw=picture(number), **settings) for number, path in enumerate(paths)]
     return 0 if all(good) else 1

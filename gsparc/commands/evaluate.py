@@ -74,7 +74,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if evaluation.columns:
         write_samples(run_dir / "per_sample.csv", evaluation.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
-    title = f"{data.site.name}, split {split.name}, {config.eval_on}"
+    title = f"{data.site.name}, split {split.title}, {config.eval_on}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)
     # Who opened the files has warned of it, and warnings are repeated below the table.
     said = remarks({**facts, "split/foreign": None}, config.eval_on)

@@ -69,7 +69,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         **dataset_facts(data), **split_facts(split),
         "seed": settings.seed, "study/rounds": study.rounds,
     }  # fmt: skip
-    title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
+    title = f"{data.site.name}, split {split.title}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))
     draw_study(rows, title, run_dir / "study.png")
     finish_run(run_dir, facts, table_of(rows, title), lines=run_conditions(facts | machine_facts()))

@@ -80,7 +80,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     table_of_points = tradeoff.table_of_points(points, pareto, chosen, copy_ms)
     write_samples(run_dir / "tradeoff.csv", table_of_points.to_dict("list"))
     best = [points[i] for i in pareto]
-    title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
+    title = f"{data.site.name}, split {run.split.title}, {config.eval_on}: {method.name}"
     save(tradeoff.draw_front(points, pareto, beside, figure, method.name, title), run_dir / "tradeoff.png")
     facts = {
         **tradeoff.facts_of(points, best, figure, beside, copy_ms),

@@ -365,8 +365,9 @@ def task(config: DictConfig) -> float:
             with recorded(run_dir, state, unread) as left:
                 config.ckpt_path = config.ckpt_path or left
                 facts, objects = train(config, run_dir, read)
-                made = f"{objects.data.site.name}, split {objects.split.name}"
-                draw = "" if config.split.get("seed") is None else f" (split.seed={config.split.seed})"
+                made = f"{objects.data.site.name}, split {objects.split.title}"
+                drawn = config.split.get("seed") is not None and not objects.split.of_release
+                draw = f" (split.seed={config.split.seed})" if drawn else ""
                 title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 tested = any(name.startswith(f"{config.eval_on}/") for name in facts)

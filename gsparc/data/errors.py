@@ -79,7 +79,7 @@ class Caution(str):
 
 
 class Severe(Caution):
-    """A caution about what changes every figure, a unit or a convention: runs say it again at their end."""
+    """A caution about what may change all figures, a unit or a convention: runs say it again at their end."""
 
 
 class DataError(ValueError):

@@ -49,11 +49,18 @@ class Split:
         name: one of `NAMES`, or a file's.
         folds: one or more folds.
         sha256: hash of all indices.
+        of_release: whether the release named the test rows.
     """
 
     name: str
     folds: tuple[Fold, ...]
     sha256: str
+    of_release: bool = False
+
+    @property
+    def title(self) -> str:
+        """Return its name, and that no seed draws the test rows where the release names them."""
+        return self.name + " (the release's test rows)" * self.of_release
 
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""
@@ -190,14 +197,13 @@ def make_split(
     rows, left = len(positions), settings.leave_out
     absent = np.zeros(0, np.int64) if isinstance(left, int) else rows_to_leave_out(left, outliers, rows)
     rows_left = np.setdiff1d(np.arange(rows), absent)
+    # Files of the release are its published split; `redraw` is for drawing others, and not read without.
+    named = None if settings.name != "random" or release_split is None or settings.redraw else release_split
     # Of the rows that stand for their places, and the place of each row.
     first = which = np.arange(len(rows_left))
     if settings.name in ("stations", "runs"):
         local_folds = _whole(None if station is None else station[rows_left], settings)
     else:
-        # Files of the release are its published split; `redraw` is for drawing others.
-        its_own = settings.name == "random" and release_split is not None and not settings.redraw
-        named = release_split if its_own else None
         if named is not None:
             # Rows were renumbered when some were left out: from numbers of the file to those that remain.
             train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
@@ -209,7 +215,7 @@ def make_split(
         pairs = enumerate(_pairs(where, settings, named))
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
     folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
-    return Split(settings.name, folds, hash_indices(folds))
+    return Split(settings.name, folds, hash_indices(folds), named is not None)
 
 
 def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:
@@ -255,11 +261,11 @@ def remove_rows(split: Split, absent: np.ndarray) -> Split:
     return Split(split.name, folds, hash_indices(folds))
 
 
-def hash_indices(folds: tuple[Fold, ...]) -> str:
-    """Return the SHA-256 of all indices of all folds."""
+def hash_indices(folds: tuple[Fold, ...], parts: Sequence[str] = ("train", "val", "test")) -> str:
+    """Return the SHA-256 of all indices of all folds, or of some `parts` of each."""
     digest = hashlib.sha256()
     for fold in folds:
-        for part in vars(fold).values():
+        for part in (getattr(fold, name) for name in parts):
             # The length first: moving a row from one part to the next changes the hash.
             digest.update(len(part).to_bytes(8, "little") + part.astype("<i8").tobytes())
     return digest.hexdigest()

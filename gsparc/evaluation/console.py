@@ -55,7 +55,7 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
     def __init__(self, quiet: Iterable[str] = (), stream: Any = None) -> None:
         super().__init__(stream or sys.stdout)
         self.quiet = tuple(f"{name}." for name in quiet)
-        self.warned: dict[str, tuple[int, str]] = {}  # by kind: how often, and the first
+        self.warned: dict[str, dict[str, None]] = {}  # by kind: different texts, in their order
         self.severe: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -67,10 +67,10 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
             self.read.update({told} - {""})
             return not again and not f"{record.name}.".startswith(self.quiet)
         if isinstance(record.args, tuple) and any(isinstance(part, Severe) for part in record.args):
-            self.severe.append(f"this changes every figure above: {message}")
-        count, first = self.warned.get(warning_kind(message), (0, message))
-        self.warned[warning_kind(message)] = count + 1, first
-        return count == 0
+            self.severe.append(f"this may change the figures above: {message}")
+        first = warning_kind(message) not in self.warned
+        self.warned.setdefault(warning_kind(message), {})[message] = None
+        return first
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the message; of a warning or an error after its level."""
@@ -79,12 +79,12 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
 
 
 def repeated_warnings() -> list[str]:
-    """Return a command's last lines on warnings: severe ones, and whether its log's file has more of any."""
+    """Return a command's last lines on warnings: severe ones, and where its log's file has others."""
     screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
-    more = [(n, first) for one in screens for n, first in one.warned.values() if n > 1]
-    again = [f"{n} like '{shorten(re.sub(PATH, '', first), AGAIN, placeholder='')} ...'" for n, first in more]
+    more = [list(texts) for one in screens for texts in one.warned.values() if len(texts) > 1]
+    again = [f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'" for a in more]
     severe = dict.fromkeys(text for one in screens for text in one.severe)
-    return [*severe, *([f"warnings that came again: {', '.join(again)}"] if again else [])]
+    return [*severe, *([f"warnings shown by their first: {', '.join(again)}"] if again else [])]
 
 
 def to_dict(node: DictConfig) -> dict[str, Any]:

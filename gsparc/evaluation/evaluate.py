@@ -11,7 +11,7 @@ import numpy as np
 
 from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split
+from gsparc.data.splits import Split, hash_indices
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import main_figure
@@ -196,7 +196,8 @@ def dataset_facts(data: Measurements) -> dict[str, Any]:
 def split_facts(split: Split) -> dict[str, Any]:
     """`split/*`; counts are sums over folds."""
     counts = {f"split/{k}": sum(len(getattr(f, k)) for f in split.folds) for k in ("train", "val", "test")}
-    return {"split/name": split.name, "split/sha256": split.sha256, "split/folds": len(split.folds), **counts}
+    hashes = {"split/sha256": split.sha256, "split/test_sha256": hash_indices(split.folds, ["test"])}
+    return {"split/name": split.name, **hashes, "split/folds": len(split.folds), **counts}
 
 
 def _skill(scores: Scores, others: Mapping[str, FittedBaseline]) -> float | None:
@@ -217,7 +218,7 @@ def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measure
         "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
         # Of what was measured, not of stored targets: channels and spectra have errors in these units.
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
-        **scores.samples,
+        **scores.samples, **paired_values(scores.samples),
     }  # fmt: skip
     if data.site.kind == "rssi":
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}

@@ -185,7 +185,7 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
         )
     if any(number >= len(split.folds) for number in numbers):
         raise ValueError(f"fold {max(numbers)} was trained, split={split.name} has {len(split.folds)} folds")
-    return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
+    return replace(split, folds=tuple(split.folds[number] for number in numbers))
 
 
 def were_trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
@@ -399,10 +399,11 @@ def calibrate_and_store(
     else:
         confidence.store_trusted(path, stored)
     if np.isfinite(threshold):
-        share = np.mean(evidence.scores[kind_used] >= threshold)
+        share = np.mean(evidence.scores[kind_used] >= choice.value)
         of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
         from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
-        return stored, f"{kind_changed}{from_there}: {of}, which fails in {guarantee.delta:.0%} of cases"
+        of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {path}"
+        return stored, f"{kind_changed}{from_there}: {of}"
     wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
     effect = design_effect(wrong, number_patches(evidence.position)) if spatial else 1.0
     bad = float(wrong.mean())

@@ -147,7 +147,7 @@ def lead_over_runs(own: Sequence[Row], others: Sequence[Row]) -> Lead | None:
     pairs = [
         (a, b)
         for a, b in product(own, others)
-        if a["draw"] == b["draw"] and (a["seed"] == b["seed"] or None in (a["seed"], b["seed"]))
+        if a["rows"] == b["rows"] and (a["seed"] == b["seed"] or None in (a["seed"], b["seed"]))
         if None not in (a["value"], b["value"])
     ]
     gains: dict[str, list[float]] = defaultdict(list)

@@ -11,6 +11,7 @@ from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
 OF_RUN = {
     "dataset": "dataset/name", "split": "split/name", "seed": "seed", "kind": "dataset/kind",
     "load": "machine/load", "data": "dataset/sha256", "git": "git", "simulate_s": "dataset/simulate_s",
+    "rows": "split/sha256",
 }  # fmt: skip
 OF_MODEL = {
     "label": "model/label", "gaussians": "model/num_gaussians", "memory_mb": "memory/peak_mb",
@@ -31,7 +32,7 @@ def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str
     """Return the row of a run's method and those of the baselines beside it, from the facts of its summary.
 
     Figures are of rows `prefix`: `test`, `train` or `val`. Columns are those of `OF_RUN`, `OF_MODEL` and
-    `COSTS`; `draw` of the split, `fold` (None: all are pooled), `method`, `baseline` (whether it is one),
+    `COSTS`; `draw` of its test rows, `fold` (None: all are pooled), `method`, `baseline` (whether it is one),
     `measured` (rows that a model learned from), `effects`, `figure` (the deciding one), its `value`, that of
     Gaussians `alone`, and every figure under its own name; None where a summary has no such fact.
     """
@@ -39,7 +40,8 @@ def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str
     counts = [int(facts.get(f"split/{name}") or 0) for name in ("train", "val", "folds")]
     folds = max(counts[2], 1)
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
-    shared["draw"] = str(facts.get("split/sha256"))[:8]  # which rows learn and test
+    # Test rows alone: a seed may move those of validation only. Older summaries have one hash of all.
+    shared["draw"] = str(facts.get("split/test_sha256", facts.get("split/sha256")))[:8]
     shared["kind"] = shared["kind"] if shared["kind"] in DECIDING else "spectrum"
     shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts, prefix), "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}

@@ -155,14 +155,10 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
         conditions.append(f"the model was trained on {facts['split/foreign']}")
     if facts.get("split/without_baselines"):
         conditions.append(f"no baselines: {facts['split/without_baselines']}")
-    if facts.get("dataset/stand_in"):
-        release = facts["dataset/stand_in"]
-        conditions.append(
-            f"SIMULATED stand-in: the {release} release was not found; these figures do not describe it"
-        )
+    if release := facts.get("dataset/stand_in"):
+        conditions.append(f"SIMULATED stand-in: these figures do not describe the {release} release")
     # A run that was not learned from has a phase that nothing tells: its figure is of another question.
-    if facts.get("split/unseen_runs"):
-        count = facts["split/unseen_runs"]
+    if count := facts.get("split/unseen_runs"):
         conditions.append(f"{count} runs were not learned from: scored after the best common phase of each")
     if facts.get("model/limited_by_clock"):
         repeat = "fixed steps or searches repeat exactly"

@@ -135,9 +135,9 @@ class Trusted(Stored):
     kind: str | None = None
     threshold: float = float("inf")
     promise: Guarantee | None = None
-    known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    kernel: Kernel | None = None
-    box: np.ndarray | None = None
+    known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    kernel: Kernel | None = field(default=None, repr=False)
+    box: np.ndarray | None = field(default=None, repr=False)
 
     def covers(self, places: np.ndarray) -> np.ndarray:
         """Tell whether local places (B, 3) [m] lie in the box, (B,) bool; all where none is known."""

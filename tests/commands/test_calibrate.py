@@ -14,6 +14,7 @@ from gsparc.commands.train import train
 from gsparc.evaluation import open_runs as command
 from gsparc.evaluation.open_runs import collect_evidence
 from gsparc.evaluation.pictures import draw_calibration
+from gsparc.prediction.confidence import as_confidence
 from gsparc.prediction.risk import (
     Evidence,
     Guarantee,
@@ -145,10 +146,11 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0
-    stored, said = command.calibrate_and_store("", {}, {}, Guarantee(better), *how)
+    stored, said = command.calibrate_and_store("a.ckpt", {}, {}, Guarantee(better), *how)
     assert f"confidence={stored.kind}, chosen by the mean error of the surest 1, 2, ... of 180 rows: " in said
     assert "before: the model's own; accepted from" in said and len(kept) == 1
     assert re.search(r"accepted from \S+, \d+% of 900 test positions: at most 10% of the accepted are", said)
+    assert said.endswith("which fails in at most 10% of cases; threshold stored in a.ckpt")
     assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better - 1), *how)[1]
     # Rows of one patch count as one, which the stored threshold did not do.
     assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better), *how, 0.8)[1]
@@ -230,6 +232,18 @@ def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
     assert len(calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[0].rows) == 2
 
 
+def test_trials_beside_a_promise_of_other_trials_read_as_a_broken_one() -> None:
+    """14% of accepting trials stood beside a promise about all; fewer answers than above had no reason."""
+    promise = Guarantee(limit_db=-5, alpha=0.2)
+    facts = calibration_facts(_evidence(), [run_trials(_evidence(), promise, "random", 5)], promise)
+    trials = calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[1]
+    heads = [column.name for column in trials.columns]
+    at = heads.index("too many bad, of all trials")
+    told = ["promised of all trials: at most", "too many bad, of accepting trials: no promise"]
+    assert heads[at + 1 :] == told
+    assert trials.note == "Trials may accept fewer: 40% of the rows calibrate, for storing 80%"
+
+
 def _trained(folder, *more: str, run: str = "run"):
     """The nearest neighbour of forty spectra."""
     return train(plain(spectra(folder / "own.npz"), "nearest", *more), folder / run)[1]
@@ -296,6 +310,15 @@ def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest
     assert facts["split/foreign"] is None  # nothing of it was learned from
     trusted, _ = command.calibrate_and_store(path, other, {}, Guarantee(), "distance", False, 0)
     assert len(trusted.known) == 32 and trusted.covers(evidence.position).all()
+
+
+def test_a_threshold_of_distances_accepted_none_of_the_test_positions(tmp_path) -> None:
+    """`accepted from 0.9933, 0% of 64`: minus metres were compared with a confidence."""
+    path = str(_trained(tmp_path).checkpoints[0])
+    evidence, _ = collect_evidence([path], {}, {})
+    trusted, said = command.calibrate_and_store(path, {}, {}, Guarantee(60, 0.4, 0.4), "distance", False, 0)
+    accepted = np.mean(as_confidence("distance", evidence.scores["distance"]) >= trusted.threshold)
+    assert accepted > 0 and f", {accepted:.0%} of {len(evidence)} test positions" in said
 
 
 def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:

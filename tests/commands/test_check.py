@@ -48,6 +48,8 @@ def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, ch
     write_own(tmp_path / "a.npz", kept)
     good, text = _said(tmp_path / "a.npz")
     assert good and warning in text
+    # The line began with `units?`, and the verdict spoke of a warning.
+    assert "warning     units? " in text and f"its {text.count('warning     ')} warning" in text
     load({"name": "own", "file": str(tmp_path / "a.npz")})
     assert warning in caplog.text
 
@@ -118,6 +120,24 @@ def test_a_file_is_drawn_unless_said_otherwise(tmp_path, arrays, monkeypatch):
     write_own(tmp_path / "hall.npz", arrays)
     assert main(["hall.npz", "--no-draw"]) == 0 and not (tmp_path / "outputs").exists()
     assert main(["hall.npz"]) == 0 and (tmp_path / "outputs" / "check" / "hall.png").exists()
+
+
+def test_the_second_file_of_a_stem_was_drawn_over_the_first(tmp_path, arrays, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a/powers.npz", "b/powers.npz"):
+        (tmp_path / name).parent.mkdir()
+        write_own(tmp_path / name, arrays)
+    assert main(["a/powers.npz", "b/powers.npz"]) == 0
+    drawn = sorted(path.name for path in (tmp_path / "outputs" / "check").iterdir())
+    assert drawn == ["powers-2.png", "powers.png"]
+
+
+def test_levels_in_db_were_said_to_be_divided(tmp_path, arrays):
+    rng = np.random.default_rng(0)
+    powers = {name: arrays[name] for name in ("rx_position", "tx_position")}
+    write_own(tmp_path / "a.npz", {**powers, "rssi_db": rng.uniform(-90, -53, 10)})
+    said = _said(tmp_path / "a.npz")[1]
+    assert "dB is taken off, then stored" in said and "divided by" not in said
 
 
 def test_advice_of_a_refusal_was_refused(tmp_path, capsys):

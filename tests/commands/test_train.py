@@ -102,7 +102,7 @@ def test_a_file_of_a_run_without_folds_was_no_error(field, spectra_file, tmp_pat
 
 def test_files_in_a_list_were_an_error_of_their_path(tmp_path):
     with pytest.raises(SettingError, match="expected one file; join tables first"):
-        train(compose("dataset=own", "dataset.file=[a.csv,b.csv]", "model=mean"), tmp_path / "run")
+        train(compose("dataset=own", "dataset.file=[a.csv,b.csv]", "model=mean", "logger=none"), tmp_path / "run")
 
 
 def test_the_simulated_stand_in_says_so(tmp_path):
@@ -195,6 +195,20 @@ def test_the_title_of_a_table_did_not_say_the_draw_of_the_split(tmp_path):
     answer = knock(main, "train.py", given)
     assert "random (split.seed=2), test, seed 0" in " ".join((tmp_path / "run/train.log").read_text().split())
     assert answer.status == 0
+
+
+def test_the_title_named_a_seed_where_the_release_named_the_test_rows(tmp_path):
+    """`split random (split.seed=2)`, and the seed had moved validation rows alone."""
+    places = np.random.default_rng(0).uniform(0, 20, (60, 3))
+    rows = {"split_train": np.arange(40), "split_test": np.arange(40, 60)}
+    file = tmp_path / "own.npz"
+    np.savez(file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0], **rows)
+    given = ["dataset=own", f"dataset.file={file}", "model=mean", "baselines=[]", "split.seed=2"]
+    given += [f"hydra.run.dir={tmp_path / 'run'}", "logger=none", "threads=1"]
+    assert knock(main, "train.py", given).status == 0
+    said = " ".join((tmp_path / "run/train.log").read_text().split())
+    assert "split random (the release's test rows), test, seed 0" in said
+    assert "random (the release's test rows): 36 training" in said and "(split.seed" not in said
 
 
 # -- the command itself ---------------------------------------------------------------------------------

@@ -61,6 +61,13 @@ def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
         assert np.allclose(errors, found.columns["error_db"])
 
 
+def test_samples_had_the_nmse_of_baselines_and_none_of_the_method(campaign, folds):
+    data, split = campaign("csi", 40), folds(40)
+    found = evaluated(InverseDistance, data, split, baselines=["idw"])
+    assert found.columns["nmse"].mean() == pytest.approx(found.facts["test/nmse"])
+    np.testing.assert_array_equal(found.columns["nmse"], found.columns["baseline/idw/nmse"])
+
+
 def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
     facts = evaluated(InverseDistance, data, split).facts

@@ -99,7 +99,7 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     facts = {"dataset/kind": "csi", "dataset/stand_in": "rfid", "machine/load": 3.0, "test/nmse": 0.2}
     facts |= {"baseline/gp/nmse": 0.1, "baseline/idw/nmse": 0.3}
     said = " | ".join(remarks(facts))
-    for words in ("SIMULATED stand-in", "load 3.0", "gp has the better nmse"):
+    for words in ("do not describe the rfid release", "load 3.0", "gp has the better nmse"):
         assert words in said
     assert "idw" not in said
     quiet = {"dataset/kind": "spectrum", "dataset/stand_in": None, "machine/load": 0.5, "test/psnr_db": 30.0}

@@ -1,5 +1,6 @@
 """A confidence kept with a model, and what `gsparc.load` answers with it."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +51,9 @@ def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     assert np.allclose(plain.confidence(tx=world), as_confidence("distance", evidence.scores["distance"]))
     assert np.array_equal(plain.accepts(tx=world), plain.confidence(tx=world) >= 0.2)
     assert isinstance(plain.accepts(tx=world[0]), bool)
+    # It listed every place that was learned from.
+    said = r"Trusted\(kind='distance', threshold=0.2, promise=Guarantee\([^()]+\)\)"
+    assert re.fullmatch(said, repr(plain.trusted))
 
 
 def test_two_moving_ends_are_accepted_where_both_were_measured(tmp_path) -> None:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.data.checks import outliers
 from gsparc.data.checks.coherence import estimate_coherence
-from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.errors import list_first
 from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, Measurements, Site
@@ -21,20 +19,20 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     phases = estimate_coherence(data)
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
     weak, strong = (int((data.censored_side(np.arange(len(data))) == side).sum()) for side in (1, -1))
-    paths, scale = data.directions, site.target_scale
+    paths, scale, unit = data.directions, site.target_scale, site.power_unit()
+    levels = site.kind == "rssi" and unit.decibels
+    scaled = f"{unit.raised_db:.4g} dB is taken off" if levels else f"measurements are divided by {scale:.4g}"
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
         ("neighbours", spacing_words(distinct_places(data), site.wavelength)),
-        *(("units?", hint) for hint in unit_warnings(data)),
-        *(("outliers?", warning) for warning in outliers.outlier_warnings(data)),
         ("carrier", _carrier(site)),
         ("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz" if len(tones) > 1 else ""),
         ("grid", "" if site.grid is None else _grid(site.grid)),
         ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
-        ("scale", "" if scale == 1 else f"stored targets are the measurements divided by {scale:.4g}"),
+        ("scale", "" if scale == 1 else f"{scaled}, then stored"),
         ("censored", f"of {len(data)} powers {weak} lie under a level (unheard, unlisted), {strong} above one"
          if data.censored is not None else ""),
         ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with an unknown complex factor"),
@@ -64,7 +62,7 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
         ("stays", _static(data.site)),
         ("moves", _moving(data)),
         ("carrier", _carrier(data.site)),
-        ("split", f"{split.name}: {rows}"),
+        ("split", f"{split.title}: {rows}"),
     ]
 
 

@@ -77,8 +77,8 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         count = int((values > HIGHEST_DBM).sum())
         warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
     elif low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
-        said = f"no level of {low:g} to {high:g} is below 0"
-        warnings.append(f"{said}: losses, per cent, an index, or linear (then give it as rssi, in W)?")
+        said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
+        warnings.append(f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?")
     return warnings
 
 

@@ -143,7 +143,7 @@ class Release(DataModule):
             return self.read(self.root)
         if self.root is not None or self.stand_in is None:
             raise DataError(self.missing())
-        log.warning("%s Using the SIMULATED stand-in %s-sim instead.", self.missing(), self.called.lower())
+        log.warning("%s Using its SIMULATED stand-in instead.", Severe(self.missing()))
         return load_stand_in(self.stand_in, self.called, self.read)
 
 

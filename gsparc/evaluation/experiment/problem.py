@@ -20,6 +20,7 @@ from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment.done import measurements_hash
+from gsparc.evaluation.experiment.options import REDRAW
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.registry import fill_defaults
 from gsparc.simulate.scenes.build import has_known_scene
@@ -126,6 +127,8 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
                 read = data, measurements_hash(data)
             folds = split_for(to_dict(config.split), read[0])
             problems.append(Problem(name, split.name, chosen, read[0], folds, read[1], draw))
+        if folds.of_release and split.draws > 1:
+            log.warning("%s, split %s: draws move validation rows alone: %s", name, split.name, REDRAW)
     return problems
 
 

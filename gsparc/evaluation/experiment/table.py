@@ -42,6 +42,7 @@ BESIDE_COLUMNS = (
     Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2"),
 )  # fmt: skip
 OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
+LITTLE = 2 / 3  # share of a budget below which a longer one is proposed
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 GIVEN = {"newrf", "directional_gp", "calibrated_raytracer"}  # methods that learn from more than places
@@ -105,6 +106,9 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     cells = table_of_cells(filled)
     if cells.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
+    # Draws with the same test rows are seeds.
+    drawn = cells.groupby(PROBLEM)[["draw", "seed"]].transform("nunique")
+    cells["draws"] &= (drawn["draw"] > 1) | (drawn["seed"] == 1)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
     means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
@@ -185,7 +189,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if len(rows) > 1 and (lead := leads[rows[1].method]):
         before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
-        lines[0] += "" if lead.sure or lead.same else ": they are not told apart"
+        lines[0] += "" if lead.same else f": they are {'' if lead.sure else 'not '}told apart"
     own = next((row for row in rows if row.method == ours), None)
     lead = None if own is None else leads.get(own.method)
     figure = heading_of(first.figure)
@@ -206,14 +210,15 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
-    spent = [
-        f"{row.method} {row.train_cpu_s:.3g}"
-        for row in rows
-        # False for NaN: methods without a budget.
-        if abs(row.train_cpu_s - row.budget_s) > OTHERWISE * row.budget_s
-    ]
-    if spent:
-        lines.append(f"spent of {block.budget_s.max():g} processor seconds: {', '.join(spent)}")
+    budget, share = block.budget_s.max(), block.train_cpu_s / block.budget_s  # NaN without a budget
+    otherwise = block[(share - 1).abs() > OTHERWISE].itertuples()
+    if spent := ", ".join(f"{row.method} {row.train_cpu_s:.3g}" for row in otherwise):
+        lines.append(f"spent of {budget:g} processor seconds: {spent}")
+    # Beside a method that used it whole; one that used next to nothing has ended by itself.
+    for row in block[share.between(OTHERWISE, LITTLE) & (share.max() > 1 - OTHERWISE)].itertuples():
+        more = f"budgets=[{{seconds: {budget**2 / row.train_cpu_s:.2g}, seeds: [0]}}]"
+        used = f"{row.method} used {row.train_cpu_s / budget:.0%} of its budget"
+        lines[-1] += f"; {used}: {more} gives it as much, unless it ended by itself"
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
@@ -223,17 +228,19 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         given = "newrf, directional_gp and gsparc were given directions of arrival of training rows"
         lines.append(f"{given}, calibrated_raytracer the scene's walls, all others places alone")
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
-    old = ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier)
-    if old:
+    if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another program (at commit): {old}")
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:
-    """Return a block as a table, the row of `ours` bold, without columns that no row fills."""
+    """Return a block as a table without columns that no row fills; bold: the first, where told apart.
+
+    `ours` is marked.
+    """
     figure, draws, value = block.figure.iloc[0], block.draws.any(), value_with_error("value", "value_error")
     columns = [
-        (True, Column("method", "", of=lambda row: row["method"] + row["label"])),
+        (True, Column("method", "", of="named")),
         (True, Column(score_heading(figure), ".2f", of=_score)),
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
@@ -242,10 +249,12 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
-    own = block[block.method == ours]
-    bold = {"bold": str((own.method + own.label).iloc[0])} if len(own) else {}
+    mark = np.where(block.method == ours, " (ours)", "")
+    rows = block.assign(named=block.method + block.label + mark).to_dict("records")
     shown = [column for there, column in columns if there]
-    return Table.from_rows(title_of(block), shown, block.to_dict("records"), **bold)  # type: ignore[arg-type]
+    lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None
+    bold = rows[0]["named"] if lead and lead.sure else None
+    return Table.from_rows(title_of(block), shown, rows, bold=bold)  # type: ignore[arg-type]
 
 
 def shown(figure: str, score_db: float) -> float:

@@ -140,10 +140,10 @@ def group_by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
 
 
 def distinct_baselines(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Rows of the baselines of each draw of the split, of its first run."""
+    """Rows of the baselines of each split of the rows, of its first run."""
     every: dict[tuple[str, str], dict[str, Any]] = {}
     for base in (base for run in runs for base in run.baselines):
-        every.setdefault((base["draw"], base["setting"]), base)
+        every.setdefault((base["rows"], base["setting"]), base)
     return list(every.values())
 
 

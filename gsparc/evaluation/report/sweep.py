@@ -19,6 +19,7 @@ from gsparc.data.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.evaluation.experiment.done import FAILURE
+from gsparc.evaluation.experiment.options import REDRAW
 
 if TYPE_CHECKING:
     from gsparc.evaluation.report.runs import Run
@@ -89,6 +90,9 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         plots.draw_distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
+        seeds = {run.config.get("split.seed") for run in group}
+        if study[1] == "random" and len(seeds) > 1 == len({run.row["draw"] for run in group}):
+            log.warning("split.seed moves validation rows alone: %s", REDRAW)
         for same in equal_settings(group_by_setting(group)):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
     summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})

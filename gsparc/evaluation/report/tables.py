@@ -149,7 +149,8 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
         values = [pooled_interval([column.value(row) for row in group], draws) for column in spread]
         rows.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
     counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
-    note = "Brackets: least and largest over seeds, on the same split: split.seed draws others. "
+    note = "Brackets: least and largest over seeds, on the same test rows: split.seed draws others "
+    note += "(split.redraw=true where the data name their test rows). "
     if several:
         note = "± standard error of the mean over draws of the split (split.seed). "
     columns, title = [SETTING, *also, *counted, *spread], f"Settings over {'draws' if several else 'seeds'}"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import identity_hash
+from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.models.array_vectors.phase_retrieval import RecoveredVectors, recover_vectors
 from gsparc.models.target_rows import training_targets
@@ -20,7 +21,6 @@ from gsparc.training.time_budget import Spent, TimeBudget
 log = logging.getLogger(__name__)
 
 AT_ONCE = 1024  # rows solved together, which bounds the memory
-NAMED = 8  # suspect images named in a log line
 
 
 @lru_cache(maxsize=1)
@@ -74,9 +74,8 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
         len(rows), np.median(result.residual), np.median(result.expected),
     )  # fmt: skip
     if len(bad):
-        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
         log.warning(
-            "%d %s cannot come from this array (array_position? a fault? see %s): %s%s",
+            "%d %s cannot come from this array (array_position? a fault? see %s): %s",
             len(bad), "spectrum" if len(bad) == 1 else "spectra", path.name,
-            ", ".join(names[i] for i in bad[:NAMED]), more,
+            list_first([names[i] for i in bad]),
         )  # fmt: skip

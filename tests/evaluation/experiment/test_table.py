@@ -75,7 +75,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert "| outage, Brier score |" in page and "| 0.0125 |" in page
     assert "simple baseline wins" not in page, "there are no others"
     (said, *_) = remarks(block, "gsparc")
-    assert said.endswith("; 1.10 ± 0.06 dB before idw (standard error over the same 3 draws)")
+    assert "; 1.10 ± 0.06 dB before idw (standard error over the same 3 draws): they are told" in said
     assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
 
 
@@ -170,7 +170,7 @@ def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
         cells.append(replace(filled(method, level.mean()), folder=tmp_path / method))
     (block,) = split_by_problem(average_cells(cells, {}))
     (said, *_) = remarks(block, "gsparc")
-    assert "; 2.00 ± 0.41 dB before idw (standard error over the same 4 test rows)" in said
+    assert "; 2.00 ± 0.41 dB before idw (standard error over the same 4 test rows): they are told" in said
 
 
 @pytest.mark.parametrize(("figure", "column"), [("nmse", "error_power"), ("rmse_db", "error_db")])
@@ -232,7 +232,10 @@ def test_budgets_called_equal_were_spent_by_half():
     cpu = {"gsparc": 14.2, "newrf": 6.43, "blind": 12.5}
     found = [filled(name, 20.0, 0, 12.0, **{"time/train_cpu_s": own}) for name, own in cpu.items()]
     said = remarks(split_by_problem(average_cells(found, {}))[0], "gsparc")
-    assert "spent of 12 processor seconds: gsparc 14.2, newrf 6.43" in said
+    more = "newrf used 54% of its budget: budgets=[{seconds: 22, seeds: [0]}] gives it as much, unless"
+    assert f"spent of 12 processor seconds: gsparc 14.2, newrf 6.43; {more} it ended by itself" in said
+    said = " ".join(remarks(split_by_problem(average_cells(found[1:2], {}))[0], "gsparc"))
+    assert "newrf 6.43" in said and "as much" not in said
 
 
 def test_the_csv_file_had_other_signs_than_the_console():
@@ -250,3 +253,38 @@ def test_what_methods_were_given_besides_places_was_not_said():
     assert any("gsparc were given directions of arrival" in line for line in remarks(block, "gsparc"))
     (block,) = split_by_problem(average_cells(FOUND[:1], {}))
     assert not any("were given" in line for line in remarks(block, "gsparc"))
+
+
+def test_draws_with_the_same_test_rows_had_a_standard_error():
+    """`split=random, draws: 3` of a release that names its test rows gave three copies of one split."""
+    same = {"split/test_sha256": "t", "drawn": True}
+    found = [filled("gp", 30.0 + draw, draw, **same) for draw in range(3)]
+    (block,) = split_by_problem(average_cells(found, {}))
+    (row,) = block.itertuples()
+    assert not row.draws and row.seeds == 3 and "draws" not in title_of(block)
+    (block,) = split_by_problem(average_cells(found[:1], {}))
+    assert title_of(block).endswith("one draw")
+
+
+def test_the_last_of_three_was_bold_in_a_comparison():
+    """`ours` was, 14 dB behind; README has in bold what is best and told apart."""
+    cells = [
+        filled(method, 30.0 - behind - draw * (1 + behind / 50), draw, drawn=True)
+        for method, behind in (("gsparc", 0.0), ("gp", 1.0), ("complex_gp", 14.0))
+        for draw in range(3)
+    ]
+    (block,) = split_by_problem(average_cells(cells, {}))
+    page = markdown([block], "complex_gp")
+    assert "| **gsparc** |" in page and "| complex_gp (ours) |" in page and page.count("**gsparc**") == 1
+    (alone,) = split_by_problem(average_cells(cells[:3], {}))
+    assert "**" not in markdown([alone], "gsparc")
+
+
+def test_the_lead_of_the_first_had_no_verdict():
+    """`6.20 ± 1.27 dB before newrf (standard error over the same 3 draws)` left the reader to compute t."""
+    leads = ((6.0, 5.9, 6.1), "they are told apart"), ((2.0, 0.1, 0.9), "they are not told apart")
+    for gains, verdict in leads:
+        cells = [filled("gp", 30.0, draw, drawn=True) for draw in range(3)]
+        cells += [filled("gsparc", 30.0 + gain, draw, drawn=True) for draw, gain in enumerate(gains)]
+        (block,) = split_by_problem(average_cells(cells, {}))
+        assert remarks(block, "gsparc")[0].endswith(f"over the same 3 draws): {verdict}")

@@ -78,6 +78,14 @@ def test_one_table_one_figure_and_a_page(three, tmp_path, capsys):
     assert "28.20" in said and "28.40]" in said and "29.50" in said
 
 
+def test_seeds_of_a_split_that_draw_no_test_rows_were_not_warned_of(run_dir, tmp_path, caplog):
+    for draw in range(2):
+        folder = run_dir(tmp_path / str(draw), overrides=(f"split.seed={draw}",))
+        (folder / ".hydra/config.yaml").write_text(f"split: {{seed: {draw}}}")
+    SweepReport(retime=False).on_multirun_end(of_sweep(tmp_path))
+    assert caplog.text.count("the dataset names its test rows: say split.redraw=true") == 1
+
+
 def test_jobs_named_after_a_path_still_end_in_a_table(three, tmp_path):
     """A path among the overrides puts a job's folder some levels down."""
     (tmp_path / "0_file-").mkdir()

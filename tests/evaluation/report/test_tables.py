@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.report import tables
 from gsparc.evaluation.report.page import warnings
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, find_runs
@@ -157,8 +158,22 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
     ]
 
 
+def test_copies_of_one_split_counted_as_draws(run_dir, tmp_path):
+    """`split.seed` moved validation rows alone where a release names the test rows: ± 0.00 over 3 draws."""
+    for draw in range(3):
+        file = run_dir(tmp_path / str(draw), overrides=(f"split.seed={draw}",)) / "summary.json"
+        facts = json.loads(file.read_text()) | {"split/sha256": f"{draw}" * 64, "split/test_sha256": "t"}
+        file.write_text(json.dumps(facts))
+    runs = drop_shared_overrides(find_runs([tmp_path]))
+    pooled = tables.table_of_seeds(runs)
+    assert pooled.title == "Settings over seeds" and "split.redraw=true" in pooled.note
+    assert cells(pooled, 0)["seeds"] == 3 and cells(pooled, 0)["PSNR dB"].error is None
+    assert all("draws" not in row[3] for row in tables.table_of_leads(runs).rows)
+    assert lead_over_runs([runs[0].row], [runs[1].row]) is None, "they learned from other rows"
+
+
 def test_a_sweep_of_seeds_did_not_say_that_the_split_is_one(three):
-    assert "on the same split: split.seed draws others" in tables.table_of_seeds(find_runs(three)).note
+    assert "on the same test rows: split.seed draws others" in tables.table_of_seeds(find_runs(three)).note
 
 
 def test_one_model_had_two_latencies_and_a_note_in_the_report_alone(three):
