@@ -102,10 +102,8 @@ def test_a_file_of_a_run_without_folds_was_no_error(field, spectra_file, tmp_pat
 
 def test_files_in_a_list_were_an_error_of_their_path(tmp_path):
     with pytest.raises(SettingError, match="expected one file; join tables first"):
-        train(
-            compose("dataset=own", "dataset.file=[a.csv,b.csv]", "model=mean", "logger=none"),
-            tmp_path / "run",
-        )
+        words = "dataset=own", "dataset.file=[a.csv,b.csv]", "model=mean", "logger=none"
+        train(compose(*words), tmp_path / "run")
 
 
 def test_the_simulated_stand_in_says_so(tmp_path):

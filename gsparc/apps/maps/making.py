@@ -90,7 +90,7 @@ def predict_map(
     lowest = -np.inf if promise is None else float(promise.evidence.level_db.min())
     if threshold_db <= np.ceil(lowest):
         said = f"threshold_db={threshold_db + level.raised_db:g} is at or below what was measured"
-        notes.append(f"{said} (lowest {lowest + level.raised_db:.4g}): this share says nothing of weaker places")
+        notes.append(f"{said} (lowest {lowest + level.raised_db:.4g}): it says nothing of weaker places")
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     every, computed, stride = np.flatnonzero(grid.inside), 0, 1
     if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
