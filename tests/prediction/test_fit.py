@@ -78,7 +78,7 @@ def test_powers_in_dbm_were_answered_in_milliwatts(model, several, tmp_path):
     level = np.c_[POWERS, np.roll(POWERS, 7)] if several else POWERS
     asked, answers = PLACES[:6] + 0.2, {}
     for unit in UNITS if model == "gp" else ("dBm", "W"):
-        found = gsparc.fit(rx=PLACES, rssi=UNITS[unit](level), unit=unit, model=model, budget_s=1.0,
+        found = gsparc.fit(rx=PLACES, rssi=UNITS[unit](level), unit=unit, model=model, budget_s=30.0,
                            save=tmp_path / "m.ckpt", **where)  # fmt: skip
         again = gsparc.load(tmp_path / "m.ckpt")
         assert found.unit == again.unit == unit and gsparc.load(tmp_path / "m.ckpt", unit="dBm").unit == "dBm"
