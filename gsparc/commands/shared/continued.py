@@ -19,7 +19,7 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
             told of that group.
     """
     said = {_key(word): word.partition("=")[2].strip("'\"") for word in words if not word.startswith("-")}
-    if not said.get("ckpt_path"):
+    if said.get("ckpt_path", "") in ("", "null"):
         return [*words]
     left = Path(said["ckpt_path"]).resolve()
     notes = [folder / ".hydra" for folder in (left, *left.parents)[:DEEP]]

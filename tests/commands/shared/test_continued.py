@@ -36,6 +36,15 @@ def test_a_run_to_go_on_from_brings_its_settings(tmp_path, of, words, kept):
     assert add_settings_of_run(line) == [*(one.replace("DATA", str(data)) for one in kept), *line]
 
 
+def test_no_run_to_go_on_from_was_one_called_null(tmp_path, monkeypatch):
+    """In a run's folder `ckpt_path=null` took the settings of that run."""
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "overrides.yaml").write_text("- seed=3\n")
+    (tmp_path / ".hydra" / "hydra.yaml").write_text(f"hydra: {{runtime: {{cwd: {tmp_path}}}}}\n")
+    monkeypatch.chdir(tmp_path)
+    assert add_settings_of_run(["ckpt_path=null"]) == ["ckpt_path=null"]
+
+
 def test_a_command_line_without_a_run_to_go_on_from_stays(tmp_path):
     for line in (["model=gp"], ["ckpt_path=null"], [f"ckpt_path={tmp_path / 'gone.ckpt'}", "seed=1"]):
         assert add_settings_of_run(line) == line
