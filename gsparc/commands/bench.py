@@ -9,6 +9,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import finish_run, run_directory
+from gsparc.data.limits import check_arguments, choice
 from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
 from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
@@ -25,6 +26,7 @@ REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
 def task(config: DictConfig) -> dict[str, Any]:
     """Time all kernels; return the facts of `summary.json`, the table is also `bench.csv`."""
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
+    check_arguments(config, device=choice("cpu", "cuda"))
     device = config.device
     backend_named(device)  # where there is no such device, its reason comes first
     every = [case for of in product(config.counts, config.projections) for case in kernel_cases(*of, device)]

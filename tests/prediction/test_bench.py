@@ -8,6 +8,7 @@ import torch
 from campaigns import compose
 
 from gsparc.commands import bench
+from gsparc.data.limits import SettingError
 from gsparc.ops import cuda_library
 from gsparc.ops.backends import BackendUnavailable
 from gsparc.prediction import bench as timed
@@ -54,3 +55,9 @@ def test_a_device_that_is_not_here_says_why():
         pytest.skip("there is a GPU here")
     with pytest.raises(BackendUnavailable, match=re.escape(reason)):
         bench.task(compose("counts=[20]", "device=cuda", config="bench"))
+
+
+def test_another_device_is_no_traceback():
+    """`device=reference` is a backend's name, and no device."""
+    with pytest.raises(SettingError, match="device='reference': one of cpu, cuda is needed"):
+        bench.task(compose("counts=[20]", "device=reference", config="bench"))
