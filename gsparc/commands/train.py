@@ -31,6 +31,7 @@ from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
+from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
@@ -60,7 +61,8 @@ log_of_models = logging.getLogger("gsparc.models")  # of which the console shows
 LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 # What a run leaves; of another one, all of it would be read beside this one's.
 LEFT = (
-    *("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png"),
+    *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
+    *("test.png", "found.png"),
     *(f"{fold}{name}" for fold in ("", "fold*/") for name in (checkpoint.MODEL, "learning_curve.csv")),
 )
 
@@ -176,9 +178,7 @@ def train(
             objects = TrainedRun(fits.methods, files, data, split, evaluation)
             if in_full:
                 _draw(loggers, config, facts, objects, run_dir)
-        if evaluation.columns:
-            samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
-            summary.write_samples(run_dir / "per_sample.csv", samples)
+        evaluation.write(run_dir, run_id=run_id)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, objects
 
@@ -371,7 +371,8 @@ def task(config: DictConfig) -> float:
                 title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
-                show_result(run_dir, *[table] * tested, lines=summary.remarks(facts, config.eval_on))
+                worst = worst_stations(objects.evaluation.stations, facts["model/label"])
+                show_result(run_dir, *[table, *worst] * tested, lines=summary.remarks(facts, config.eval_on))
     figure = main_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:

@@ -8,6 +8,7 @@ from scipy.stats import norm
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.data.units import power_in_decibels
+from gsparc.evaluation.by_station import best_server, rmse_after_constants
 from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
 from gsparc.evaluation.scores import Scores, errors_with_silent
 
@@ -104,14 +105,15 @@ def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | No
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies and `reduced_chi_squared`; of powers also `rmse_with_silent`, `power_intervals` and, of
-    stations held out, errors left after a constant of each.
+    """Accuracies and `reduced_chi_squared`; of powers `rmse_with_silent`, `power_intervals`, `best_server`.
+
+    Of stations held out also the errors left after a constant of each.
     """
     figures = scores.figures()
     if data.site.kind != "rssi":
         figures |= reduced_chi_squared(scores, data)
     else:
-        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data)
+        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data) | best_server(scores, data)
         if split.name == "stations" and data.station is not None:
-            figures["rmse_db_after_constant"] = scores.rmse_without_station_bias(data.station)
+            figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.station)
     return figures

@@ -42,10 +42,13 @@ FIGURES = {
     "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller"),
     "mae_db": Figure("MAE dB", ".2f", "smaller"),
     "error_db": Figure("error dB", ".2f", "smaller"),
+    "best_server": Figure("strongest told", ".1%"),
     "skill": Figure("skill", ".3f"),
     "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
+LISTED = "ahead_listed"
+BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
 # Order matters: `DECIDING` takes the first of each.
 TABLES: dict[Scored, tuple[str, ...]] = {
@@ -69,6 +72,16 @@ def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
     """Return the figure that methods are compared by; where rows were silent, these count too."""
     kind: Scored = facts["dataset/kind"] if facts.get("dataset/kind") in DECIDING else "spectrum"
     return deciding_figure({WITH_SILENT: facts.get(f"{prefix}/{WITH_SILENT}")}, kind)
+
+
+def judged_by(facts: Mapping[str, Any], prefix: str = "test") -> dict[str, str]:
+    """Return figures that methods are judged by, by what leads in them are called; of lists heard rows, too.
+
+    >>> judged_by({"dataset/kind": "rssi", "test/rmse_db_with_silent": 4.0})
+    {'ahead': 'rmse_db_with_silent', 'ahead_listed': 'rmse_db'}
+    """
+    figure = main_figure(facts, prefix)
+    return {"ahead": figure} | ({LISTED: "rmse_db"} if figure == WITH_SILENT else {})
 
 
 def deciding_figure(figures: Mapping[str, Any], kind: Scored) -> str:
