@@ -301,8 +301,10 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     link, called = which.reshape(-1) * count + station, data.row_names
     rows = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
     absent = np.zeros(0, np.int64)
-    # What was not heard is known to be weak; a file with a station for each place has no empty cells.
-    if data.censored is None and len(first) < len(data):
+    # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
+    # with a station for each place has no empty cells.
+    told = data.censored is not None or data.provenance.get("absent") == "unknown"
+    if not told and len(first) < len(data):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
     parts = [] if stations is None else [name.split(FROM_ROW) for name in stations.name]
     for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
