@@ -299,6 +299,7 @@ def _keep(
         context.log_curve(report.seconds, fitted.name)
     marks = fitting.run_extra(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
+    extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
 

@@ -125,9 +125,8 @@ def open_files(
     if len({one.extra.get("run_id") for one in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
     # A class is imported only where the caller named it, never because a file does.
-    chosen_class = "_target_" in (dataset or {})
-    module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
-    data = align_to_site(module.measurements, stored[0].site)
+    own = _read(stored[0], dataset, trusted="_target_" in (dataset or {}))
+    data = align_to_site(own, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
     # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
@@ -149,8 +148,16 @@ def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> Measurement
     Raises:
         ValueError: the file, or the settings, cannot be read.
     """
-    module = datamodule(_settings("dataset", stored, {"file": str(path)}), trusted=False)
-    return align_to_site(module.measurements, stored.site)
+    return align_to_site(_read(stored, {"file": str(path)}), stored.site)
+
+
+def _read(
+    stored: checkpoint.Stored, overrides: Mapping[str, Any] | None = None, trusted: bool = False
+) -> Measurements:
+    """The measurements that `_settings` name; how they are read is said unless training said it."""
+    module = datamodule(_settings("dataset", stored, overrides), trusted=trusted)
+    module.told = stored.extra.get("read_notes", ())
+    return module.measurements
 
 
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -246,7 +253,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
     site = stored[0].site
     try:
         if data.site.sha256 != site.sha256:
-            data = datamodule(_settings("dataset", stored[0], None), trusted=False).measurements
+            data = _read(stored[0])
             # The file was changed or exchanged after training: its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None

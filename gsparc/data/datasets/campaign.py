@@ -67,8 +67,11 @@ class Campaign(DataModule):
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
         reading = interpret(self.raw(), self.file, self.selection)
+        self.notes = reading.notes
         for note in reading.notes:
-            log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
+            careful = isinstance(note, Caution)
+            if careful or note not in self.told:
+                log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
         for warning in _implausible(reading.data):
             log.warning("%s: %s", self.file, warning)
         for hint in unit_warnings(reading.data):
