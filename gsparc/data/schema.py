@@ -287,7 +287,6 @@ class Measurements:
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
         position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
             where positions count as exact.
-        file_rows: number from 0 of each row in its file, as `dataset.level_steps` counts; empty: unknown.
     """
 
     site: Site
@@ -307,7 +306,6 @@ class Measurements:
     censored: np.ndarray | None = None
     run: np.ndarray | None = None
     position_std: np.ndarray | None = None
-    file_rows: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.target)

@@ -178,7 +178,7 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
             f"{rows[step.last]} and {rows[step.first]}"
             for step in own
         )
-        first = ",".join(str(levels.file_rows[step.first]) for step in own)
+        first = ",".join(str(levels.file_row[step.first]) for step in own)
         setting = f"'dataset.level_steps={{{names[t]}:[{first}]}}' (rows from 0) makes it another station"
         setting = "" if names[t] == UNNAMED else f" {setting} from there on"
         warnings.append(f"{who} {said}, which the places do not explain: another gain or antenna?{setting}")
@@ -267,7 +267,7 @@ class LinkLevels:
         station: (n,) int64.
         level_db: (n,) [dB], NaN where there is no value.
         rows: (n,) what messages call the row of the file.
-        file_rows: (n,) its number from 0.
+        file_row: (n,) its number from 0.
         names: (T,) of the stations.
         station_position: (T, 3), in the world [m]; None where it is not known.
     """
@@ -276,7 +276,7 @@ class LinkLevels:
     station: np.ndarray
     level_db: np.ndarray
     rows: list[str]
-    file_rows: Sequence[int]
+    file_row: np.ndarray
     names: list[str]
     station_position: np.ndarray | None
 
@@ -286,8 +286,13 @@ class LinkLevels:
             yield int(t), np.flatnonzero((self.station == t) & np.isfinite(self.level_db))
 
 
-def link_levels(data: Measurements) -> LinkLevels | None:
-    """Return levels of powers with one end that stands still; None of anything else."""
+def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkLevels | None:
+    """Return levels of powers with one end that stands still; None of anything else.
+
+    Args:
+        data: the measurements.
+        file_row: (S,) number of each row in its file; None: the row's own.
+    """
     site = data.site
     if site.kind != "rssi" or site.static_end is None:
         return None
@@ -320,5 +325,5 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     known = site.static_position if stations is None else stations.position
     known = None if known is None else np.atleast_2d(known) + site.origin
     names = [UNNAMED] if stations is None else list(stations.name)
-    number = [data.file_rows[i] for i in of_row]
+    number = of_row if file_row is None else file_row[of_row]
     return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, number, names, known)

@@ -32,7 +32,7 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     rows, count = level_db.shape
     return LinkLevels(
         np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
-        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count).tolist(), names,
+        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count), names,
         station_position,
     )  # fmt: skip
 
@@ -228,12 +228,14 @@ def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
     (tmp_path / "walk.csv").write_text(text)
     (tmp_path / "posts.csv").write_text(posts)
     reading = read_any(tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv")
-    levels = link_levels(reading.data)
+    levels = link_levels(reading.data, reading.file_row)
     steps = plausibility.find_level_steps(levels)
     said = plausibility.step_warnings(levels, steps)[0]
-    first = levels.file_rows[steps[0][1].first]
+    first = levels.file_row[steps[0][1].first]
     assert f"and line {first + 3}," in said and f"'dataset.level_steps={{A:[{first}]}}'" in said
     # Once it is set, rows before and after the step were called outages of its parts.
-    parted = read_any(tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv", level_steps={"A": [first]})
+    parted = read_any(
+        tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv", level_steps={"A": [int(first)]}
+    )
     assert f"A from row {first}" in parted.data.site.stations.name
     assert plausibility.gap_warnings(link_levels(parted.data)) == []
