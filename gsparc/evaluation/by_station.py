@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
@@ -13,21 +14,15 @@ from gsparc.evaluation.scores import FEW, Scores
 from gsparc.evaluation.table import Column, Table
 
 WORST = 3  # stations shown; the file has all
+ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
 
 
-def errors_by_station(
-    error: np.ndarray, station: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows, mean and root mean square of errors (n,) of rows of `count` stations, (T,); NaN: no row.
-
-    >>> errors_by_station(np.array([1.0, 3.0, np.nan]), np.array([1, 1, 0]), 2)[1]
-    array([nan,  2.])
-    """
-    known = np.isfinite(error)
-    error, station = error[known], station[known]
-    rows, total, squares = (np.bincount(station, weight, count) for weight in (None, error, error**2))
-    with np.errstate(invalid="ignore"):
-        return rows, total / rows, np.sqrt(squares / rows)
+def errors_by_station(scores: Scores, station: np.ndarray, name: str = ERRORS[0]) -> pd.DataFrame:
+    """Return `rows`, `bias` and `rmse` [dB] of the errors `name` of each `station` (n,) of all rows."""
+    errors = pd.DataFrame({"error": scores.samples[name], "square": scores.samples[name] ** 2})
+    by = errors.groupby(station[scores.row])
+    means = by.mean()
+    return pd.DataFrame({"rows": by["error"].count(), "bias": means.error, "rmse": means.square**0.5})
 
 
 def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
@@ -35,10 +30,10 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
 
     Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
     """
-    rows, bias, rmse = errors_by_station(
-        scores.samples["error_db"], station[scores.row], int(station.max()) + 1
-    )
-    return float(np.sqrt(np.nansum(rows * (rmse**2 - bias**2)) / rows.sum())) if rows.any() else None
+    by = errors_by_station(scores, station)
+    # NaN where no row has an error.
+    mean = (by["rows"] * (by.rmse**2 - by.bias**2)).sum() / max(by["rows"].sum(), 1)
+    return float(mean**0.5) if by["rows"].any() else None
 
 
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
@@ -49,51 +44,42 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     """
     if data.station is None:
         return {}
-    place = np.arange(len(data)) if data.place is None else data.place
-    link, of_link = np.unique(
-        np.stack([scores.fold, place[scores.row], data.station[scores.row]]), axis=1, return_inverse=True
-    )
-    of_link = of_link.reshape(-1)
+    row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
+    every = pd.DataFrame({
+        "fold": scores.fold, "place": place[row], "station": data.station[row],
+        "predicted": scores.samples["prediction"], "measured": scores.samples["target"],
+    })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.
-    predicted, measured = np.full((2, link.shape[1]), -np.inf)
-    np.maximum.at(predicted, of_link, scores.samples["prediction"])
-    np.maximum.at(measured, of_link, np.nan_to_num(scores.samples["target"], nan=-np.inf))
-    start = np.flatnonzero(np.r_[True, (np.diff(link[:2]) != 0).any(0)])
-    size = np.diff(np.r_[start, link.shape[1]])
-    told = predicted == np.repeat(np.maximum.reduceat(predicted, start), size)
-    right = told & (measured == np.repeat(np.maximum.reduceat(measured, start), size))
-    used = (size > 1) & np.isfinite(np.maximum.reduceat(measured, start))
-    share = np.add.reduceat(right.astype(float), start) / np.add.reduceat(told.astype(float), start)
-    return {BEST_SERVER: float(share[used].mean())} if used.any() else {}
+    links = every.groupby(["fold", "place", "station"]).max()
+    strongest = links == links.groupby(["fold", "place"]).transform("max")
+    strongest["right"] = strongest.predicted & strongest.measured
+    places = strongest.groupby(["fold", "place"])
+    found = places.sum()[(places.size() > 1) & places.measured.any()]
+    return {BEST_SERVER: float((found.right / found.predicted).mean())} if len(found) else {}
 
 
 def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[str, Any]:
-    """Return columns (T,) of `by_station.csv`: rows, rmse and bias of methods by the heads' beginning.
+    """Return columns of `by_station.csv`: rows, rmse and bias of methods by the heads' beginning.
 
     Of stations with scored rows; silent ones count in `rmse_db_with_silent`. Empty without stations.
     """
     if data.site.kind != "rssi" or data.station is None or data.site.stations is None:
         return {}
-    columns: dict[str, Any] = {"station": np.array(data.site.stations.shown)}
+    columns: dict[str, Any] = {}
     for stem, one in methods.items():
-        for name in [name for name in ("error_db", "error_db_with_silent") if name in one.samples]:
-            rows, bias, rmse = errors_by_station(
-                one.samples[name], data.station[one.row], len(columns["station"])
-            )
-            figure = name.replace("error", "rmse")
-            columns.setdefault(figure.replace("rmse_db", "rows"), rows)
-            columns[f"{stem}{figure}"] = rmse
-            if name == "error_db":
-                columns[f"{stem}bias_db"] = bias
-    scored = columns[next(reversed([name for name in columns if name.startswith("rows")]))] > 0
-    return {name: values[scored] for name, values in columns.items()}
+        for name in [name for name in ERRORS if name in one.samples]:
+            by, figure = errors_by_station(one, data.station, name), name.replace("error", "rmse")
+            columns.setdefault("station", np.array(data.site.stations.shown)[by.index])
+            columns |= {name.replace("error_db", "rows"): by["rows"], stem + figure: by.rmse}
+            columns |= {f"{stem}bias_db": by.bias} if name == ERRORS[0] else {}
+    return {name: np.asarray(values) for name, values in columns.items()}
 
 
 def leads_by_station(columns: Mapping[str, Any], figure: str, baseline: str) -> str:
     """Say at how many stations of `by_station.csv`, with rows enough, a method is better than a baseline."""
     enough = columns[figure.replace("rmse_db", "rows")] >= FEW
     better = columns[figure] < columns[f"baseline/{baseline}/{figure}"]
-    return f"{int((better & enough).sum())} of {int(enough.sum())}"
+    return f"{(better & enough).sum()} of {enough.sum()}"
 
 
 def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
@@ -101,13 +87,11 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
 
     Baselines beside it tell whether a station is hard, or hard for this method.
     """
-    enough = np.flatnonzero(columns["rows"] >= FEW) if columns else np.zeros(0, np.int64)
-    if len(enough) < 2:
-        return []
-    worst = enough[np.argsort(-columns["rmse_db"][enough], kind="stable")[:WORST]]
     names = [name for name in columns if name.endswith("/rmse_db") and "/zero/" not in name]
     heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
-    shown = [Column("station", ""), Column("rows", ".0f")]
-    shown += [Column(head, number_format("rmse_db")) for head in heads.values()]
-    rows = [[columns[name][t] for name in ("station", "rows", *heads)] for t in worst]
-    return [Table("rmse_db of the worst stations; by_station.csv has all", shown, rows)]
+    shown = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
+    shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
+    every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
+    rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
+    title = "rmse_db of the worst stations; by_station.csv has all"
+    return [Table.from_rows(title, shown, rows[:WORST].to_dict("records"))] if len(rows) > 1 else []
