@@ -75,17 +75,10 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
     return {name: np.asarray(values) for name, values in columns.items()}
 
 
-def leads_by_station(columns: Mapping[str, Any], figure: str, baseline: str) -> str:
-    """Say at how many stations of `by_station.csv`, with rows enough, a method is better than a baseline."""
-    enough = columns[figure.replace("rmse_db", "rows")] >= FEW
-    better = columns[figure] < columns[f"baseline/{baseline}/{figure}"]
-    return f"{(better & enough).sum()} of {enough.sum()}"
-
-
 def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     """Return a table of the stations with the largest rmse, of those with rows enough, if these are several.
 
-    Baselines beside it tell whether a station is hard, or hard for this method.
+    Baselines beside it tell whether a station is hard, its note at how many the method is better.
     """
     names = [name for name in columns if name.endswith("/rmse_db") and "/zero/" not in name]
     heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
@@ -93,5 +86,9 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
     every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
+    better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
+    note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
-    return [Table.from_rows(title, shown, rows[:WORST].to_dict("records"))] if len(rows) > 1 else []
+    return (
+        [Table.from_rows(title, shown, rows[:WORST].to_dict("records"), note=note)] if len(rows) > 1 else []
+    )

@@ -15,7 +15,7 @@ from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, hash_indices
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
-from gsparc.evaluation.by_station import leads_by_station, station_columns
+from gsparc.evaluation.by_station import station_columns
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import judged_by
 from gsparc.evaluation.metrics import paired_values
@@ -124,8 +124,6 @@ def evaluate(
         lead = lead_over_rows(other.scores.samples, scores.samples, figure)
         if lead is not None and other is not same:
             facts |= {f"baseline/{name}/{ahead}{key}": value for key, value in lead.facts().items()}
-            if stations:
-                facts[f"baseline/{name}/{ahead}_stations"] = leads_by_station(stations, figure, name)
     facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
     decided = scores.dominant_row()
     if decided and data.row_names:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from gsparc.data.files import read_shipped_table
 from gsparc.data.schema import Scored
 
 
@@ -26,26 +27,8 @@ class Figure:
 
 
 # SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default.
-FIGURES = {
-    "psnr_db": Figure("PSNR dB", ".2f"),
-    "ssim_gauss": Figure("SSIM (Gauss 11)"),
-    "ssim": Figure("SSIM (uniform 7)"),
-    "mse": Figure("MSE", ".3g", "ratio"),
-    "mae": Figure("MAE", ".3g", "smaller"),
-    "nmse": Figure("NMSE", ".3g", "ratio"),
-    "nmse_aligned": Figure("NMSE, rows aligned", ".3g", "ratio"),
-    "tone_rmse_db": Figure("RMSE of tones dB", ".2f", "smaller"),
-    "nmse_scalar": Figure("NMSE up to a scalar", ".3g", "ratio"),
-    "snr_db": Figure("SNR dB", ".2f"),
-    "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
-    "rmse_db": Figure("RMSE dB", ".2f", "smaller"),
-    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller"),
-    "mae_db": Figure("MAE dB", ".2f", "smaller"),
-    "error_db": Figure("error dB", ".2f", "smaller"),
-    "best_server": Figure("strongest told", ".1%"),
-    "skill": Figure("skill", ".3f"),
-    "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
-}
+ROWS = {row.pop("name"): row for row in read_shipped_table(__package__, "figures.csv")}
+FIGURES = {name: Figure(**row) for name, row in ROWS.items()}  # type: ignore[arg-type]
 WITH_SILENT = "rmse_db_with_silent"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by

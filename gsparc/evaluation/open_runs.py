@@ -338,9 +338,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
     if ours is None or theirs is None:
         if ours is theirs or (data.site.static_position is not None and site.static_position is not None):
             return data  # one place, a table of one or not
-        if ours is None:
-            raise ValueError(f"{data.site.name} has one static end, the model has stations; {ANOTHER}")
-        raise ValueError(f"{data.site.name} has {len(ours)} stations, the model one static end; {ANOTHER}")
+        have = ["one static end" if of is None else f"{len(of)} stations" for of in (ours, theirs)]
+        raise ValueError(f"{data.site.name} has {have[0]}, the model {have[1]}; {ANOTHER}")
     # A list of cells has names of its own beside those that a drive gives them.
     called, known = (
         [{*pair} for pair in zip(of.name, of.label or of.name, strict=True)] for of in (ours, theirs)

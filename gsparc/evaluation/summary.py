@@ -225,9 +225,7 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
             continue
         lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}")
         if lead is not None:
-            at = facts.get(f"baseline/{best}/{ahead}_stations")
             said += judge_baseline(best, method, figure, lead, ahead == LISTED)
-            said[-1] += f"; {method} is better at {at} stations" if at else ""
         elif known[best] > score_of(figure, own):
             said.append(f"the baseline {best} has the better {figure} here; how surely is not known")
     return said

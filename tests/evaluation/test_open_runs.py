@@ -68,7 +68,7 @@ def test_a_station_that_the_model_does_not_know_is_refused():
     with pytest.raises(ValueError, match=said):
         align_to_site(town(), town((0, 1)).site)
     alone = from_arrays({"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0]})
-    with pytest.raises(ValueError, match="arrays has one static end, the model has stations"):
+    with pytest.raises(ValueError, match="arrays has one static end, the model 3 stations"):
         align_to_site(alone, replace(town().site, name="arrays"))
 
 

@@ -205,7 +205,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
     where fading makes its edges ragged.
     """
-    names, rows, weakest = levels.names, levels.rows, dict[str, float]()
+    names, rows, warnings = levels.names, levels.rows, list[str]()
     outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)  # by first row, last row, length
     silent, faint, plain = list[str](), dict[str, int](), dict[str, int]()  # how many, by station
     for t in np.unique(levels.station):
@@ -215,7 +215,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         if missing.all() or not missing.any():
             silent += [name] * bool(missing.all())
             continue
-        weak, weakest[name] = float(np.percentile(level[~missing], 1)) + WEAK_DB, float(level[~missing].min())
+        weak = float(np.percentile(level[~missing], 1)) + WEAK_DB
         absent, count, around = np.flatnonzero(missing), 0, list[float]()
         for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
             start, stop = int(piece[0]), int(piece[-1]) + 1
@@ -229,28 +229,19 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         if count:
             often = count >= FEW * len(used) and len(around) > 0
             (faint if often and np.median(around) < weak else plain)[name] = count
-    warnings = [
-        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: off, or not listed; "
-        "these rows are not used"
-        for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2])
-    ]
+    if faint:
+        # First of all: what is not heard and not said so leaves weak stations far too strong.
+        lost = f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the weakest ones"
+        advice = "not heard? then say dataset.absent=silent"
+        warnings.append(f"{advice}: {lost}; left out, weak levels are predicted too high")
+    for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2]):
+        where = f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}"
+        warnings.append(f"{where}: off, or not listed; these rows are not used")
     if silent:
         warnings.append(f"no level in any row{_of(silent, len(names))}")
-    if faint:
-        floor = np.floor(min(weakest[n] for n in faint))
-        # First of all: what is not heard and not said so leaves weak stations far too strong.
-        warnings.insert(
-            0,
-            "not heard? then say dataset.absent=silent (of empty cells also "
-            f"dataset.columns.sensitivity_db={floor:g} does): {sum(faint.values())} levels are "
-            f"missing{_of([*faint], len(names))}, beside the weakest ones; left out, weak levels are "
-            "predicted too high",
-        )
     if plain:
-        warnings.append(
-            f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}, few or beside strong "
-            "ones: lost or not listed; they are not used"
-        )
+        lost = f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}"
+        warnings.append(f"{lost}, few or beside strong ones: lost or not listed; they are not used")
     return warnings
 
 

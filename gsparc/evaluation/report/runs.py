@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -21,6 +21,7 @@ from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.fitting import dotted_settings
 from gsparc.prediction.timing import BLOCKS, Call, p50_p95, time_interleaved
 
+Item, Key = TypeVar("Item"), TypeVar("Key")
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
 HIDDEN = (
@@ -131,12 +132,17 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     return list(runs.values())
 
 
+def group_in_order(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Return items by what `key` returns of them, in order of appearance."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
 def group_by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     """Runs whose figures can be compared, by dataset and split, in order of appearance."""
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.study, []).append(run)
-    return groups
+    return group_in_order(runs, lambda run: run.study)
 
 
 def distinct_baselines(runs: Sequence[Run]) -> list[dict[str, Any]]:
