@@ -89,6 +89,5 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
     note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
-    return (
-        [Table.from_rows(title, shown, rows[:WORST].to_dict("records"), note=note)] if len(rows) > 1 else []
-    )
+    worst = Table.from_rows(title, shown, rows[:WORST].to_dict("records"), note=note)
+    return [worst] if len(rows) > 1 else []

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 from cycler import cycler
+from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
@@ -23,20 +23,7 @@ PALETTE = (
     "#56B4E9", "#4B5320", "#000000", "#882255", "#332288",
 )  # fmt: skip
 STROKES = ("-", "--", ":", "-.")  # where there are more lines than colours
-STYLE: dict[Any, Any] = {
-    "axes.prop_cycle": cycler(color=PALETTE),
-    "axes.formatter.useoffset": False,  # 29.114 is read, 0.004 beside +2.911e1 is not
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": "medium",
-    "figure.titlesize": "medium",
-    "font.size": 10.0,
-    "legend.fontsize": 8.5,
-    "legend.frameon": False,
-    "lines.linewidth": 1.3,
-}
-
-
+STYLE = [f"{__package__}.style", {"axes.prop_cycle": cycler(color=PALETTE)}]
 PRINTED = choice("pdf", "svg")  # formats beside PNG
 
 
@@ -89,7 +76,7 @@ def panels(
 
     At most 9 inches of width stay readable at 600 pixels.
     """
-    matplotlib.rcParams.update(STYLE)  # text and lines that are added later read it too
+    style.use(STYLE)  # text and lines that are added later read it too
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, **how)

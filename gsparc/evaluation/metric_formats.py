@@ -33,22 +33,14 @@ WITH_SILENT = "rmse_db_with_silent"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
-# Order matters: `DECIDING` takes the first of each.
-TABLES: dict[Scored, tuple[str, ...]] = {
-    "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
-    "csi": ("nmse", "nmse_scalar", "snr_db"),
-    "aligned csi": ("nmse_aligned", "tone_rmse_db", "snr_db"),
-    "rssi": ("rmse_db", "mae_db"),
-}
+KINDS = {row["kind"]: row for row in read_shipped_table(__package__, "kinds.csv")}
+TABLES = {kind: tuple(row["columns"].split()) for kind, row in KINDS.items()}
 """The columns of a kind's tables; methods, fronts and effects are compared by the first."""
-DECIDING: dict[Scored, str] = {kind: names[0] for kind, names in TABLES.items()}
-PER_SAMPLE: dict[Scored, str] = {
-    "spectrum": "psnr_db",
-    "csi": "snr_db",
-    "aligned csi": "snr_db",
-    "rssi": "error_db",
-}
+DECIDING = {kind: names[0] for kind, names in TABLES.items()}
+PER_SAMPLE = {kind: row["per_sample"] for kind, row in KINDS.items()}
 """The figure of a single sample, in decibels."""
+SECOND = {kind: row["second"] for kind, row in KINDS.items()}  # beside the deciding one
+CDFS = {kind: tuple(row["distributions"].split()) for kind, row in KINDS.items()}  # figures of samples, drawn
 
 
 def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:

@@ -354,9 +354,6 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
             number[t] = (alike or near)[0]
     if (number < 0).any():
         raise ValueError(_explain_unknown(data.site.name, ours, theirs, number < 0))
-    same = np.array_equal(number, np.arange(len(theirs))) and ours.name == theirs.name
-    if same and np.isfinite(gap.diagonal()).all():
-        return data
     assert data.station is not None
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
     end = "tx" if facts.static_end == "tx" else "rx_position"

@@ -21,7 +21,8 @@ from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.fitting import dotted_settings
 from gsparc.prediction.timing import BLOCKS, Call, p50_p95, time_interleaved
 
-Item, Key = TypeVar("Item"), TypeVar("Key")
+Item = TypeVar("Item")
+Key = TypeVar("Key")
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
 HIDDEN = (
