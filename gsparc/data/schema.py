@@ -62,6 +62,11 @@ class Stations:
         pairs = zip(self.label or self.name, self.name, strict=True)
         return tuple(own if own == name else f"{own} ({name})" for own, name in pairs)
 
+    @property
+    def named(self) -> dict[str, Sequence[str]]:
+        """(T,) names as columns of tables have them: `station`, and `cell` of a list of cells."""
+        return {"station": self.name} | ({} if self.label is None else {"cell": self.label})
+
     def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
         optional = (self.rotation, self.carrier_hz, self.sector)

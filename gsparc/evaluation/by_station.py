@@ -69,7 +69,8 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
     for stem, one in methods.items():
         for name in [name for name in ERRORS if name in one.samples]:
             by, figure = errors_by_station(one, data.station, name), name.replace("error", "rmse")
-            columns.setdefault("station", np.array(data.site.stations.shown)[by.index])
+            for head, names in data.site.stations.named.items():
+                columns.setdefault(head, np.array(names)[by.index])
             columns |= {name.replace("error_db", "rows"): by["rows"], stem + figure: by.rmse}
             columns |= {f"{stem}bias_db": by.bias} if name == ERRORS[0] else {}
     return {name: np.asarray(values) for name, values in columns.items()}

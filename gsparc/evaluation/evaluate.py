@@ -238,7 +238,8 @@ def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measure
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     if data.station is not None and data.site.stations is not None:
-        columns["station"] = np.array(data.site.stations.name)[data.station[scores.row]]
+        of_row = data.station[scores.row]
+        columns |= {head: np.array(names)[of_row] for head, names in data.site.stations.named.items()}
     if data.site.static_end is None:
         other = data.tx[scores.row] + data.site.origin
         columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
