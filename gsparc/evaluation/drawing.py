@@ -23,7 +23,7 @@ PALETTE = (
     "#56B4E9", "#4B5320", "#000000", "#882255", "#332288",
 )  # fmt: skip
 STROKES = ("-", "--", ":", "-.")  # where there are more lines than colours
-STYLE = [f"{__package__}.style", {"axes.prop_cycle": cycler(color=PALETTE)}]
+STYLE: list[Any] = [f"{__package__}.style", {"axes.prop_cycle": cycler(color=PALETTE)}]
 PRINTED = choice("pdf", "svg")  # formats beside PNG
 
 

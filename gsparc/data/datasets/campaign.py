@@ -18,7 +18,7 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems, Severe
 from gsparc.data.files import read_text
 from gsparc.data.limits import SettingError
-from gsparc.data.own import Reading, interpret
+from gsparc.data.own import interpret
 from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.data.raw import Raw, numbered_rows, read_raw, rename_arrays
@@ -72,7 +72,7 @@ class Campaign(DataModule):
             careful = isinstance(note, Caution)
             if careful or note not in self.told:
                 log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
-        for warning in _implausible(reading):
+        for warning in _implausible(reading.data, reading.file_row):
             log.warning("%s: %s", self.file, warning)
         for hint in unit_warnings(reading.data):
             log.warning("%s: %s", self.file, Severe(f"units? {hint}"))
@@ -82,14 +82,13 @@ class Campaign(DataModule):
 MOST_LINKS = 1_000_000  # of places and stations; all are held at once
 
 
-def _implausible(reading: Reading) -> list[str]:
+def _implausible(data: Measurements, file_row: np.ndarray | None) -> list[str]:
     """What `gsparc check` warns of, where that takes seconds."""
-    data = reading.data
     stations = 1 if data.site.stations is None else len(data.site.stations)
     places = len(data) if data.place is None else len(np.unique(data.place))
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
-    levels = link_levels(data, reading.file_row)
+    levels = link_levels(data, file_row)
     if levels is None:
         return [Severe(warning) for warning in convention_warnings(data)]
     return sanity_warnings(levels, find_level_steps(levels))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,8 +21,6 @@ from gsparc.evaluation.summary import read_summary, write_samples
 from gsparc.models.fitting import dotted_settings
 from gsparc.prediction.timing import BLOCKS, Call, p50_p95, time_interleaved
 
-Item = TypeVar("Item")
-Key = TypeVar("Key")
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
 HIDDEN = (
@@ -133,9 +131,9 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     return list(runs.values())
 
 
-def group_in_order(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+def group_in_order(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
     """Return items by what `key` returns of them, in order of appearance."""
-    groups: dict[Key, list[Item]] = {}
+    groups: dict[Any, list[Any]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)
     return groups
