@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isnan
 from typing import Any
 
 from omegaconf import DictConfig
@@ -37,7 +38,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         error = placing.new_station_error(reopen_training(path, settings["dataset"]), int(config.left_out))
     found = placing.place_station(predictor, count=config.count, promise=promise, error=error, **query)
     columns = {**found.given, **coordinates(found.places, predictor)}
-    columns |= {"coverage": found.coverage, "low": found.low, "high": found.high}
+    of_each = {"coverage": found.coverage, "gain": found.gain, "nearest_m": found.nearest_m}
+    of_each |= dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True))
+    columns |= of_each
     write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
     draw_placement(found, run_dir / "place.png", level, unit)
@@ -47,23 +50,26 @@ def task(config: DictConfig) -> dict[str, Any]:
     if predictor.site.georeference is not None:
         latitude, longitude, _ = predictor.degrees(found.places[0])
         where = f"{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
+    best = {name: float(values[0]) for name, values in of_each.items()}
     facts = {
         "place/x": x, "place/y": y, "place/z": z, "place/before": found.before,
-        "place/after": found.coverage[0], "place/low": found.low[0], "place/high": found.high[0],
-        "place/refused": found.refused, "place/candidates": len(found.places), "place/threshold_db": level,
+        "place/after": best["coverage"], "place/refused": found.refused,
+        "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
+        **{f"place/{name}": None if isnan(best[name]) else best[name] for name in [*best][1:]},
     }  # fmt: skip
+    share, gain = (
+        f"{best[name]:.1%}" + ("" if isnan(low) else f" (90 % interval {low:.1%} to {high:.1%})")
+        for name, (low, high) in zip(("coverage", "gain"), found.between[0].reshape(2, 2), strict=True)
+    )
     lines = [
         placing.assumption(predictor.site, z, query["antenna"]),
         f"now {found.before:.1%} of the area with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
-        f"with a station at {where}: {found.coverage[0]:.1%} "
-        f"(90 % interval {found.low[0]:.1%} to {found.high[0]:.1%}), a gain of "
-        f"{found.coverage[0] - found.before:.1%} ({found.low[0] - found.before:.1%} to "
-        f"{found.high[0] - found.before:.1%})",
+        f"with a station at {where}, {best['nearest_m']:.4g} m from the next: {share}, a gain of {gain}",
     ]
-    if error.stations:
-        lines[-1] += f", which counts how far {error.stations} stations left out were off as a whole"
+    if isnan(best["low"]):
+        lines.append("no interval is known: no station could be left out, or promised=false, left_out=0")
     else:
-        lines.append("the interval knows nothing of a whole station's offset: no station was left out")
+        lines[-1] += f", which counts how far {error.stations} sites left out were off as a whole"
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

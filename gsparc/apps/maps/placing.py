@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.stats import norm, t
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.covariance import shadowing
+from gsparc.apps.maps.covered import DRAWS, draw_errors, draw_strongest, share_between
+from gsparc.apps.maps.intervals import Evidence, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise, held_out_evidence
@@ -22,13 +25,13 @@ from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.data.tables import is_table
+from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
-Levels = tuple[np.ndarray, np.ndarray]
 Candidates = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
@@ -77,14 +80,25 @@ class NewStationError:
     """How wrong the model is about a station that it never heard.
 
     Attributes:
-        offset_db: deviation of the mean error of a whole station [dB].
+        offset_db: deviation of the mean error of a whole site [dB].
         within: deviation of errors about that mean, in deviations that the model states.
-        stations: left out, one at a time; 0: nobody was, and the model's own deviations are taken.
+        stations: sites left out, one at a time; 0: none was, and the model's own deviations are taken.
     """
 
     offset_db: float = 0.0
     within: float = 1.0
     stations: int = 0
+
+    @classmethod
+    def from_evidence(cls, parts: Sequence[Evidence]) -> NewStationError:
+        """Return what rows of sites tell, each of which was left out as a whole."""
+        # With silent rows: of lists those alone that were heard are the strong ones.
+        errors = [error_distribution(replace(one, spread_db=np.ones(len(one)))) for one in parts]
+        means = np.array([mass @ error for error, mass in errors])
+        scatter = [mass @ np.square(error - mean) for (error, mass), mean in zip(errors, means, strict=True)]
+        stated = [np.square(one.spread_db).mean() for one in parts]
+        within = np.average(np.divide(scatter, stated), weights=[(one.side == 0).sum() for one in parts])
+        return cls(float(np.sqrt(np.mean(means**2))), float(np.sqrt(within)), len(means))
 
 
 @dataclass(frozen=True)
@@ -95,24 +109,26 @@ class Placement:
         places: (n, 3) world [m].
         coverage: (n,) expected share of the area that is not refused with the threshold or more, with a
             station there.
-        low, high: (n,) the ends of its 90 % interval.
+        gain: (n,) what a station there adds to the share as it is.
+        between: (n, 4) ends of 90 % intervals of both, old and new share drawn together; NaN where no site
+            was left out, or nothing is promised.
+        nearest_m: (n,) to the next station that stands [m].
         before: the share as it is.
         refused: share of the area where the promise says nothing.
         grid: the area.
         stations: (T, 2) that stand already [m].
-        error: of stations left out.
         given: other columns (n,) of a table of candidates, by head.
     """
 
     places: np.ndarray
     coverage: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    gain: np.ndarray
+    between: np.ndarray
+    nearest_m: np.ndarray
     before: float
     refused: float
     grid: Grid
     stations: np.ndarray
-    error: NewStationError
     given: Mapping[str, np.ndarray]
 
 
@@ -160,6 +176,7 @@ def place_station(
         predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
         threshold_db=threshold_db, promise=promise, dry=dry,
     )  # fmt: skip
+    now = replace(now, power_db=np.where(grid.inside, now.power_db, np.nan))
     error = error or NewStationError()
     # Refused squares are left out: as unserved they would count against the stations that stand,
     # and draw a new one to where nothing was tested.
@@ -167,54 +184,60 @@ def place_station(
     if not known.any() and not dry:
         raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
     old_outage, cells = now.outage[grid.inside][known], cells[known]
-    # A 90 % interval of Student's t, as few stations tell the deviation: the normal's 1.645 held too little.
-    reach = float(t.ppf(0.95, max(error.stations, 1))) * error.offset_db
+    together: tuple[np.ndarray, ...] = ()
+    if promise is not None and error.stations:
+        square, best = draw_strongest(now, predictor, promise)
+        few, old = np.searchsorted(np.flatnonzero(grid.inside)[known], square), best >= threshold_db
+        together = few, old, error.within * draw_errors(shadowing(cells[few], promise.block_m), seed=1)
+    # Student's t, as few stations tell the deviation: the normal's ends held too little.
+    offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
 
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells, antenna)
-        goals = np.empty(3)
-        # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
-        for k, shift in enumerate((0.0, -reach, reach)):
-            wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
-            outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
-            goals[k] = np.mean(1 - old_outage * outage)  # its errors are its own
-        return goals
+        wide = np.maximum(np.hypot(spread * error.within, error.offset_db), 1e-9)
+        # Its errors are its own.
+        gain = np.mean(old_outage * norm.sf((threshold_db - level) / wide))
+        if not together:
+            return np.array([gain, *[np.nan] * 4])
+        few, old, wrong = together
+        new = ~old & (level[few, None] + spread[few, None] * wrong + offset >= threshold_db)
+        share = share_between((old | new).mean(0), before + gain)
+        return np.array([gain, *share, *share_between(new.mean(0), gain)])
 
-    scores = np.full((len(candidates), 3), np.nan)
+    before = 1 - float(old_outage.sum()) / max(len(old_outage), 1)
+    scores = np.full((len(candidates), 5), np.nan)
     for row, goals in run_each(tried, list(candidates), "candidates", wanted=lambda place: not dry):
         scores[row] = goals
-    before = np.nan if dry else float(np.mean(1 - old_outage))
     order = np.argsort(-scores[:, 0], kind="stable")
-    given = {head: words[order] for head, words in given.items()}
-    value, low, high = scores[order].T
-    lost = 1 - float(known.mean())
-    return Placement(candidates[order], value, low, high, before, lost, grid, still[:, :2], error, given)
+    given, places = {head: words[order] for head, words in given.items()}, candidates[order]
+    gain, nearest = scores[order, 0], np.fmin.reduce(cdist(places[:, :2], still[:, :2]), axis=1)
+    return Placement(
+        places, before + gain, gain, scores[order, 1:], nearest, before, 1 - float(known.mean()), grid,
+        still[:, :2], given,
+    )  # fmt: skip
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
-    """Leave out whole stations, up to `most`, and predict them from the others."""
-    data, known = learned.data, learned.rows
-    assert data.site.stations is not None and data.station is not None
-    heard = np.unique(data.station[known])
+    """Leave out whole sites, up to `most`, and predict their stations from the others.
+
+    A sector alone would be left to its site's others, which share its shadowing.
+    """
+    data, known, stations = learned.data, learned.rows, learned.data.site.stations
+    assert stations is not None and data.station is not None
+    site = number_sites(stations, stations.position)[data.station[known]]
+    heard = np.unique(site)
     if len(heard) < LEAST_STATIONS:
         return NewStationError()
-    # By the seed of the training: the same stations are left out whenever it is asked again.
+    # By the seed of the training: the same sites are left out whenever it is asked again.
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
-    # Without validation rows: the station left out is the test, all else is learned from.
+    # Without validation rows: the site left out is the test, all else is learned from.
     for one in chosen:
-        own = data.station[known] == one
+        own = site == one
         inner = Fold(known[~own], known[:0], known[own])
         parts.append(held_out_evidence(learned.unlearn(inner), data, inner, np.full(int(own.sum()), one)))
     parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
-    if not parts:
-        return NewStationError()
-    errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
-    means = np.array([error.mean() for error in errors])
-    pairs = zip(errors, means, parts, strict=True)
-    inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
-    within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
-    return NewStationError(float(np.sqrt(np.mean(means**2))), within, len(means))
+    return NewStationError.from_evidence(parts) if parts else NewStationError()
 
 
 def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Candidates:
@@ -234,7 +257,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
 
-def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna) -> Levels:
+def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna) -> Any:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
     known = predictor.predict_new(cells, place, antenna.sectors())
     if known is None and antenna.azimuth is not None:
