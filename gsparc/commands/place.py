@@ -26,50 +26,44 @@ def task(config: DictConfig) -> dict[str, Any]:
     if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)
-    query = {
-        "area": settings["area"], "threshold_db": float(config.threshold_db),
-        "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
-        "antenna": placing.Antenna(**settings["antenna"]),
+    where = {
+        "area": settings["area"], "height_m": config.height_m, "sites": config.sites, "count": config.count,
+        "station_height_m": config.station_height_m, "antenna": placing.Antenna(**settings["antenna"]),
     }  # fmt: skip
-    placing.place_station(predictor, count=1, dry=True, **query)  # refuses before anything is fitted
+    placing.lay_candidates(predictor, **where)  # refuses before anything is fitted
     promise, error = read_or_gather(path, settings), placing.NewStationError()
     # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
         error = placing.new_station_error(reopen_training(path, settings["dataset"]), int(config.left_out))
-    found = placing.place_station(predictor, count=config.count, promise=promise, error=error, **query)
-    columns = {**found.given, **coordinates(found.places, predictor)}
-    of_each = {"coverage": found.coverage, "gain": found.gain, "nearest_m": found.nearest_m}
-    of_each |= dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True))
-    columns |= of_each
-    write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
+    found = placing.place_station(predictor, threshold_db=level, promise=promise, error=error, **where)
+    columns = {
+        **coordinates(found.places, predictor), "coverage": found.coverage, "gain": found.gain,
+        **dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True)),
+        "nearest_m": found.nearest_m,
+    }  # fmt: skip
+    every = {**found.given, **columns}
+    write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in every.items()})
     draw_placement(found, run_dir / "place.png", level, unit)
     # Candidates come best first.
-    x, y, z = found.places[0]
-    where = f"({x:.2f}, {y:.2f}, {z:.2f})"
+    best = {name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()}
+    at = "({x:.2f}, {y:.2f}, {z:.2f})"
     if predictor.site.georeference is not None:
-        latitude, longitude, _ = predictor.degrees(found.places[0])
-        where = f"{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
-    best = {name: float(values[0]) for name, values in of_each.items()}
-    facts = {
-        "place/x": x, "place/y": y, "place/z": z, "place/before": found.before,
-        "place/after": best["coverage"], "place/refused": found.refused,
+        at = "{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
+    facts = {f"place/{name}": value for name, value in best.items()} | {
+        "place/before": found.before, "place/after": best["coverage"], "place/refused": found.refused,
         "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
-        **{f"place/{name}": None if isnan(best[name]) else best[name] for name in [*best][1:]},
     }  # fmt: skip
-    share, gain = (
-        f"{best[name]:.1%}" + ("" if isnan(low) else f" (90 % interval {low:.1%} to {high:.1%})")
-        for name, (low, high) in zip(("coverage", "gain"), found.between[0].reshape(2, 2), strict=True)
-    )
+    told = "with a station at " + at + ", {nearest_m:.4g} m from the next: {coverage:.1%}, gaining {gain:.1%}"
+    interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
+    if best["low"] is not None:
+        interval = "90 % intervals {low:.1%} to {high:.1%}, gain {gain_low:.1%} to {gain_high:.1%}; with how "
+        interval += f"far {error.stations} sites left out were off as a whole"
     lines = [
-        placing.assumption(predictor.site, z, query["antenna"]),
+        placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
         f"now {found.before:.1%} of the area with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
-        f"with a station at {where}, {best['nearest_m']:.4g} m from the next: {share}, a gain of {gain}",
-    ]
-    if isnan(best["low"]):
-        lines.append("no interval is known: no station could be left out, or promised=false, left_out=0")
-    else:
-        lines[-1] += f", which counts how far {error.stations} sites left out were off as a whole"
+        told.format(**best), interval.format(**best),
+    ]  # fmt: skip
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

@@ -99,7 +99,7 @@ def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
     how = ("count=4", "threshold_db=-75", "promised=false")
     done = run("place", f"ckpt={path}", *how, folder=tmp_path / "to")
     assert done.status == 0 and any("no interval is known" in line for line in done.out), done
-    (said,) = [line for line in done.out if "a gain of" in line]
+    (said,) = [line for line in done.out if "gaining" in line]
     assert " m from the next: " in said and "interval" not in said
     table = pd.read_csv(tmp_path / "to" / "place.csv")
     assert table[["low", "high", "gain_low", "gain_high"]].isna().all(axis=None)

@@ -32,12 +32,12 @@ def covered_between(
 
 
 def draw_strongest(
-    field: FieldMap, predictor: Predictor, promise: Promise, other_end: Sequence[float] | None = None
+    field: FieldMap, predictor: Predictor, promise: Promise | None, other_end: Sequence[float] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return squares (n,) of a thinned grid, and the strongest station's level there, drawn (n, DRAWS) [dB].
 
     Errors of the strongest stations are drawn together by the model's own covariance, each as large as
-    held-out blocks say. See `covered_between`.
+    held-out blocks say. See `covered_between`; without a promise only each square's own spread is right.
     """
     level, error = (one.reshape(len(one), -1) for one in (field.power_db, field.expected_error_db))
     known = np.flatnonzero(np.isfinite(level).any(0))
@@ -47,9 +47,10 @@ def draw_strongest(
     rank, at = np.nonzero(np.isfinite(np.take_along_axis(few, station, axis=0)))
     station = station[rank, at]
     places, spread = field.grid.places(square)[at], error[station, square[at]]
-    alike = _pair_correlation(predictor, places, field.number[station], promise.block_m, other_end)
     # The mean of all errors is known no better than the blocks tell it: the correlations hold none of it.
-    covariance = np.outer(spread, spread) * alike + mean_error_variance(promise)
+    block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error_variance(promise))
+    alike = _pair_correlation(predictor, places, field.number[station], block_m, other_end)
+    covariance = np.outer(spread, spread) * alike + common
     drawn = few[station, at][:, None] + draw_errors(covariance)
     best = np.full((len(square), DRAWS), -np.inf)
     np.maximum.at(best, at, drawn)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
-from scipy.stats import norm, t
+from scipy.stats import t
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.covariance import shadowing
-from gsparc.apps.maps.covered import DRAWS, draw_errors, draw_strongest, share_between
+from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, share_between
 from gsparc.apps.maps.intervals import Evidence, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
@@ -32,7 +32,6 @@ from gsparc.prediction.refit import Learned
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
-Candidates = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -93,12 +92,11 @@ class NewStationError:
     def from_evidence(cls, parts: Sequence[Evidence]) -> NewStationError:
         """Return what rows of sites tell, each of which was left out as a whole."""
         # With silent rows: of lists those alone that were heard are the strong ones.
-        errors = [error_distribution(replace(one, spread_db=np.ones(len(one)))) for one in parts]
-        means = np.array([mass @ error for error, mass in errors])
-        scatter = [mass @ np.square(error - mean) for (error, mass), mean in zip(errors, means, strict=True)]
+        told = map(error_distribution, parts)
+        mean, square = np.array([[mass @ error, mass @ np.square(error)] for error, mass in told]).T
         stated = [np.square(one.spread_db).mean() for one in parts]
-        within = np.average(np.divide(scatter, stated), weights=[(one.side == 0).sum() for one in parts])
-        return cls(float(np.sqrt(np.mean(means**2))), float(np.sqrt(within)), len(means))
+        within = np.average(square - mean**2, weights=[(one.side == 0).sum() for one in parts])
+        return cls(float(np.sqrt(np.mean(mean**2 * stated))), float(np.sqrt(within)), len(parts))
 
 
 @dataclass(frozen=True)
@@ -133,24 +131,75 @@ class Placement:
 
 
 def place_station(
-    predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0, height_m: float | None = None,
-    sites: Any = None, station_height_m: float | None = None, count: int = 100,
-    promise: Promise | None = None, error: NewStationError | None = None, antenna: Antenna | None = None,
-    dry: bool = False,
+    predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0,
+    promise: Promise | None = None, error: NewStationError = NewStationError(), antenna: Antenna = Antenna(),
+    **where: Any,
 ) -> Placement:  # fmt: skip
     """Try one more station at every candidate.
 
     Args:
         predictor: of powers at several stations, learned together.
-        area, height_m, threshold_db: see `predict_map`.
+        area, threshold_db: see `predict_map`.
+        promise: see `predict_map`, of the stations that stand.
+        error: see `new_station_error`; without stations the model's own deviations.
+        antenna: of the new station.
+        where: see `lay_candidates`.
+
+    Raises:
+        DataError: as there; or all of the area is too far from what was measured.
+    """
+    grid, candidates, given = lay_candidates(predictor, area, antenna=antenna, **where)
+    left, right, south, north = grid.extent
+    now = predict_map(
+        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
+        threshold_db=threshold_db, promise=promise,
+    )  # fmt: skip
+    # Refused squares are left out: as unserved they would count against the stations that stand,
+    # and draw a new one to where nothing was tested.
+    known = grid.inside & ~now.refused
+    if not known.any():
+        raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
+    now = replace(now, power_db=np.where(known, now.power_db, np.nan))
+    square, best = draw_strongest(now, predictor, promise)
+    old, cells, before = best >= threshold_db, grid.places(square), 1 - float(now.outage[known].mean())
+    alike = shadowing(cells, 1.0 if promise is None else promise.block_m)
+    own = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
+    # Student's t, as few stations tell the deviation: the normal's ends held too little.
+    offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
+    scores = np.full((len(candidates), 5), np.nan)
+
+    def tried(place: np.ndarray) -> np.ndarray:
+        level, spread = _new(predictor, place, cells, antenna)
+        new = ~old & (level[:, None] + spread[:, None] * own + offset >= threshold_db)
+        share = share_between((old | new).mean(0), before + new.mean())
+        return np.array([new.mean(), *share, *np.quantile(new.mean(0), ENDS)])
+
+    for row, goals in run_each(tried, list(candidates), "candidates"):
+        scores[row] = goals
+    if promise is None or not error.stations:
+        scores[:, 1:] = np.nan
+    order = np.argsort(-scores[:, 0], kind="stable")
+    given, places = {head: words[order] for head, words in given.items()}, candidates[order]
+    gain, still = scores[order, 0], now.station_place
+    nearest = np.fmin.reduce(cdist(places[:, :2], still), axis=1)
+    lost = 1 - float(known.sum() / grid.inside.sum())
+    between = scores[order, 1:]
+    return Placement(places, before + gain, gain, between, nearest, before, lost, grid, still, given)
+
+
+def lay_candidates(
+    predictor: Predictor, area: Any = None, *, height_m: float | None = None, sites: Any = None,
+    station_height_m: float | None = None, count: int = 100, antenna: Antenna = Antenna(),
+) -> tuple[Grid, np.ndarray, dict[str, np.ndarray]]:  # fmt: skip
+    """Return the area, places (n, 3) [m] where a station is tried, and other columns (n,) of their table.
+
+    Args:
+        predictor, antenna: see `place_station`, which can be asked about all that is returned.
+        area, height_m: see `predict_map`.
         sites: where a station may stand: GeoJSON of polygons or lines, or a table of places (see
             `read_query_places`), all of which are tried; None: the whole area.
         station_height_m: world; None: the middle height of the stations that stand.
         count: candidates, about.
-        antenna: of the new station.
-        promise: see `predict_map`, of the stations that stand.
-        error: see `new_station_error`; None: the model's own deviations.
-        dry: predict one square of each station that stands alone: whether everything asked for is possible.
 
     Raises:
         DataError: the model cannot predict a station that was never there, or anything else that is wrong.
@@ -160,61 +209,15 @@ def place_station(
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
-    antenna = antenna or Antenna()
-    still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]
-    height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
+    middle = float(np.median(site.stations.position[:, 2]) + site.origin[2])
+    height = middle if station_height_m is None else float(station_height_m)
     candidates, given = _candidates(grid, sites, predictor, height, count)
-    cells = grid.places()
     try:
-        _new(predictor, candidates[0], cells[:1], antenna)
-    except DataError:
-        raise
+        _new(predictor, candidates[0], grid.places()[:1], antenna)
     except ValueError as refused:
-        raise unheard_stations_error(f"{predictor.method.name} ({refused})") from None
-    left, right, south, north = grid.extent
-    now = predict_map(
-        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
-        threshold_db=threshold_db, promise=promise, dry=dry,
-    )  # fmt: skip
-    now = replace(now, power_db=np.where(grid.inside, now.power_db, np.nan))
-    error = error or NewStationError()
-    # Refused squares are left out: as unserved they would count against the stations that stand,
-    # and draw a new one to where nothing was tested.
-    known = np.isfinite(now.outage[grid.inside])
-    if not known.any() and not dry:
-        raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
-    old_outage, cells = now.outage[grid.inside][known], cells[known]
-    together: tuple[np.ndarray, ...] = ()
-    if promise is not None and error.stations:
-        square, best = draw_strongest(now, predictor, promise)
-        few, old = np.searchsorted(np.flatnonzero(grid.inside)[known], square), best >= threshold_db
-        together = few, old, error.within * draw_errors(shadowing(cells[few], promise.block_m), seed=1)
-    # Student's t, as few stations tell the deviation: the normal's ends held too little.
-    offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
-
-    def tried(place: np.ndarray) -> np.ndarray:
-        level, spread = _new(predictor, place, cells, antenna)
-        wide = np.maximum(np.hypot(spread * error.within, error.offset_db), 1e-9)
-        # Its errors are its own.
-        gain = np.mean(old_outage * norm.sf((threshold_db - level) / wide))
-        if not together:
-            return np.array([gain, *[np.nan] * 4])
-        few, old, wrong = together
-        new = ~old & (level[few, None] + spread[few, None] * wrong + offset >= threshold_db)
-        share = share_between((old | new).mean(0), before + gain)
-        return np.array([gain, *share, *share_between(new.mean(0), gain)])
-
-    before = 1 - float(old_outage.sum()) / max(len(old_outage), 1)
-    scores = np.full((len(candidates), 5), np.nan)
-    for row, goals in run_each(tried, list(candidates), "candidates", wanted=lambda place: not dry):
-        scores[row] = goals
-    order = np.argsort(-scores[:, 0], kind="stable")
-    given, places = {head: words[order] for head, words in given.items()}, candidates[order]
-    gain, nearest = scores[order, 0], np.fmin.reduce(cdist(places[:, :2], still[:, :2]), axis=1)
-    return Placement(
-        places, before + gain, gain, scores[order, 1:], nearest, before, 1 - float(known.mean()), grid,
-        still[:, :2], given,
-    )  # fmt: skip
+        told = unheard_stations_error(f"{predictor.method.name} ({refused})")
+        raise refused if isinstance(refused, DataError) else told from None
+    return grid, candidates, given
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
@@ -240,7 +243,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     return NewStationError.from_evidence(parts) if parts else NewStationError()
 
 
-def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Candidates:
+def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Any:
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and is_table(sites):
         site, end = predictor.site, predictor.site.static_end or "tx"

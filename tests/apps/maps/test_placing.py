@@ -102,7 +102,7 @@ def test_intervals_took_four_stations_for_very_many(together, promise):
         place_station(predictor, **how, error=NewStationError(3.0, 1.0, stations)) for stations in (4, 10_000)
     )
     assert (np.ptp(few.between[:, 2:], 1) > np.ptp(many.between[:, 2:], 1)).all()
-    assert (few.coverage == many.coverage).all()
+    assert many.coverage == pytest.approx(few.coverage, abs=0.02)
 
 
 def test_refused_squares_counted_as_not_served(together):
