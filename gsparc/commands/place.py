@@ -22,8 +22,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Try candidates, draw and write; returns the facts of `summary.json`."""
     RunSettings.from_config(config)
     run_dir, settings, path = run_directory(), to_dict(config), str(config.ckpt)
-    stored = checkpoint.read(path)
-    if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
+    if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)
     where = {
@@ -42,8 +41,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         **dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True)),
         "nearest_m": found.nearest_m,
     }  # fmt: skip
-    every = {**found.given, **columns}
-    write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in every.items()})
+    write_samples(run_dir / "place.csv", {name: v.tolist() for name, v in {**found.given, **columns}.items()})
     draw_placement(found, run_dir / "place.png", level, unit)
     # Candidates come best first.
     best = {name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()}
@@ -58,8 +56,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     told = "with a station at " + at + ", {nearest_m:.4g} m from the next: {coverage:.1%}, gaining {gain:.1%}"
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
-        interval = "90 % intervals {low:.1%} to {high:.1%}, gain {gain_low:.1%} to {gain_high:.1%}; with how "
-        interval += f"far {error.stations} sites left out were off as a whole"
+        interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain {gain_low:.1%} to {gain_high:.1%}"
     lines = [
         placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
         f"now {found.before:.1%} of the area with {level:g} {unit} or more"

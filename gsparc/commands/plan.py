@@ -56,6 +56,5 @@ def task(config: DictConfig) -> dict[str, Any]:
         every = "all stations alike (a map shows the strongest)"
         before += f" of {every if stations is None else ', '.join(map(str, stations))}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
-    before += f", a way of {plan.length_m:.0f} m, {kind}"
-    lines = [line for line in (plan.stopped, plan.in_vain) if line]
-    return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")
+    before += f", a way of {plan.length_m:.0f} m, {kind}; plan "
+    return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)

@@ -11,7 +11,6 @@ from gsparc.data.schema import Site
 from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
 from gsparc.models.per_station import OneStationView, PerStation
 from gsparc.prediction.query import Queries
-from gsparc.processes.powers import PowerProcess
 
 
 class JointMixin:
@@ -62,15 +61,6 @@ class JointMixin:
         level, covariance, noise = (part.numpy() for part in known.predict_joint(moving, stations))
         return JointLevels(level + 10 * np.log10(self.site.target_scale), covariance, noise)
 
-    @property
-    def has_covariance(self) -> bool:
-        """Whether `covariance` answers."""
-        return self._error_process() is not None
-
-    def _error_process(self) -> HasJoint | PowerProcess | None:
-        joint = self.method.joint_method() if isinstance(self.method, OneStationView) else None
-        return joint or (self.method.process() if isinstance(self.method, HasProcess) else None)
-
     def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float]:
         """Return the covariance (B, B) of the power's errors at B places, and a measurement's noise [dB^2].
 
@@ -89,16 +79,17 @@ class JointMixin:
         Raises:
             ValueError: the model states none.
         """
-        query, known = self.queries.query(tx, rx, torch.float64).query, self._error_process()
+        query = self.queries.query(tx, rx, torch.float64).query
         places = query.places(self.site)
-        if known is None:
-            raise ValueError(f"covariance: {self.method.name} states none of errors; model=gp of powers does")
-        if isinstance(known, HasJoint):
-            assert isinstance(self.method, OneStationView)
+        known = self.method.joint_method() if isinstance(self.method, OneStationView) else None
+        if isinstance(self.method, OneStationView) and known is not None:
             station = torch.full((len(places),), self.method.number)
             _, covariance, noise = known.predict_joint(places[None], station)
             return (covariance[0] - noise.diag()).numpy(), float(noise[0])
+        process = self.method.process() if isinstance(self.method, HasProcess) else None
+        if process is None:
+            raise ValueError(f"covariance: {self.method.name} states none of errors; model=gp of powers does")
         # Who learned all stations together tells them by their places: there both ends are a query's.
         places = query.places(getattr(self.method, "site", None) or self.site)
-        covariance = known.posterior.covariance(places)  # type: ignore[attr-defined]
-        return covariance.numpy(), known.kernel.amplitude * known.kernel.noise
+        covariance = process.posterior.covariance(places)  # type: ignore[attr-defined]
+        return covariance.numpy(), process.kernel.amplitude * process.kernel.noise

@@ -59,9 +59,9 @@ def error_covariances(
     """
     covariances = []
     for name in stations:
-        number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
         asking = predictor if predictor.site.stations is None else predictor.select_station(name)
-        covariance, noise = station_covariance(asking, places, other_end)
+        number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
+        covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()
@@ -73,26 +73,6 @@ def error_covariances(
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
         covariances.append(ErrorCovariance(covariance, noise, weight))
     return covariances
-
-
-def station_covariance(
-    asking: Predictor, places: np.ndarray, other_end: Sequence[float] | None, block_m: float | None = None
-) -> tuple[np.ndarray, float]:
-    """Return the covariance (S, S) of one station's errors at world places, and a measurement's noise [dB^2].
-
-    Where the model has no process, with `block_m` that of `shadowing`.
-
-    Raises:
-        ValueError: it has none, and nobody says over which blocks errors are alike.
-    """
-    if block_m is not None and not asking.has_covariance:
-        return shadowing(places, block_m), 0.0
-    return asking.covariance(**query_ends(asking.site, places, other_end))
-
-
-def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:
-    """Return correlations (S, S) of errors that are alike over half a block, as exponential shadowing is."""
-    return np.exp(-2 / block_m * cdist(places, places))
 
 
 def prior_covariances(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:

@@ -11,15 +11,14 @@ from scipy.spatial.distance import cdist
 from scipy.stats import t
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.covariance import shadowing
-from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, share_between
+from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, shadowing, share_between
 from gsparc.apps.maps.intervals import Evidence, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise, held_out_evidence
 from gsparc.data.blocks import evenly_spaced
 from gsparc.data.errors import DataError
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.data.limits import Checked, check_arguments, finite_array, number, setting, whole
 from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site
@@ -92,8 +91,7 @@ class NewStationError:
     def from_evidence(cls, parts: Sequence[Evidence]) -> NewStationError:
         """Return what rows of sites tell, each of which was left out as a whole."""
         # With silent rows: of lists those alone that were heard are the strong ones.
-        told = map(error_distribution, parts)
-        mean, square = np.array([[mass @ error, mass @ np.square(error)] for error, mass in told]).T
+        mean, square = np.array([[p @ e, p @ np.square(e)] for e, p in map(error_distribution, parts)]).T
         stated = [np.square(one.spread_db).mean() for one in parts]
         within = np.average(square - mean**2, weights=[(one.side == 0).sum() for one in parts])
         return cls(float(np.sqrt(np.mean(mean**2 * stated))), float(np.sqrt(within)), len(parts))
@@ -166,7 +164,6 @@ def place_station(
     own = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
     # Student's t, as few stations tell the deviation: the normal's ends held too little.
     offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
-    scores = np.full((len(candidates), 5), np.nan)
 
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells, antenna)
@@ -174,17 +171,17 @@ def place_station(
         share = share_between((old | new).mean(0), before + new.mean())
         return np.array([new.mean(), *share, *np.quantile(new.mean(0), ENDS)])
 
-    for row, goals in run_each(tried, list(candidates), "candidates"):
-        scores[row] = goals
+    scores = np.array(run_all(tried, list(candidates), "candidates"))
     if promise is None or not error.stations:
         scores[:, 1:] = np.nan
     order = np.argsort(-scores[:, 0], kind="stable")
     given, places = {head: words[order] for head, words in given.items()}, candidates[order]
     gain, still = scores[order, 0], now.station_place
     nearest = np.fmin.reduce(cdist(places[:, :2], still), axis=1)
-    lost = 1 - float(known.sum() / grid.inside.sum())
-    between = scores[order, 1:]
-    return Placement(places, before + gain, gain, between, nearest, before, lost, grid, still, given)
+    return Placement(
+        places, before + gain, gain, scores[order, 1:], nearest, before,
+        1 - float(known.sum() / grid.inside.sum()), grid, still, given,
+    )  # fmt: skip
 
 
 def lay_candidates(
