@@ -55,6 +55,13 @@ def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
     assert (facts["test/psnr_db"] == facts["baseline/gp/psnr_db"]) == (times == 1)
 
 
+def test_sectors_were_drawn_where_there_are_test_rows_alone(spectra_file, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("gsparc.commands.train.draw_sector_levels", lambda *given: drawn.append(given[-1].name))
+    train(plain(spectra_file, "gp", "baselines=[]", "split=none"), tmp_path)
+    assert drawn == ["sectors.png"]
+
+
 def test_a_checkpoint_evaluates_to_the_same_figures(field):
     facts, checkpoints = field.evaluation.facts, field.checkpoints
     found, _, _ = evaluate.evaluate_files(checkpoints, baselines=["mean"])

@@ -19,6 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
 
@@ -64,6 +65,14 @@ def test_the_share_as_it_is_was_taken_as_exact(together, promise):
     now = covered_between(field, predictor, promise)
     width, gained = (np.ptp(part, axis=1) for part in np.split(found.between, 2, axis=1))
     assert (width > 0.02).all() and (width < 1.1 * np.ptp(now)).all() and (gained > 0).all()
+
+
+def test_any_fault_of_a_covariance_was_taken_for_a_model_without_one(together, promise, monkeypatch):
+    predictor = gsparc.load(together[2])
+    monkeypatch.setattr(Predictor, "covariance", lambda *_, **__: pytest.fail("nothing is asked and dropped"))
+    field = predict_map(predictor, step_m=4.0, threshold_db=-75.0, promise=promise)
+    low, high = covered_between(field, predictor, promise)
+    assert low < 1 - np.nanmean(field.outage) < high
 
 
 def test_an_interval_of_no_width_stood_where_no_station_was_left_out(together):
