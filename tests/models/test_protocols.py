@@ -3,8 +3,6 @@
 Methods are fitted once, on tiny data.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Methods by name, and what a file may ask to build."""
 
-from __future__ import annotations
-
 from dataclasses import is_dataclass
 
 import pytest

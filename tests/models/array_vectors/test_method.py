@@ -1,7 +1,5 @@
 """The static-array model end to end: renderer, Gaussian process, kernel choice, state, queries."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The distance law against what made the powers: exponent, floor, outliers, unknown places, moving ends."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """The Gaussian process against brute force, scikit-learn and the real data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The simple baselines, and what all of them share."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

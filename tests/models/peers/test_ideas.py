@@ -1,7 +1,5 @@
 """Each peer on a scene where its own idea must work."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """What every peer trained by gradient keeps to: its budget, its kinds, its checkpoint, the test rows."""
 
-from __future__ import annotations
-
 import signal
 from functools import partial
 from pathlib import Path

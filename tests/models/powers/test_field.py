@@ -1,7 +1,5 @@
 """The field of powers: the plain process without Gaussians, known walls, rows left out, slopes, state."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Sources estimated in an uplink, and the methods that read one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
