@@ -130,6 +130,29 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     assert again.count_components() == method.count_components()
 
 
+UNFITTED = (*VARIANCE, "nearest", "splat", "gsrf", "uplink", "ridge")
+POISONED = ("mean", "complex_gp", "gsrf", "newrf", "splat", "array", "directional_gp", "uplink")
+
+
+@pytest.mark.parametrize("name", UNFITTED)
+def test_a_method_that_is_not_fitted_says_so(name):
+    query = Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3)))
+    with pytest.raises(ValueError, match=r"uplink= is needed|fit or restore|not fitted|not been trained"):
+        method_class(name)().predict(query)
+
+
+@pytest.mark.parametrize("name", POISONED)
+def test_no_test_row_is_looked_at(name, tmp_path):
+    method, data, fold = fitted(name)
+    batch, target, rays = data.batch(fold.test), data.target.copy(), data.directions
+    target[fold.test] = 0 if target.dtype == np.uint8 else np.nan
+    if rays is not None:
+        rays = [np.full_like(one, np.nan) if row in fold.test else one for row, one in enumerate(rays)]
+    again = unfitted(name).create_for(data)
+    again.fit(replace(data, target=target, directions=rays), fold, short(tmp_path, 10))
+    assert torch.equal(again.predict(batch).mean, method.predict(batch).mean)
+
+
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
