@@ -153,6 +153,29 @@ def test_no_test_row_is_looked_at(name, tmp_path):
     assert torch.equal(again.predict(batch).mean, method.predict(batch).mean)
 
 
+FEW = ("mean", "nearest", "idw", "gp", "kriging", "distance_law", "complex_gp", "array")
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, "four at a place", "at one place", "alike"])
+@pytest.mark.parametrize("name", FEW)
+def test_few_rows_and_rows_of_one_place_are_finite(name, rows, tmp_path):
+    _, data, fold = fitted(name)
+    few, places = fold.train[: rows if isinstance(rows, int) else 20], np.zeros(len(data), int)
+    if isinstance(rows, str):
+        places = np.arange(len(data)) // 4 if rows == "four at a place" or name == "array" else places
+        moving = "tx" if data.site.moving_end == "tx" else "rx_position"
+        data = replace(data, **{moving: getattr(data, moving)[places]})
+    if rows == "alike":
+        data = replace(data, target=data.target[np.zeros(len(data), int)])
+    method, batch = unfitted(name).create_for(data), data.batch(fold.test)
+    method.fit(data, Fold(few, few[:0], fold.test), short(tmp_path, 10))
+    found = method.predict(batch)
+    assert all(torch.isfinite(part).all() for part in (found.mean, found.variance) if part is not None)
+    assert (
+        rows != "alike" or name == "array" or torch.allclose(found.mean, batch.target, rtol=1e-3, atol=0.02)
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "settings"),
     [

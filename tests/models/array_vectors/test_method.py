@@ -159,17 +159,6 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
         ArrayField(SMALL).fit(data, _fold(12), FitContext(tmp_path))
 
 
-@pytest.mark.parametrize("rows", [1, 3, 96])
-def test_very_few_rows_and_duplicate_positions(known_campaign, tmp_path, rows):
-    data, _ = known_campaign
-    if rows == 96:
-        data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
-    method = ArrayField(SMALL)
-    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 100)), FitContext(tmp_path))
-    batch = data.batch(np.arange(4))
-    assert torch.isfinite(method.predict(batch).mean).all()
-
-
 @pytest.mark.slow
 def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
     """Real spectra: paired differences to the image GP."""

@@ -72,12 +72,6 @@ def test_few_rows_give_a_usual_law(count):
     assert EXPONENTS[0] <= law.exponent <= EXPONENTS[1] and np.isfinite([law.level, law_variance(law)]).all()
 
 
-def test_all_rows_at_one_place():
-    rows = rows_of(20)
-    law = fit_law(replace(rows, places=np.tile(STILL, (20, 1))), STILL)
-    assert np.isfinite(law.mean(torch.from_numpy(rows.places)).numpy()).all()
-
-
 def test_the_density_has_mass_one_and_its_variance():
     def density(z: float) -> float:
         return float(np.exp(-likelihood_slopes(np.array([z]), np.array([False]), 1.0)[0]))
