@@ -109,6 +109,11 @@ def drawn(deviations: list[float], rows: int = 400, common: float = 0.0, seed: i
     return rng.normal(size=(rows, len(deviations))) * deviations + common * rng.normal(size=(rows, 1))
 
 
+def test_no_weight_is_negative_where_plain_least_squares_has_one():
+    gram = np.array([[1.0, 1.5], [1.5, 4.0]])  # unconstrained: 1.25 and -0.25
+    assert best_weights(gram) == pytest.approx([1.0, 0.0], abs=1e-6)
+
+
 def test_weights_are_the_best_of_a_grid():
     errors = drawn([1.0, 1.2, 0.9], common=0.3)
     gram = gram_of(errors).mean(0)
