@@ -162,7 +162,7 @@ def test_few_rows_and_rows_of_one_place_are_finite(name, rows, tmp_path):
     _, data, fold = fitted(name)
     few, places = fold.train[: rows if isinstance(rows, int) else 20], np.zeros(len(data), int)
     if isinstance(rows, str):
-        places = np.arange(len(data)) // 4 if rows == "four at a place" or name == "array" else places
+        places = np.arange(len(data)) // 4 if rows == "four at a place" else places
         moving = "tx" if data.site.moving_end == "tx" else "rx_position"
         data = replace(data, **{moving: getattr(data, moving)[places]})
     if rows == "alike":
