@@ -54,6 +54,8 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
     if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return
+    # Noise below a stated level has its place in a list, and bounds what is not listed by that level.
+    levels = np.where(np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels)
     moment = number_lists(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
@@ -82,7 +84,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
         may = np.isnan(lists.level)
         what = (
             f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
-            f" below its weakest, in lists shorter than {lists.length}: below {floor.min():.4g} dB"
+            f" below its weakest, in lists shorter than {lists.length}: below {np.nanmin(floor):.4g} dB"
         )
     most, every = UNLISTED_EACH * len(heard), int(may.sum())
     of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)

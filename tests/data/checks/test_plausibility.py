@@ -96,7 +96,6 @@ def test_sound_degrees():
     (lambda v: -v + 40, "losses (store minus them; dataset.columns.rssi_db=HEAD*-1), per cent"),
     (lambda v: np.round((v + 100) / 2), "an index, or linear"),
     (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-    (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? then say dataset.not_heard=[-48]"),
     (lambda v: v * 0 - 3, "all levels are -3 dB"),
 ])  # fmt: skip
 def test_levels(level, said):
@@ -160,12 +159,10 @@ def test_outages_and_what_was_not_heard():
     level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
     found = plausibility.gap_warnings(as_links(place, level, ["a", "b", "c"]))
     # What to do comes first: it was the third of three warnings, in words that no command took.
-    assert found[0].startswith("not heard? then say dataset.absent=silent (")
+    assert found[0].startswith("not heard? then say dataset.absent=silent: ")
     assert "180 levels are missing of station b, beside the weakest ones" in found[0]
-    advised = float(found[0].partition("dataset.columns.sensitivity_db=")[2].split()[0])  # was refused
     off = "no level in the 60 rows from row 100 to row 159 of station a: off, or not listed;"  # "an outage"
     assert found[1].startswith(off)
-    assert advised <= np.nanmin(level[:, 1])
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
     assert plausibility.gap_warnings(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == [
         "no level in any row"
