@@ -47,6 +47,7 @@ from gsparc.evaluation.metric_formats import main_figure, score_of
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
+from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import all_methods, build, fill_defaults
@@ -329,6 +330,7 @@ def _draw(
     own = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
     tracking.log_final(loggers, own)
     method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
+    draw_sector_levels(method, data, fold, run_dir / "sectors.png")
     if len(fold.test):
         title = f"{data.site.name}: test rows of {method.label}"
         draw_predictions(method, data, fold, title, run_dir / "test.png")

@@ -62,6 +62,8 @@ def measured_at(place):
     [
         (lambda p: np.round(p * [600, 600, 1]), "whole numbers up to"),
         (lambda p: p * [1, 1, 1000], "heights differ by"),
+        (lambda p: p / 1000, "if these are kilometres"),
+        (lambda p: p * [300, 300, 1] + 30e3 * np.outer(np.arange(len(p)) % 2, [1, 0, 0]), "reach over"),
         (lambda p: np.array([40.76, -111.8, 0]) + p / 1e3, "degrees? then give"),
         (lambda p: p, None),
         (lambda p: p + np.array([4e5, 5e6, 100]), None),  # UTM
