@@ -71,9 +71,13 @@ def identity_hash(data: Measurements) -> str:
     The content hash of a site (`Site.sha256`) is of the measurements alone: on another grid, in another unit
     or about another origin they are other data.
     """
+    return hashlib.sha256(f"{_fact_text(data.site)} {auxiliary_hash(data)}".encode()).hexdigest()
+
+
+def auxiliary_hash(data: Measurements) -> str:
+    """Return the SHA-256 of directions and uplinks, which that of a site leaves out."""
     directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
-    auxiliary = content_hash({**directions, "uplink": data.uplink})
-    return hashlib.sha256(f"{_fact_text(data.site)} {auxiliary}".encode()).hexdigest()
+    return content_hash({**directions, "uplink": data.uplink})
 
 
 def _fact_text(fact: Any) -> str:

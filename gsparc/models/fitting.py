@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from gsparc.data import heeded
-from gsparc.data.assemble import content_hash
+from gsparc.data.assemble import auxiliary_hash
 from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices
@@ -147,9 +147,7 @@ class Origin:
     @classmethod
     def from_fit(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
         """Return the origin of a fit that begins."""
-        directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
-        auxiliary = content_hash({**directions, "uplink": data.uplink})
-        return cls(data.site, auxiliary, hash_indices((fold,)), context.seed, context.config_yaml)
+        return cls(data.site, auxiliary_hash(data), hash_indices((fold,)), context.seed, context.config_yaml)
 
     def to_extra(self) -> dict[str, Any]:
         """Return what a checkpoint has as `extra`; it holds the configuration itself."""

@@ -23,6 +23,7 @@ SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS = 3
+NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
 HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
@@ -40,8 +41,9 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    warnings = [*map(Severe, level_warnings(levels.level_db)), *duplicate_warnings(levels)]
-    return [*warnings, *outlier_row_warnings(levels), *step_warnings(levels, steps), *gap_warnings(levels)]
+    severe = map(Severe, [*level_warnings(levels.level_db), *floor_warnings(levels)])
+    warnings = [*severe, *duplicate_warnings(levels), *outlier_row_warnings(levels)]
+    return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
@@ -64,22 +66,55 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         return []
     if not np.ptp(values):
         return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
-    warnings = []
-    different, counts = np.unique(values, return_counts=True)
-    least = f"{round(float(different[0]), 6) + 0:g}"
-    usual = max(5 * float(np.median(counts)), 3 * counts[1])
-    if len(counts) > 3 and counts[0] > max(PILE * len(values), 10, usual):
-        share = f"{counts[0]} of {len(values)} levels are exactly {least}"
-        warnings.append(f"{share}, the least: not heard? then say dataset.not_heard=[{least}]")
-        values = values[values != different[0]]
     low, high = float(values.min()), float(values.max())
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
-        warnings.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
-    elif low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
+        return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
+    if low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
-        warnings.append(f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?")
-    return warnings
+        return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
+    return []
+
+
+def floor_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of stations whose levels pile up at a receiver's own noise, or lowest reading."""
+    heard = {_of([levels.names[t]], len(levels.names)): levels.level_db[used] for t, used in levels.heard()}
+    # Of a station that is seldom heard weak levels are missing, not piled up.
+    often = max(map(len, heard.values()), default=0) / 2
+    found = [(who, find_floor_pile(level)) for who, level in heard.items() if len(level) >= often]
+    every = [("", find_floor_pile(levels.level_db[np.isfinite(levels.level_db)]))]
+    piles = [(who, *pile) for who, pile in found if pile] or [(who, *pile) for who, pile in every if pile]
+    said = list_first([f"{share:.0%} of the levels{who} below {top:.4g} dB" for who, top, share in piles])
+    return [
+        f"not heard? {said}, a receiver's noise or lowest reading, are learned as signals; dataset.columns."
+        f"sensitivity_db={top:.4g} (or a column of stations, of each its own) takes levels below as not heard"
+        for top in sorted(top for _, top, _ in piles)[-1:]
+    ]
+
+
+def find_floor_pile(levels: np.ndarray) -> tuple[float, float] | None:
+    """Return the level below which a pile at the lowest of levels (n,) lies, and its share; None without.
+
+    The lowest level may repeat. Else signals become rarer upwards no faster than exponentially (distances and
+    shadowing have log-concave densities in decibels): a pile is one that far fewer follow than that law with
+    the mean of all lets expect.
+    """
+    levels, (different, counts) = np.sort(levels), np.unique(levels, return_counts=True)
+    if len(counts) < 4:
+        return None
+    if counts[0] > max(PILE * len(levels), 10, 5 * float(np.median(counts)), 3 * counts[1]):
+        return float(different[1]), counts[0] / len(levels)
+    held = np.searchsorted(levels, levels + NOISE_DB, "right") - np.arange(len(levels))
+    first, count = int(held.argmax()), int(held.max())
+    top = levels[first] + NOISE_DB
+    after, end = np.searchsorted(levels, top + np.array([1, 1 + NOISE_DB]))  # a decibel above the pile
+    low = first <= 0.1 * count + 2 and count >= max(PILED * len(levels), 15)
+    if not low or len(levels) - end < PILE * len(levels):  # few far above: the range of all is small
+        return None
+    most = end - after + np.sqrt(end - after) + 1  # a deviation more than were counted
+    expected = count * np.exp(-(NOISE_DB + 1) / (levels[first:] - levels[first]).mean())
+    # In simulated tables without a floor more than .7 of those expected follow.
+    return (float(top), (first + count) / len(levels)) if most < 0.7 * expected else None
 
 
 def find_saturation(values: np.ndarray) -> float | None:
@@ -117,26 +152,17 @@ def find_marks(values: np.ndarray) -> list[float]:
 
 def duplicate_warnings(levels: LinkLevels) -> list[str]:
     """Warn of rows of one place and station: copies of equal value, repeated measurements else."""
-    import pandas as pd  # here, as it takes half a second
-
-    rows = levels.rows
-    places = np.column_stack([levels.position, levels.station])
-    where = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
-    table = pd.DataFrame({"link": where, "level": levels.level_db, "row": range(len(rows))})
-    table = table[np.isfinite(table["level"])].sort_values("link", kind="stable")
-    first = table.groupby(["link", "level"])["row"].transform("first")
-    warnings = []
-    same = [f"{rows[b]} of {rows[a]}" for a, b in zip(first, table["row"], strict=True) if a != b]
-    if same:
-        fine = "fine if measured twice (rows of a place stay on one side of a split), as are repeats near by"
-        warnings.append(f"copies (same place, station and level): {list_first(same)}; {fine}, else leave out")
-    spreads = table.drop_duplicates(["link", "level"]).groupby("link")["level"].std().dropna()
-    if len(spreads):
-        warnings.append(
-            f"{len(spreads)} places were measured more than once by one station, with different levels "
-            f"(standard deviation {spreads.median():.2g} dB, median)"
-        )
-    return warnings
+    rows, known = levels.rows, np.flatnonzero(np.isfinite(levels.level_db))
+    links = np.column_stack([levels.position, levels.station, levels.level_db])[known]
+    different, first, which = np.unique(links, axis=0, return_index=True, return_inverse=True)
+    same = [f"{rows[known[i]]} of {rows[known[j]]}" for i, j in enumerate(first[which.reshape(-1)]) if i != j]
+    fine = "fine if measured twice (rows of a place stay on one side of a split), as are repeats near by"
+    copies = f"copies (same place, station and level): {list_first(same)}; {fine}, else leave out"
+    apart = np.split(different[:, -1], np.flatnonzero(np.diff(different[:, :-1], axis=0).any(axis=1)) + 1)
+    spreads = [one.std(ddof=1) for one in apart if len(one) > 1]
+    repeated = f"{len(spreads)} places were measured more than once by one station, with different levels"
+    spread = f"(standard deviation {np.median(spreads or [0]):.2g} dB, median)"
+    return [copies] * bool(same) + [f"{repeated} {spread}"] * bool(spreads)
 
 
 def outlier_row_warnings(levels: LinkLevels) -> list[str]:

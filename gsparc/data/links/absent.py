@@ -54,6 +54,8 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
     if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return
+    # Noise below a stated level has its place in a list, and bounds what is not listed by that level.
+    levels = np.where(np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels)
     moment = number_lists(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
@@ -75,7 +77,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
         floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
         may = np.isnan(lists.level)
         how = "one that a full list leaves out is below its weakest"
-        how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"
+        how += f", in lists shorter than {lists.length}: below {np.nanmin(floor):.4g} dB"
     if not wanted:
         flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
         unknown = f"{missing} with dataset.absent=unknown: {flattered}; leave absent out"

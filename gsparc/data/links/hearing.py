@@ -69,16 +69,13 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
         heard = values[~unheard & np.isfinite(values)]
         unknown |= unheard
         if floor is not None:
-            censored = unknown & marked
+            unknown |= _below_floor(check, values, floor, ~unknown & marked, unknown & marked)
+            censored = unknown & marked & ~np.isnan(floor)
         elif unheard.any() and len(heard):
             floor, censored = np.full(len(values), heard.min()), unheard
         saturated = _saturated(check, values, ~unknown & marked)
-        values = arrays[measured]
     if floor is not None:
-        _note_floor(check, links, values, floor, ~unknown & marked, censored)
-        if len(check.problems) > before:
-            return None
-        arrays[measured] = np.where(censored, floor, values)
+        arrays[measured] = np.where(censored, floor, arrays[measured])
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
     if mask is not None and lost.any():
         return links  # marked as measured, and is not: refused where values are read
@@ -115,37 +112,27 @@ def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarr
     if level is None or values.ndim != 1:
         return None
     floor = np.broadcast_to(level, values.shape)
-    floor = np.where(np.isnan(floor) & np.isfinite(values), values, floor)  # what was heard needs none
-    if not (np.abs(floor) <= 400).all():
+    if (np.abs(floor) > 400).any():  # NaN: of that station or row it is not known
         return check.refuse("sensitivity_db", "expected dB between -400 and 400")
     return floor
 
 
-def _note_floor(
-    check: Checker,
-    links: Links,
-    values: np.ndarray,
-    floor: np.ndarray,
-    known: np.ndarray,
-    censored: np.ndarray,
-) -> None:
-    """Refuse a level of hearing (S,) above known values (S,), note one far below them all."""
+def _below_floor(
+    check: Checker, values: np.ndarray, floor: np.ndarray, known: np.ndarray, silent: np.ndarray
+) -> np.ndarray:
+    """Which of known values (S,) lie below a level of hearing (S,), (S,) bool; one far below all is noted."""
     below = known & (values < floor)
-    # A value under the limit contradicts it: one of the two has another unit or receiver.
     if below.any():
-        row = int(np.flatnonzero(below)[0])
-        of_row = replace(links, station=check.raw.arrays.get("station"))
-        named = of_row.name_rows([*map(str, check.raw.arrays["row_name"])])[row]
-        wrong = f"{named}: rssi_db is {values[row]:.4g}, below {floor[row]:.4g}"
-        return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
-    # Levels may be whole numbers, among which there is no infinity.
-    highest, weakest = floor[censored].max(initial=-np.inf), values[known].astype(float).min(initial=np.inf)
+        share = f"{below.sum()} of {known.sum()} levels lie below sensitivity_db"
+        check.notes.append(Caution(f"{share}: taken as not heard; has it the unit of the levels?"))
+    highest = np.fmax.reduce(floor[silent | below], initial=-np.inf)
+    weakest = values[known & ~below].astype(float).min(initial=np.inf)  # whole numbers know no infinity
     if FAR_BELOW_DB < weakest - highest < np.inf:
         check.notes.append(
             f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
             "is it the receiver's? places where nothing was heard count as weaker still"
         )
-    return None
+    return below
 
 
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
@@ -160,8 +147,7 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     for mark in marks if given is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
         said = f"{share}, apart from all others: taken as not heard, below {floor}"
-        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db gives another limit (of a table "
-        say += "dataset.columns.sensitivity_db=LEVEL)"
+        say = "dataset.not_heard=[] keeps them as levels, dataset.columns.sensitivity_db=LEVEL sets that"
         check.notes.append(Caution(f"{said}; {say}"))
     return silent
 

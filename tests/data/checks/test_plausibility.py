@@ -98,7 +98,6 @@ def test_sound_degrees():
     (lambda v: -v + 40, "losses (store minus them; dataset.columns.rssi_db=HEAD*-1), per cent"),
     (lambda v: np.round((v + 100) / 2), "an index, or linear"),
     (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-    (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? then say dataset.not_heard=[-48]"),
     (lambda v: v * 0 - 3, "all levels are -3 dB"),
 ])  # fmt: skip
 def test_levels(level, said):

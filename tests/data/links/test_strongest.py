@@ -121,6 +121,17 @@ def test_cells_below_a_floor_were_taken_for_lost(wide):
     assert interpret(Raw(arrays, {"absent": "unknown"}), "drive").data.censored is None
 
 
+def test_noise_in_lists_of_the_strongest_was_refused():
+    one, listed = network(0), network(0).listed(6)
+    arrays = one.arrays(6)
+    floor = float(np.quantile(arrays["rssi_db"], 0.3))
+    plain, data = (from_arrays(arrays | more) for more in ({}, {"sensitivity_db": np.array(floor)}))
+    assert len(plain) == len(data) == 3 * listed.sum()
+    assert (data.censored == 0).sum() == (one.measured[listed] >= floor).sum()
+    levels = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
+    assert levels.min() > floor - 1e-3
+
+
 @pytest.mark.parametrize("share", [0.005, 0.1, 0.5])
 def test_lost_levels_are_below_no_floor(share):
     """At random, and of cells that were off."""
