@@ -39,8 +39,6 @@ NB_MODULE(_native, module) {
     module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;
     module.attr("SIMILARITY_HEIGHT") = kSimilarityHeight;
     module.attr("RADIUS") = kRadius;
-    module.attr("MOST_INPUTS") = kMostInputs;
-    module.attr("MOST_OUTPUTS") = kMostOutputs;
     define(module, "plan", plan);
     define(module, "entries", entries);
     define(module, "rasterize", rasterize);
