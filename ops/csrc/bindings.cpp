@@ -32,8 +32,6 @@ NB_MODULE(_native, module) {
     module.attr("STRIP_ROWS") = kStripRows;
     module.attr("UNSOUND_POSE") = kUnsoundPose;
     module.attr("EQUAL_IDS") = kEqualIds;
-    module.attr("UNSOUND_FEATURES") = kUnsoundFeatures;
-    module.attr("REFUSED") = kRefused;
     module.attr("TILE_WIDTH") = kTileWidth;
     module.attr("TILE_HEIGHT") = kTileHeight;
     module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;
@@ -41,7 +39,6 @@ NB_MODULE(_native, module) {
     module.attr("RADIUS") = kRadius;
     define(module, "plan", plan);
     define(module, "entries", entries);
-    define(module, "rasterize", rasterize);
 #define X(name) define(module, #name, [](const Call& call) { return (call.twice ? kernels<double>().name : kernels<float>().name)(call); });
     GSPARC_KERNELS(X)
 #undef X
