@@ -1,4 +1,4 @@
-"""Rooms import what a list allows, and no circle; nobody prints; ops register once."""
+"""Rooms import what a list allows, and no circle; ops register once. That nobody prints: ruff (T20)."""
 
 import ast
 import importlib
@@ -207,12 +207,9 @@ def test_imports_have_full_names():
             assert not {name.split(".")[0] for name in names} & {"lightning", "hydra", "omegaconf"}, file
 
 
-def test_nothing_prints_and_nothing_happens_at_import():
+def test_nothing_happens_at_import():
     for file in (*(file for _, file in FILES), ROOT / "train.py"):
         tree = _tree(file)
-        asked = ast.walk(tree) if "print(" in _text(file) else ()
-        printed = [n.lineno for n in asked if isinstance(n, ast.Call) and ast.unparse(n.func) == "print"]
-        assert not printed, f"{file}:{printed}: print: use logging or rich"
         for node in tree.body:  # os.environ, torch.set_num_threads, ... belong into functions
             if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
                 called = ast.unparse(node.value.func)

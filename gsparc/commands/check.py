@@ -50,7 +50,7 @@ def check(
         for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:
             _line(console, line)
         return False
-    levels = link_levels(reading.data)
+    levels = link_levels(reading.data, reading.file_row)
     steps = [] if levels is None else find_level_steps(levels)
     warnings = [f"units? {hint}" for hint in unit_warnings(reading.data)] + outlier_warnings(reading.data)
     warnings += [note for note in reading.notes if isinstance(note, Caution)]

@@ -13,9 +13,10 @@ from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
+from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import remarks, results_table, write_samples
+from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models import checkpoint
 
 
@@ -71,11 +72,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     # All folds of a run share its configuration, and so its seed.
     seed = checkpoint.read(paths[0]).configuration.get("seed")
     facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
-    if evaluation.columns:
-        write_samples(run_dir / "per_sample.csv", evaluation.columns)
+    evaluation.write(run_dir)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.title}, {config.eval_on}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)
     # Who opened the files has warned of it, and warnings are repeated below the table.
     said = remarks({**facts, "split/foreign": None}, config.eval_on)
-    return finish_run(run_dir, facts, results, lines=said)
+    worst = worst_stations(evaluation.stations, facts["model/label"])
+    return finish_run(run_dir, facts, results, *worst, lines=said)

@@ -79,7 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     promise = read_or_gather(str(config.ckpt), settings)
     field = predict_map(predictor, promise=promise, **query)
     coverage = None if promise is None else promise.coverage(how.share)
-    ends = None if promise is None else covered_between(field, predictor, promise, settings["other_end"])
+    ends = None if promise is None else covered_between(field, predictor, promise)
     lines = map_notes(field, coverage, ends)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"

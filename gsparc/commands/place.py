@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isnan
 from typing import Any
 
 from omegaconf import DictConfig
@@ -21,49 +22,45 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Try candidates, draw and write; returns the facts of `summary.json`."""
     RunSettings.from_config(config)
     run_dir, settings, path = run_directory(), to_dict(config), str(config.ckpt)
-    stored = checkpoint.read(path)
-    if str(UNHEARD) not in stored.state.get("per_station", {str(UNHEARD): None}):
+    if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)
-    query = {
-        "area": settings["area"], "threshold_db": float(config.threshold_db),
-        "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
-        "antenna": placing.Antenna(**settings["antenna"]),
+    where = {
+        "area": settings["area"], "height_m": config.height_m, "sites": config.sites, "count": config.count,
+        "station_height_m": config.station_height_m, "antenna": placing.Antenna(**settings["antenna"]),
     }  # fmt: skip
-    placing.place_station(predictor, count=1, dry=True, **query)  # refuses before anything is fitted
+    placing.lay_candidates(predictor, **where)  # refuses before anything is fitted
     promise, error = read_or_gather(path, settings), placing.NewStationError()
     # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
         error = placing.new_station_error(reopen_training(path, settings["dataset"]), int(config.left_out))
-    found = placing.place_station(predictor, count=config.count, promise=promise, error=error, **query)
-    columns = {**found.given, **coordinates(found.places, predictor)}
-    columns |= {"coverage": found.coverage, "low": found.low, "high": found.high}
-    write_samples(run_dir / "place.csv", {name: values.tolist() for name, values in columns.items()})
     level, unit = float(config.threshold_db), predictor.site.level_unit
+    found = placing.place_station(predictor, threshold_db=level, promise=promise, error=error, **where)
+    columns = {
+        **coordinates(found.places, predictor), "coverage": found.coverage, "gain": found.gain,
+        **dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True)),
+        "nearest_m": found.nearest_m,
+    }  # fmt: skip
+    write_samples(run_dir / "place.csv", {name: v.tolist() for name, v in {**found.given, **columns}.items()})
     draw_placement(found, run_dir / "place.png", level, unit)
     # Candidates come best first.
-    x, y, z = found.places[0]
-    where = f"({x:.2f}, {y:.2f}, {z:.2f})"
+    best = {name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()}
+    at = "({x:.2f}, {y:.2f}, {z:.2f})"
     if predictor.site.georeference is not None:
-        latitude, longitude, _ = predictor.degrees(found.places[0])
-        where = f"{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
-    facts = {
-        "place/x": x, "place/y": y, "place/z": z, "place/before": found.before,
-        "place/after": found.coverage[0], "place/low": found.low[0], "place/high": found.high[0],
-        "place/refused": found.refused, "place/candidates": len(found.places), "place/threshold_db": level,
+        at = "{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
+    facts = {f"place/{name}": value for name, value in best.items()} | {
+        "place/before": found.before, "place/after": best["coverage"], "place/refused": found.refused,
+        "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
+    told = "with a station at " + at + ", {nearest_m:.4g} m from the next: {coverage:.1%}, gaining {gain:.1%}"
+    interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
+    if best["low"] is not None:
+        interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain {gain_low:.1%} to {gain_high:.1%}"
     lines = [
-        placing.assumption(predictor.site, z, query["antenna"]),
+        placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
         f"now {found.before:.1%} of the area with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
-        f"with a station at {where}: {found.coverage[0]:.1%} "
-        f"(90 % interval {found.low[0]:.1%} to {found.high[0]:.1%}), a gain of "
-        f"{found.coverage[0] - found.before:.1%} ({found.low[0] - found.before:.1%} to "
-        f"{found.high[0] - found.before:.1%})",
-    ]
-    if error.stations:
-        lines[-1] += f", which counts how far {error.stations} stations left out were off as a whole"
-    else:
-        lines.append("the interval knows nothing of a whole station's offset: no station was left out")
+        told.format(**best), interval.format(**best),
+    ]  # fmt: skip
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

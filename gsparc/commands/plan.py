@@ -23,13 +23,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Choose, draw and write; returns the facts of `summary.json`."""
     settings_of(config)
     run_dir, settings = run_directory(), to_dict(config)
+    stations = stations_of(settings["stations"])
     floor = read_plan_settings(settings)
     # Before anything is measured there is no model, and places are spread over the area.
     predictor = None if config.ckpt is None else load(config.ckpt)
     promise = None if predictor is None else read_or_gather(str(config.ckpt), settings)
     plan = plan_measurements(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
-        plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],
+        plan=floor, stations=stations, other_end=settings["other_end"],
         promise=promise, least_gain_db=float(config.least_gain_db), route=config.route,
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
     )  # fmt: skip
@@ -52,9 +53,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
     if predictor is not None and predictor.site.stations is not None:
-        before += " of all stations alike (a map shows the strongest)"
-    if walk:
-        kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
-        before += f", a way of {plan.length_m:.0f} m, {kind}"
-    lines = [line for line in (plan.stopped, plan.in_vain) if line]
-    return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")
+        every = "all stations alike (a map shows the strongest)"
+        before += f" of {every if stations is None else ', '.join(map(str, stations))}"
+    kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
+    before += f", a way of {plan.length_m:.0f} m, {kind}; plan "
+    return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)

@@ -31,6 +31,7 @@ from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
+from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
@@ -47,6 +48,7 @@ from gsparc.evaluation.metric_formats import main_figure, score_of
 from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
+from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import all_methods, build, fill_defaults
@@ -60,7 +62,8 @@ log_of_models = logging.getLogger("gsparc.models")  # of which the console shows
 LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 # What a run leaves; of another one, all of it would be read beside this one's.
 LEFT = (
-    *("summary.json", "split.json", "per_sample.csv", "render_ms.csv", "test.png", "found.png"),
+    *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
+    *("test.png", "found.png"),
     *(f"{fold}{name}" for fold in ("", "fold*/") for name in (checkpoint.MODEL, "learning_curve.csv")),
 )
 
@@ -176,9 +179,7 @@ def train(
             objects = TrainedRun(fits.methods, files, data, split, evaluation)
             if in_full:
                 _draw(loggers, config, facts, objects, run_dir)
-        if evaluation.columns:
-            samples = {**evaluation.columns, "run_id": [run_id] * len(evaluation.columns["row"])}
-            summary.write_samples(run_dir / "per_sample.csv", samples)
+        evaluation.write(run_dir, run_id=run_id)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, objects
 
@@ -299,6 +300,7 @@ def _keep(
         context.log_curve(report.seconds, fitted.name)
     marks = fitting.run_extra(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
+    extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
 
@@ -329,6 +331,7 @@ def _draw(
     own = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
     tracking.log_final(loggers, own)
     method, data, fold = objects.methods[0], objects.data, objects.split.folds[0]
+    draw_sector_levels(method, data, fold, run_dir / "sectors.png")
     if len(fold.test):
         title = f"{data.site.name}: test rows of {method.label}"
         draw_predictions(method, data, fold, title, run_dir / "test.png")
@@ -371,7 +374,8 @@ def task(config: DictConfig) -> float:
                 title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
                 table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
                 tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
-                show_result(run_dir, *[table] * tested, lines=summary.remarks(facts, config.eval_on))
+                worst = worst_stations(objects.evaluation.stations, facts["model/label"])
+                show_result(run_dir, *[table, *worst] * tested, lines=summary.remarks(facts, config.eval_on))
     figure = main_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Self
@@ -129,6 +129,8 @@ class DataModule(pl.LightningDataModule, ABC):
     """
 
     free = "auto"  # `dataset.align`: what of each row's factor is free
+    notes: Sequence[str] = ()  # how the data were understood, once they are read
+    told: Sequence[str] = ()  # notes that a user has seen, at the training of a model
 
     def __init__(self, name: str, batch_size: int = 16) -> None:
         super().__init__()

@@ -45,10 +45,12 @@ class Reading:
     Attributes:
         data: the measurements.
         notes: remarks for the user, one line each; nothing is wrong.
+        file_row: (S,) number of each row in its file from 0, as `dataset.level_steps` counts; None: its own.
     """
 
     data: Measurements
     notes: tuple[str, ...]
+    file_row: np.ndarray | None = None
 
 
 def load_own(path: str | Path) -> Measurements:
@@ -180,7 +182,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
         station=links.station, place=links.place, censored=links.censored, run=links.run,
-        position_std=position_std, file_rows=raw.arrays["file_row"].tolist(),
+        position_std=position_std,
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":
@@ -200,7 +202,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)  # `**` may overflow
     site = replace(data.site, target_scale=scale)
     data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
-    return Reading(data, tuple(check.notes))
+    return Reading(data, tuple(check.notes), raw.arrays["file_row"])
 
 
 def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, Any]:

@@ -47,9 +47,8 @@ class FromBuffer(Placeholder):
         return np.frombuffer(buffer, dtype).reshape(shape, order=order)
 
 
-ARRAYS: dict[
-    str, Callable[..., Any]
-] = {  # by name below numpy, builtins or _codecs: these build arrays, and no more
+# By name below numpy, builtins or _codecs: these build arrays, and no more.
+ARRAYS: dict[str, Callable[..., Any]] = {
     "numpy.ndarray": np.ndarray,
     "numpy.dtype": np.dtype,
     "numpy.multiarray._reconstruct": multiarray._reconstruct,  # type: ignore[attr-defined]

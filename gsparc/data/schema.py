@@ -62,6 +62,11 @@ class Stations:
         pairs = zip(self.label or self.name, self.name, strict=True)
         return tuple(own if own == name else f"{own} ({name})" for own, name in pairs)
 
+    @property
+    def named(self) -> dict[str, Sequence[str]]:
+        """(T,) names as columns of tables have them: `station`, and `cell` of a list of cells."""
+        return {"station": self.name} | ({} if self.label is None else {"cell": self.label})
+
     def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
         optional = (self.rotation, self.carrier_hz, self.sector)
@@ -287,7 +292,6 @@ class Measurements:
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
         position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
             where positions count as exact.
-        file_rows: number from 0 of each row in its file, as `dataset.level_steps` counts; empty: unknown.
     """
 
     site: Site
@@ -307,7 +311,6 @@ class Measurements:
     censored: np.ndarray | None = None
     run: np.ndarray | None = None
     position_std: np.ndarray | None = None
-    file_rows: list[int] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.target)

@@ -45,16 +45,14 @@ class Answers:
 
     Attributes:
         place: (N,) int64, row of the places.
-        station: (N,) names; None where the model has no stations.
-        cell: (N,) the same as a list of cells calls them; None where that is no other name.
+        names: (N,) of stations by heads of columns, see `Stations.named`; empty where the model has none.
         mean: (N, ...) in the predictor's unit.
         variance: (N,) float64, expected squared error per entry; None where the method has none.
         confidence: (N,) float32; None where the method has none.
     """
 
     place: np.ndarray
-    station: np.ndarray | None
-    cell: np.ndarray | None
+    names: dict[str, np.ndarray]
     mean: np.ndarray
     variance: np.ndarray | None
     confidence: np.ndarray | None
@@ -112,7 +110,7 @@ def predict_file(
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside_and_margin": int(far.sum()),
-        "predict/stations": 0 if predictions.station is None else len(np.unique(predictions.station)),
+        "predict/stations": len(np.unique(predictions.names.get("station", ()))),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,
     }  # fmt: skip
@@ -192,9 +190,9 @@ def predict_places(
     whole = Prediction.joined([prediction for _, prediction in parts], torch.from_numpy(order))
     variance, confidence = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
     rows = rows[order]
-    names = None if stations is None else np.array(stations.name)[number[rows]]
-    cells = None if stations is None or stations.label is None else np.array(stations.label)[number[rows]]
-    return Answers(row[rows], names, cells, whole.mean.numpy(), variance, confidence)
+    called = {} if stations is None else stations.named
+    names = {head: np.array(every)[number[rows]] for head, every in called.items()}
+    return Answers(row[rows], names, whole.mean.numpy(), variance, confidence)
 
 
 def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
@@ -266,8 +264,7 @@ def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]
         axes = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
         for axis, values in zip(axes, where.all().T, strict=True):
             columns[before + axis] = values[predictions.place]
-    columns |= {} if predictions.station is None else {"station": predictions.station}
-    return columns if predictions.cell is None else {**columns, "cell": predictions.cell}
+    return columns | predictions.names
 
 
 def _in_order(

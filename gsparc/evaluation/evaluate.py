@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +15,13 @@ from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, hash_indices
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
+from gsparc.evaluation.by_station import station_columns
 from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import main_figure
+from gsparc.evaluation.metric_formats import judged_by
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unseen_runs
+from gsparc.evaluation.summary import write_samples
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.prediction import timing
@@ -46,10 +50,18 @@ class Evaluation:
     Attributes:
         facts: flat keys as in `summary.json`.
         columns: per-sample columns of `per_sample.csv`.
+        stations: columns of `by_station.csv`, of powers of several stations.
     """
 
     facts: dict[str, Any]
     columns: dict[str, Any]
+    stations: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: Path, **shared: Any) -> None:
+        """Write what there is of `per_sample.csv` and `by_station.csv`, `shared` cells in every row."""
+        for name, columns in (("per_sample.csv", self.columns), ("by_station.csv", self.stations)):
+            if columns:
+                write_samples(folder / name, columns | shared)
 
 
 def evaluate(
@@ -105,11 +117,13 @@ def evaluate(
     for stem, one in every.items():
         own = {**pool_figures(one, data, split), "skill": _skill(one, others)}
         facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
-    figure = main_figure({**facts, "dataset/kind": data.site.scored}, eval_on)
-    for name, other in others.items():
+    stems = {f"baseline/{name}/": other.scores for name, other in others.items()}
+    stations = station_columns({"": scores, **stems}, data)
+    judged = judged_by({**facts, "dataset/kind": data.site.scored}, eval_on)
+    for (name, other), (ahead, figure) in product(others.items(), judged.items()):
         lead = lead_over_rows(other.scores.samples, scores.samples, figure)
         if lead is not None and other is not same:
-            facts |= {f"baseline/{name}/ahead{key}": value for key, value in lead.facts().items()}
+            facts |= {f"baseline/{name}/{ahead}{key}": value for key, value in lead.facts().items()}
     facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
     decided = scores.dominant_row()
     if decided and data.row_names:
@@ -124,7 +138,7 @@ def evaluate(
     facts |= _about(methods, seconds, data, split)
     if FIELD in every:
         facts[f"{FIELD}/train_s"] = facts["time/train_s"]
-    return Evaluation(facts, _columns(scores, others, data))
+    return Evaluation(facts, _columns(scores, others, data), stations)
 
 
 def _about(
@@ -223,6 +237,9 @@ def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measure
     if data.site.kind == "rssi":
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
+    if data.station is not None and data.site.stations is not None:
+        of_row = data.station[scores.row]
+        columns |= {head: np.array(names)[of_row] for head, names in data.site.stations.named.items()}
     if data.site.static_end is None:
         other = data.tx[scores.row] + data.site.origin
         columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 from scipy.stats import norm
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.data.units import power_in_decibels
+from gsparc.evaluation.by_station import best_server, rmse_after_constants
 from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
 from gsparc.evaluation.scores import Scores, errors_with_silent
 
 SHARE = 0.9  # of the truth that an interval is to hold
-# 1e-4 of a power is .0004 dB: above float32 rounding (6e-8), below any two real levels.
-SAME_LEVEL = 1e-4  # of a power: levels that differ by less are one
+SAME_LEVEL_DB = 4e-4  # levels that differ by less are one: above float32 rounding, below any two real ones
 
 
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
@@ -81,14 +82,11 @@ def sensitivity_levels(data: Measurements) -> np.ndarray | None:
     if not len(rows):
         return None
     station = np.zeros(len(data), np.int64) if data.station is None else data.station
-    level = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
-    power = data.target[rows, 0].astype(np.float64)
-    for number in np.unique(station[rows]):
-        own = power[station[rows] == number]
-        if np.ptp(own) <= SAME_LEVEL * own[0]:
-            # The target of a silent row is its level, a power in stored units.
-            level[number] = 10 * np.log10(own[0] * data.site.target_scale)
-    return level
+    # The target of a silent row is its level, a power in stored units.
+    levels = pd.Series(10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale))
+    each = levels.groupby(station[rows]).agg(["first", "min", "max"])
+    one = each["first"].where(each["max"] - each["min"] <= SAME_LEVEL_DB)
+    return one.reindex(range(1 if data.site.stations is None else len(data.site.stations))).to_numpy()
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
@@ -104,14 +102,15 @@ def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | No
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies and `reduced_chi_squared`; of powers also `rmse_with_silent`, `power_intervals` and, of
-    stations held out, errors left after a constant of each.
+    """Accuracies and `reduced_chi_squared`; of powers `rmse_with_silent`, `power_intervals`, `best_server`.
+
+    Of stations held out also the errors left after a constant of each.
     """
     figures = scores.figures()
     if data.site.kind != "rssi":
         figures |= reduced_chi_squared(scores, data)
     else:
-        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data)
+        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data) | best_server(scores, data)
         if split.name == "stations" and data.station is not None:
-            figures["rmse_db_after_constant"] = scores.rmse_without_station_bias(data.station)
+            figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.station)
     return figures

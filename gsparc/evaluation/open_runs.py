@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, list_first
+from gsparc.data.links.stations import all_names
 from gsparc.data.load import datamodule, split_for
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
@@ -124,9 +125,8 @@ def open_files(
     if len({one.extra.get("run_id") for one in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
     # A class is imported only where the caller named it, never because a file does.
-    chosen_class = "_target_" in (dataset or {})
-    module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
-    data = align_to_site(module.measurements, stored[0].site)
+    own = _read(stored[0], dataset, trusted="_target_" in (dataset or {}))
+    data = align_to_site(own, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
     # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
@@ -148,8 +148,16 @@ def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> Measurement
     Raises:
         ValueError: the file, or the settings, cannot be read.
     """
-    module = datamodule(_settings("dataset", stored, {"file": str(path)}), trusted=False)
-    return align_to_site(module.measurements, stored.site)
+    return align_to_site(_read(stored, {"file": str(path)}), stored.site)
+
+
+def _read(
+    stored: checkpoint.Stored, overrides: Mapping[str, Any] | None = None, trusted: bool = False
+) -> Measurements:
+    """The measurements that `_settings` name; how they are read is said unless training said it."""
+    module = datamodule(_settings("dataset", stored, overrides), trusted=trusted)
+    module.told = stored.extra.get("read_notes", ())
+    return module.measurements
 
 
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -245,7 +253,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
     site = stored[0].site
     try:
         if data.site.sha256 != site.sha256:
-            data = datamodule(_settings("dataset", stored[0], None), trusted=False).measurements
+            data = _read(stored[0])
             # The file was changed or exchanged after training: its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None
@@ -330,25 +338,42 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
     if ours is None or theirs is None:
         if ours is theirs or (data.site.static_position is not None and site.static_position is not None):
             return data  # one place, a table of one or not
-        if ours is None:
-            raise ValueError(f"{data.site.name} has one static end, the model has stations; {ANOTHER}")
-        raise ValueError(f"{data.site.name} has {len(ours)} stations, the model one static end; {ANOTHER}")
-    number = np.empty(len(ours), np.int64)
-    for t, name in enumerate(ours.name):
-        near = np.linalg.norm(ours.position[t] + shift - theirs.position, axis=1) <= SAME_PLACE_M
-        if np.isnan(ours.position[t]).any():  # nobody knows where: by the name alone
-            near = np.isnan(theirs.position).any(axis=1) & (np.array(theirs.name) == name)
-        here = np.flatnonzero(near).tolist()
-        # Sectors of one mast share a place: there the name decides.
-        called = [i for i in here if theirs.name[i] == name]
-        if len(here) != 1 and not called:
-            raise ValueError(f"station {name} of {data.site.name} is none of the model's; leave it out")
-        number[t] = called[0] if called else here[0]
-    if np.array_equal(number, np.arange(len(theirs))) and ours.name == theirs.name:
-        return data
+        have = ["one static end" if of is None else f"{len(of)} stations" for of in (ours, theirs)]
+        raise ValueError(f"{data.site.name} has {have[0]}, the model {have[1]}; {ANOTHER}")
+    # A list of cells has names of its own beside those that a drive gives them.
+    called, known = (
+        [{*pair} for pair in zip(of.name, of.label or of.name, strict=True)] for of in (ours, theirs)
+    )
+    gap = np.linalg.norm(ours.position[:, None] + shift - theirs.position, axis=2)
+    number = np.full(len(ours), -1)
+    for t, names in enumerate(called):
+        # Sectors of one mast share a place: there the name decides, as it does where nobody knows the place.
+        alike = [i for i, own in enumerate(known) if names & own and not gap[t, i] > SAME_PLACE_M]
+        near = np.flatnonzero(gap[t] <= SAME_PLACE_M).tolist()
+        if alike or len(near) == 1:
+            number[t] = (alike or near)[0]
+    if (number < 0).any():
+        raise ValueError(_explain_unknown(data.site.name, ours, theirs, number < 0))
     assert data.station is not None
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
-    return replace(data, station=number[data.station], site=facts)
+    end = "tx" if facts.static_end == "tx" else "rx_position"
+    there = (theirs.position - shift)[number[data.station]]
+    # Of a place that one of both does not know, all is as the model learned it.
+    both = np.isfinite(there + getattr(data, end))
+    still = np.where(both, getattr(data, end), there)
+    return replace(data, station=number[data.station], site=facts, **{end: still})
+
+
+def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.ndarray) -> str:
+    """Which stations of a file a model does not know, and what to do."""
+    lost, kept = ([ours.name[t] for t in np.flatnonzero(flags)] for flags in (unknown, ~unknown))
+    fault = f"stations {list_first(lost)} of {source} are none of the model's, {list_first(theirs.name)}"
+    if not {*all_names(ours)} & {*all_names(theirs)}:
+        way = (
+            "dataset.columns.station=COLUMN takes another column's names, dataset.stations_file=FILE a list's"
+        )
+        return f"{fault}: no name in common; {way} that has both"
+    return f"{fault}, by name and place; leave them out: dataset.stations=[{list_first(kept, 9)}]"
 
 
 def _times(values: Any, factor: float) -> Any:

@@ -11,7 +11,6 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models.method import Method, predict_in_batches
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
@@ -32,7 +31,6 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
-        draw_sector_levels(method, data, np.sort(np.r_[fold.train, fold.val]), path.with_name("sectors.png"))
         measured = data.censored_side(rows) == 0  # of a silent row the target is its level
         return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
     assert data.site.grid is not None

@@ -68,20 +68,6 @@ class Scores:
         facts = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
         return {f"decided_by/{name}": value for name, value in facts.items()}
 
-    def rmse_without_station_bias(self, station: np.ndarray) -> float | None:
-        """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
-
-        Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
-        """
-        error, of_row = self.samples["error_db"], station[self.row]
-        known = np.isfinite(error)
-        # Numbered from 0 without gaps: stations without a scored row would be divided by 0.
-        error, of_row = error[known], np.unique(of_row[known], return_inverse=True)[1].reshape(-1)
-        if not len(error):
-            return None
-        means = np.bincount(of_row, error) / np.bincount(of_row)
-        return float(np.sqrt(np.mean((error - means[of_row]) ** 2)))
-
 
 def errors_with_silent(
     samples: Mapping[str, np.ndarray], row: np.ndarray, data: Measurements

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
@@ -19,15 +20,15 @@ MOST, ACROSS = 12, 4  # sectors drawn, those with most rows; beside each other
 LEAST = 10  # rows that were heard of a sector
 
 
-def draw_sector_levels(method: Method, data: Measurements, rows: np.ndarray, path: Path) -> None:
-    """Draw rows (n,) of sectors, less the law of distance, where there are patterns."""
+def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Path) -> None:
+    """Draw rows of sectors that were learned from, less the law of distance, where there are patterns."""
     every = method.all_stations() if isinstance(method, PerStation) else None
     field = None if every is None else every.joint_method()
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
         return
     trend = field.own.never.trend
     assert isinstance(trend, Sectors)
-    heard = rows_of_stations(data, rows, field.places).measured_rows
+    heard = rows_of_stations(data, np.r_[fold.train, fold.val], field.places).measured_rows
     count = np.bincount(heard.station, minlength=len(field.places))
     # Without an azimuth there is no angle to draw over.
     count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0

@@ -19,9 +19,12 @@ import pandas as pd
 
 from gsparc.data.files import write_whole
 from gsparc.evaluation.metric_formats import (
+    BEST_SERVER,
     CALIBRATION,
+    LISTED,
     TABLES,
     WITH_SILENT,
+    judged_by,
     main_figure,
     number_format,
     score_of,
@@ -97,8 +100,8 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
         title: of the table.
         prefix: `test`, `train` or `val`.
     """
-    # Silent rows, and variances, are not of all data and methods.
-    beside = [name for name in (WITH_SILENT, CALIBRATION) if f"{prefix}/{name}" in facts]
+    # Silent rows, stations and variances are not of all data and methods.
+    beside = [name for name in (WITH_SILENT, BEST_SERVER, CALIBRATION) if f"{prefix}/{name}" in facts]
     wanted = [*TABLES[facts["dataset/kind"]], "skill", *beside]
     own, *others = result_rows(facts, prefix)
     figures = [own.get(name) for name in wanted]
@@ -211,28 +214,35 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Return whether the best baseline beats the method, or neither; where rows were silent, these count."""
-    figure = main_figure(facts, prefix)
-    own = facts.get(f"{prefix}/{figure}")
-    keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
-    known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
-    best = max(known, key=lambda name: known[name], default=None)
-    if best is None or own is None:
-        return []
-    lead = Lead.from_facts(facts, f"baseline/{best}/ahead")
-    if lead is None:
-        better = known[best] > score_of(figure, own)
-        return [f"the baseline {best} has the better {figure} here; how surely is not known"] * better
-    return judge_baseline(best, str(facts.get("model/label") or facts.get("model/name")), figure, lead)
+    """Return whether the best baseline beats the method, or neither; with silent rows, and of heard ones."""
+    method, said = str(facts.get("model/label") or facts.get("model/name")), list[str]()
+    for ahead, figure in judged_by(facts, prefix).items():
+        own = facts.get(f"{prefix}/{figure}")
+        keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
+        known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
+        best = max(known, key=lambda name: known[name], default=None)
+        if best is None or own is None:
+            continue
+        lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}")
+        if lead is not None:
+            said += judge_baseline(best, method, figure, lead, ahead == LISTED)
+        elif known[best] > score_of(figure, own):
+            said.append(f"the baseline {best} has the better {figure} here; how surely is not known")
+    return said
 
 
-def judge_baseline(baseline: str, method: str, figure: str, lead: Lead) -> list[str]:
-    """Return whether a baseline, which has `lead` over a method, is better, worse or not told apart."""
+def judge_baseline(baseline: str, method: str, figure: str, lead: Lead, listed: bool = False) -> list[str]:
+    """Return whether a baseline, which has `lead` over a method, is better, worse or not told apart.
+
+    Of `listed` rows alone it is no choice: lists hold what is strong, and which cells they hold is not known.
+    """
+    figure = f"{figure} of heard rows" if listed else figure
     if not lead.sure:
         return [f"the baseline {lead.no_difference(baseline, method, figure)}"]
     if lead.ahead_db < 0:
         return [f"{method} is {-lead} in {figure} than {baseline}, the best baseline"]
-    return [f"the baseline {baseline} is {lead} in {figure}: the better choice for this data and split"]
+    choice = "" if listed else ": the better choice for this data and split"
+    return [f"the baseline {baseline} is {lead} in {figure}{choice}"]
 
 
 def _value(key: str, value: Any) -> int | float | str | None:

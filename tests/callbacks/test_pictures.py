@@ -32,18 +32,12 @@ def test_now_and_then_and_at_the_end(campaign, folds, tmp_path, step, drawn):
     assert (tmp_path / "pictures" / f"step_{step:06d}.png").exists() == drawn
 
 
-def test_training_rows_are_never_drawn(campaign, folds, tmp_path):
-    data = campaign("spectrum")
+@pytest.mark.parametrize(("kind", "validation"), [("spectrum", 0), ("csi", None)])
+def test_neither_training_rows_nor_channels_are_drawn(campaign, folds, tmp_path, kind, validation):
+    data = campaign(kind)
     fold = folds(len(data)).folds[0]
-    run, module = stage(data, type(fold)(fold.train, fold.val[:0], fold.test), tmp_path, 25)
-    Pictures(every=10, count=200).on_train_batch_end(run, module)
-    assert not list(tmp_path.iterdir())
-
-
-def test_channels_have_no_picture(campaign, folds, tmp_path):
-    data = campaign("csi")
-    run, module = stage(data, folds(len(data)).folds[0], tmp_path, 25)
-    Pictures(every=5).on_train_batch_end(run, module)
+    run, module = stage(data, type(fold)(fold.train, fold.val[:validation], fold.test), tmp_path, 25)
+    Pictures(every=5, count=200).on_train_batch_end(run, module)
     assert not list(tmp_path.iterdir())
 
 

@@ -17,6 +17,7 @@ import gsparc
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
 from gsparc.data.public.fetch import MIRROR
+from gsparc.evaluation.console import ConsoleHandler
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint, loading
 
@@ -39,6 +40,29 @@ def test_the_command_leaves_summary_samples_and_table(trained, tmp_path):
     assert {"per_sample.csv", "split.json"} <= {path.name for path in (tmp_path / "run").iterdir()}
     table = "\n".join(done.out)
     assert all(word in table for word in ("query", "nearest", "complex_gp"))
+
+
+def test_every_command_repeated_how_columns_are_read(tmp_path, monkeypatch):
+    """Ten lines stood above each answer; evaluate said nothing, of another file either."""
+    rng = np.random.default_rng(0)
+
+    def drive(name, heads):
+        rows = [f"{x:.1f},{y:.1f},{-60 - x:.1f}" for x, y in rng.uniform(0, 9, (40, 2))]
+        (tmp_path / name).write_text("\n".join([heads, *rows]))
+        return tmp_path / name
+
+    def said(command, *given):
+        monkeypatch.setattr(ConsoleHandler, "read", set())  # as a process of its own begins
+        done = knock(COMMANDS[command].run, command, [*given, f"hydra.run.dir={tmp_path / command}"])
+        assert done.status == 0, done
+        return [line for line in done.out if "taken as" in line]
+
+    first, model = drive("a.csv", "x,y,rsrp_dbm"), f"ckpt={tmp_path / 'train' / 'model.ckpt'}"
+    own = "dataset=own", f"dataset.file={first}", "model=idw", "threads=1", "baselines=[]"
+    assert len(said("train", *own)) == 3
+    assert said("evaluate", model, "baselines=[]") == [] == said("map", model, "step_m=5")
+    (other,) = said("evaluate", model, "baselines=[]", f"dataset.file={drive('b.csv', 'x,y,rssi_dbm')}")
+    assert "column 'rssi_dbm' taken as rssi_db" in other
 
 
 def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path):

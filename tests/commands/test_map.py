@@ -9,10 +9,11 @@ from pathlib import Path
 from threading import Timer
 
 import numpy as np
+import pandas as pd
 import pytest
 from doors import assert_refused, knock
 from PIL import Image
-from towns import town_model
+from towns import town_file, town_model, trained
 
 import gsparc
 from gsparc.apps.maps import predict_map
@@ -66,7 +67,8 @@ def test_the_promise_stays_with_the_model(mapped, model):
 
 
 def test_a_plan_from_the_model(mapped, model, tmp_path):
-    done = run("plan", f"ckpt={model}", "count=6", "route=true", "area=[-20,0,80,60]", folder=tmp_path)
+    """Places were in the order of gains without a way between them, unless somebody said `route=true`."""
+    done = run("plan", f"ckpt={model}", "count=6", "area=[-20,0,80,60]", folder=tmp_path)
     assert done.status == 0, done
     (said,) = [line for line in done.out if "6 places: expected error" in line]
     assert "a way of" in said and "of all stations alike (a map shows the strongest)" in said
@@ -78,10 +80,31 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     assert np.hypot(*np.diff(way, axis=0).T).sum() == pytest.approx(facts["plan/length_m"])
 
 
+def test_a_plan_for_some_stations_spoke_of_all(model, tmp_path):
+    how = ("count=2", "stations=[west]", "promised=false", "route=false")
+    done = run("plan", f"ckpt={model}", *how, folder=tmp_path)
+    (said,) = [line for line in done.out if "2 places: expected error" in line]
+    assert " of west, a way of " in said and not (tmp_path / "plan.geojson").exists()
+
+
 def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
     monkeypatch.setattr("gsparc.commands.place.load", lambda path: pytest.fail("all stations are restored"))
     answer = run("place", f"ckpt={model}", folder=tmp_path)
     assert_refused(answer, "train with stations=together", tmp_path)
+
+
+def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
+    """Two stations, of which none can be left out; gains stood in no file."""
+    path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
+    how = ("count=4", "threshold_db=-75", "promised=false")
+    done = run("place", f"ckpt={path}", *how, folder=tmp_path / "to")
+    assert done.status == 0 and any("no interval is known" in line for line in done.out), done
+    (said,) = [line for line in done.out if "gaining" in line]
+    assert " m from the next: " in said and "interval" not in said
+    table = pd.read_csv(tmp_path / "to" / "place.csv")
+    assert table[["low", "high", "gain_low", "gain_high"]].isna().all(axis=None)
+    facts = json.loads((tmp_path / "to" / "summary.json").read_text())
+    assert facts["place/low"] is None and facts["place/gain"] == pytest.approx(table["gain"].max())
 
 
 def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):

@@ -2,15 +2,12 @@
 
 import json
 import logging
-import re
-import traceback
 from pathlib import Path
 
 import numpy as np
 import pytest
 from campaigns import brief, compose, plain, short
 from doors import knock
-from lightning.pytorch import Trainer
 from lightning.pytorch.loggers import CSVLogger
 
 import gsparc
@@ -22,8 +19,6 @@ from gsparc.evaluation.experiment import options
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.training import curve
-
-ROOT = Path(__file__).parents[2]
 
 
 def steps(folder: Path) -> list[int]:
@@ -55,6 +50,13 @@ def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
     assert (facts["test/psnr_db"] == facts["baseline/gp/psnr_db"]) == (times == 1)
 
 
+def test_sectors_were_drawn_where_there_are_test_rows_alone(spectra_file, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("gsparc.commands.train.draw_sector_levels", lambda *of: drawn.append(of[-1].name))
+    train(plain(spectra_file, "gp", "baselines=[]", "split=none"), tmp_path)
+    assert drawn == ["sectors.png"]
+
+
 def test_a_checkpoint_evaluates_to_the_same_figures(field):
     facts, checkpoints = field.evaluation.facts, field.checkpoints
     found, _, _ = evaluate.evaluate_files(checkpoints, baselines=["mean"])
@@ -62,26 +64,6 @@ def test_a_checkpoint_evaluates_to_the_same_figures(field):
     assert len(same) > 5 and all(found.facts[key] == facts[key] for key in same)
     image = gsparc.load(checkpoints[0]).spectrum(tx=[0.1, 0.2, 0.1])
     assert image.shape == (16, 32) and image.max() <= 1
-
-
-def test_calls_down_to_the_trainer_are_those_of_the_map(spectra_file, tmp_path, monkeypatch):
-    called, root = [], Path(gsparc.__file__).parent
-
-    def reached(*unused, **named):
-        stack = [one.name for one in traceback.extract_stack() if str(root) in one.filename]
-        called.extend(name for name in stack if name != "<genexpr>")
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(Trainer, "fit", reached)
-    with pytest.raises(ZeroDivisionError):
-        train(short(spectra_file), tmp_path)
-    text = (root.parent / "ARCHITECTURE.md").read_text().partition("To the Trainer: ")[2]
-    named = [name.rpartition(".")[2] for name in re.findall(r"`([\w.]+)`", text.partition(".\n")[0])]
-    returned = {"by_station", "align_phases", "create_for", "choose"}  # have ended when steps begin
-    named = [name for name in named if name not in returned]
-    down = iter(["run", "task", *called])
-    # In this order, helpers between them left out.
-    assert named[-1] == called[-1] and all(name in down for name in named)
 
 
 def test_folds_have_folders_and_are_pooled(spectra_file, tmp_path):

@@ -83,24 +83,6 @@ def test_directions_from_last_points(csi_arrays):
     np.testing.assert_allclose(np.concatenate(data.directions), np.tile([0, 1, 0], (24, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["csi", "spectrum"])
-def test_far_from_the_origin_changes_rounding_only(kind, csi_arrays, spectrum_arrays):
-    arrays = csi_arrays if kind == "csi" else spectrum_arrays
-    near = from_arrays(arrays)
-    shift = np.array([1e5, -1e5, 1e3])
-    moved = {n: a + shift if n in ("rx_position", "tx_position") else a for n, a in arrays.items()}
-    far = from_arrays(moved)
-    assert np.abs(far.tx - near.tx).max() < 1e-9 and np.abs(far.rx_position - near.rx_position).max() < 1e-9
-    np.testing.assert_allclose(far.site.origin - near.site.origin, shift)
-    rows = np.arange(4)
-    for a, b in (
-        (far.batch(rows).tx, near.batch(rows).tx),
-        (far.batch(rows).rx.position, near.batch(rows).rx.position),
-    ):
-        np.testing.assert_allclose(a.numpy(), b.numpy(), atol=2.5e-7)
-    np.testing.assert_array_equal(far.target, near.target)
-
-
 def test_a_refused_file_is_not_written(tmp_path, csi_arrays):
     csi_arrays["csi"][0, 0, 0] = np.inf
     with pytest.raises(ValueError, match="row 0"):

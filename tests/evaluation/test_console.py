@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from gsparc.data.datasets.own import Own
 from gsparc.data.errors import Severe
 from gsparc.evaluation.console import ConsoleHandler, config_folder, error_in_one_line, repeated_warnings
 
@@ -40,13 +41,19 @@ def test_an_equals_sign_in_a_list_was_not_understood_without_saying_why():
     assert quoted in example
 
 
-def test_evaluate_said_how_every_column_is_read():
+def test_evaluate_said_how_every_column_is_read(tmp_path, caplog):
     """28 lines of columns, of the file and of the one that was learned from, stood before its table."""
-    with initialize_config_module("gsparc.conf", version_base="1.3"):
-        node = compose("evaluate", overrides=["ckpt=x"], return_hydra_config=True).hydra.job_logging
-    screen = ConsoleHandler(node.handlers.console.quiet, io.StringIO())
-    said = [logging.LogRecord("gsparc.data.datasets.own", level, "", 0, "x", (), None) for level in (20, 30)]
-    assert [screen.filter(one) for one in said] == [False, True]
+    (tmp_path / "drive.csv").write_text(
+        "x,y,rsrp_dbm\n" + "".join(f"{i},{i * i},{-60 - i}\n" for i in range(9))
+    )
+    first, again = Own(tmp_path / "drive.csv"), Own(tmp_path / "drive.csv")
+    with caplog.at_level(logging.INFO):
+        first.measurements  # noqa: B018 (read)
+        assert "column 'rsrp_dbm' taken as rssi_db" in caplog.text
+        caplog.clear()
+        again.told = first.notes
+        again.measurements  # noqa: B018
+    assert not [one for one in caplog.records if one.levelno < logging.WARNING]
 
 
 def test_a_setting_of_a_launcher_that_was_not_chosen_had_no_hint():

@@ -7,7 +7,7 @@ import pytest
 from campaigns import compose
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from gsparc.evaluation.drawing import GREY, PALETTE, style_of
+from gsparc.evaluation.drawing import PALETTE, style_of
 
 # Linear RGB as seen without cones for red, green or blue (Machado, Oliveira and Fernandes 2009, severity 1).
 VISION = {
@@ -27,7 +27,7 @@ VISION = {
 @pytest.mark.parametrize("vision", VISION)
 def test_brown_beside_vermillion_without_cones_for_red(vision):
     """The brown of the distance law was the vermillion of gsparc for protanopes (difference 2.5)."""
-    colours = [*PALETTE, GREY]
+    colours = [*PALETTE, "#6E6E6E"]
     rgb = np.array([[int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)] for code in colours])
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ np.array(VISION[vision]).T, 0, 1)

@@ -64,11 +64,37 @@ def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power)
 
 
 def test_a_station_that_the_model_does_not_know_is_refused():
-    with pytest.raises(ValueError, match="station roof of arrays is none of the model's"):
+    said = r"stations roof of arrays are none of the model's, north, east, by .*stations=\[north, east\]"
+    with pytest.raises(ValueError, match=said):
         align_to_site(town(), town((0, 1)).site)
     alone = from_arrays({"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0]})
-    with pytest.raises(ValueError, match="arrays has one static end, the model has stations"):
+    with pytest.raises(ValueError, match="arrays has one static end, the model 3 stations"):
         align_to_site(alone, replace(town().site, name="arrays"))
+
+
+def test_a_drive_that_names_cells_otherwise_was_to_leave_them_out():
+    """A second drive by PCI was refused, though the list of cells holds both names of each."""
+    mast, pci = {"station_position": POSTS[[0, 0, 0]]}, np.array(["211", "212", "213"])
+    site = town(**mast).site
+    second = {"station_name": pci[[2, 0, 1]], "station_label": NAMES[[2, 0, 1]]}
+    same = align_to_site(town((2, 0, 1), **mast, **second), site)
+    assert same.site.stations.name == site.stations.name and same.station[:3].tolist() == [2, 0, 1]
+    listed = town(**mast, station_name=pci, station_label=NAMES).site  # the model's drive was the one by PCI
+    assert align_to_site(town((1, 0, 2), **mast), listed).station[:3].tolist() == [1, 0, 2]
+    said = "stations 211, 212, 213 of arrays are none of the model's, north, east, roof: no name in common"
+    with pytest.raises(ValueError, match=said + ".*dataset.columns.station=COLUMN.*stations_file=FILE"):
+        align_to_site(town(**mast, station_name=pci), site)
+
+
+@pytest.mark.parametrize("lost", ["file", "model"])
+def test_stations_of_equal_names_were_unknown_where_one_had_no_places(lost):
+    """A list of cells beside the second drive alone, or beside the first, made all its cells strangers."""
+    nowhere = {"station_position": np.full((3, 3), np.nan)}
+    file, model = (town((2, 0, 1), **(nowhere if lost == one else {})) for one in ("file", "model"))
+    same = align_to_site(file, model.site)
+    assert same.station[:3].tolist() == [0, 1, 2]
+    places = model.site.stations.position[same.station]
+    np.testing.assert_allclose(same.tx, places, equal_nan=True)
 
 
 def test_stations_at_one_place_are_known_by_their_names():

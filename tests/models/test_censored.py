@@ -1,7 +1,5 @@
 """Rows where nothing was heard: the likelihood of "below the level", and a town half of which is silent."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

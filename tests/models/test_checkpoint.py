@@ -1,7 +1,5 @@
 """Checkpoints: what goes in comes out; what may not come in: tests/hard_cases/doors/test_checkpoints.py."""
 
-from __future__ import annotations
-
 import collections
 import os
 import re

@@ -1,7 +1,5 @@
 """Runs of many parts: finished ones are taken, none for another, and what is said of how to go on is true."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The Gaussian field of every kind of measurement: what it says, keeps, stores, and what it does not know."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """A copy of a method for each station, and one for stations that were never heard."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Methods are fitted once, on tiny data.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -130,6 +128,52 @@ def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, t
     for part in ("mean", "confidence", "variance"):
         torch.testing.assert_close(getattr(told, part), getattr(said, part))
     assert again.count_components() == method.count_components()
+
+
+UNFITTED = (*VARIANCE, "nearest", "splat", "gsrf", "uplink", "ridge")
+POISONED = ("mean", "complex_gp", "gsrf", "newrf", "splat", "array", "directional_gp", "uplink")
+
+
+@pytest.mark.parametrize("name", UNFITTED)
+def test_a_method_that_is_not_fitted_says_so(name):
+    query = Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3)))
+    with pytest.raises(ValueError, match=r"uplink= is needed|fit or restore|not fitted|not been trained"):
+        method_class(name)().predict(query)
+
+
+@pytest.mark.parametrize("name", POISONED)
+def test_no_test_row_is_looked_at(name, tmp_path):
+    method, data, fold = fitted(name)
+    batch, target, rays = data.batch(fold.test), data.target.copy(), data.directions
+    target[fold.test] = 0 if target.dtype == np.uint8 else np.nan
+    if rays is not None:
+        rays = [np.full_like(one, np.nan) if row in fold.test else one for row, one in enumerate(rays)]
+    again = unfitted(name).create_for(data)
+    again.fit(replace(data, target=target, directions=rays), fold, short(tmp_path, 10))
+    assert torch.equal(again.predict(batch).mean, method.predict(batch).mean)
+
+
+FEW = ("mean", "nearest", "idw", "gp", "kriging", "distance_law", "complex_gp", "array")
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, "four at a place", "at one place", "alike"])
+@pytest.mark.parametrize("name", FEW)
+def test_few_rows_and_rows_of_one_place_are_finite(name, rows, tmp_path):
+    _, data, fold = fitted(name)
+    few, places = fold.train[: rows if isinstance(rows, int) else 20], np.zeros(len(data), int)
+    if isinstance(rows, str):
+        places = np.arange(len(data)) // 4 if rows == "four at a place" else places
+        moving = "tx" if data.site.moving_end == "tx" else "rx_position"
+        data = replace(data, **{moving: getattr(data, moving)[places]})
+    if rows == "alike":
+        data = replace(data, target=data.target[np.zeros(len(data), int)])
+    method, batch = unfitted(name).create_for(data), data.batch(fold.test)
+    method.fit(data, Fold(few, few[:0], fold.test), short(tmp_path, 10))
+    found = method.predict(batch)
+    assert all(torch.isfinite(part).all() for part in (found.mean, found.variance) if part is not None)
+    assert (
+        rows != "alike" or name == "array" or torch.allclose(found.mean, batch.target, rtol=1e-3, atol=0.02)
+    )
 
 
 @pytest.mark.parametrize(

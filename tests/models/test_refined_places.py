@@ -1,7 +1,5 @@
 """Positions with errors: displacements in closed form, and what they buy on channels."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which terms a site calls for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """One wrong training row, for every method: refused or finite; left out, as if it had never been."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import kinds

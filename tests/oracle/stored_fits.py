@@ -6,8 +6,6 @@
 Only `gsparc.fit`, `gsparc.load` and command lines are used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """Who is beaten, in words and drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

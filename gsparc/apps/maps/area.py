@@ -92,7 +92,7 @@ def lay_grid(
     rows = (np.column_stack([x, np.full(nx, one)]) for one in y)  # a million places at once take memory
     inside = np.ones((ny, nx), bool) if contains is None else np.array([contains(row) for row in rows])
     if not inside.any():
-        raise DataError(f"area={area}: no centre of a cell of {step:g} m lies in it; take a smaller step_m")
+        raise DataError(f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer")
     return Grid(x, y, height, step, inside)
 
 

@@ -337,8 +337,9 @@ def _profile(raster: FieldMap, origin: Georeference | None, **bands: Any) -> dic
     from rasterio.transform import from_origin
 
     left, _, _, high = raster.grid.extent
-    here = None if origin is None else f"+lat_0={origin.latitude!r} +lon_0={origin.longitude!r}"
-    place = None if here is None else f"+proj=aeqd {here} +datum=WGS84 +units=m +no_defs"
+    # Without a title programs show it as "unknown".
+    form = "+proj=aeqd +datum=WGS84 +lat_0={0!r} +lon_0={1!r} +title=equidistant_about_{0}_{1}"
+    place = None if origin is None else form.format(origin.latitude, origin.longitude)
     return {
         "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "crs": place, **bands,
         "transform": from_origin(left, high, raster.grid.step, raster.grid.step),

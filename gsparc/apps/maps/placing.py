@@ -7,29 +7,30 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.spatial.distance import cdist
+from scipy.stats import t
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, shadowing, share_between
+from gsparc.apps.maps.intervals import Evidence, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise, held_out_evidence
 from gsparc.data.blocks import evenly_spaced
 from gsparc.data.errors import DataError
-from gsparc.data.executor import run_each
+from gsparc.data.executor import run_all
 from gsparc.data.limits import Checked, check_arguments, finite_array, number, setting, whole
 from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.data.tables import is_table
+from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
-Levels = tuple[np.ndarray, np.ndarray]
-Candidates = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -77,14 +78,23 @@ class NewStationError:
     """How wrong the model is about a station that it never heard.
 
     Attributes:
-        offset_db: deviation of the mean error of a whole station [dB].
+        offset_db: deviation of the mean error of a whole site [dB].
         within: deviation of errors about that mean, in deviations that the model states.
-        stations: left out, one at a time; 0: nobody was, and the model's own deviations are taken.
+        stations: sites left out, one at a time; 0: none was, and the model's own deviations are taken.
     """
 
     offset_db: float = 0.0
     within: float = 1.0
     stations: int = 0
+
+    @classmethod
+    def from_evidence(cls, parts: Sequence[Evidence]) -> NewStationError:
+        """Return what rows of sites tell, each of which was left out as a whole."""
+        # With silent rows: of lists those alone that were heard are the strong ones.
+        mean, square = np.array([[p @ e, p @ np.square(e)] for e, p in map(error_distribution, parts)]).T
+        stated = [np.square(one.spread_db).mean() for one in parts]
+        within = np.average(square - mean**2, weights=[(one.side == 0).sum() for one in parts])
+        return cls(float(np.sqrt(np.mean(mean**2 * stated))), float(np.sqrt(within)), len(parts))
 
 
 @dataclass(frozen=True)
@@ -95,46 +105,98 @@ class Placement:
         places: (n, 3) world [m].
         coverage: (n,) expected share of the area that is not refused with the threshold or more, with a
             station there.
-        low, high: (n,) the ends of its 90 % interval.
+        gain: (n,) what a station there adds to the share as it is.
+        between: (n, 4) ends of 90 % intervals of both, old and new share drawn together; NaN where no site
+            was left out, or nothing is promised.
+        nearest_m: (n,) to the next station that stands [m].
         before: the share as it is.
         refused: share of the area where the promise says nothing.
         grid: the area.
         stations: (T, 2) that stand already [m].
-        error: of stations left out.
         given: other columns (n,) of a table of candidates, by head.
     """
 
     places: np.ndarray
     coverage: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    gain: np.ndarray
+    between: np.ndarray
+    nearest_m: np.ndarray
     before: float
     refused: float
     grid: Grid
     stations: np.ndarray
-    error: NewStationError
     given: Mapping[str, np.ndarray]
 
 
 def place_station(
-    predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0, height_m: float | None = None,
-    sites: Any = None, station_height_m: float | None = None, count: int = 100,
-    promise: Promise | None = None, error: NewStationError | None = None, antenna: Antenna | None = None,
-    dry: bool = False,
+    predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0,
+    promise: Promise | None = None, error: NewStationError = NewStationError(), antenna: Antenna = Antenna(),
+    **where: Any,
 ) -> Placement:  # fmt: skip
     """Try one more station at every candidate.
 
     Args:
         predictor: of powers at several stations, learned together.
-        area, height_m, threshold_db: see `predict_map`.
+        area, threshold_db: see `predict_map`.
+        promise: see `predict_map`, of the stations that stand.
+        error: see `new_station_error`; without stations the model's own deviations.
+        antenna: of the new station.
+        where: see `lay_candidates`.
+
+    Raises:
+        DataError: as there; or all of the area is too far from what was measured.
+    """
+    grid, candidates, given = lay_candidates(predictor, area, antenna=antenna, **where)
+    left, right, south, north = grid.extent
+    now = predict_map(
+        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
+        threshold_db=threshold_db, promise=promise,
+    )  # fmt: skip
+    # Refused squares are left out: as unserved they would count against the stations that stand,
+    # and draw a new one to where nothing was tested.
+    known = grid.inside & ~now.refused
+    if not known.any():
+        raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
+    now = replace(now, power_db=np.where(known, now.power_db, np.nan))
+    square, best = draw_strongest(now, predictor, promise)
+    old, cells, before = best >= threshold_db, grid.places(square), 1 - float(now.outage[known].mean())
+    alike = shadowing(cells, 1.0 if promise is None else promise.block_m)
+    own = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
+    # Student's t, as few stations tell the deviation: the normal's ends held too little.
+    offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
+
+    def tried(place: np.ndarray) -> np.ndarray:
+        level, spread = _new(predictor, place, cells, antenna)
+        new = ~old & (level[:, None] + spread[:, None] * own + offset >= threshold_db)
+        share = share_between((old | new).mean(0), before + new.mean())
+        return np.array([new.mean(), *share, *np.quantile(new.mean(0), ENDS)])
+
+    scores = np.array(run_all(tried, list(candidates), "candidates"))
+    if promise is None or not error.stations:
+        scores[:, 1:] = np.nan
+    order = np.argsort(-scores[:, 0], kind="stable")
+    given, places = {head: words[order] for head, words in given.items()}, candidates[order]
+    gain, still = scores[order, 0], now.station_place
+    nearest = np.fmin.reduce(cdist(places[:, :2], still), axis=1)
+    return Placement(
+        places, before + gain, gain, scores[order, 1:], nearest, before,
+        1 - float(known.sum() / grid.inside.sum()), grid, still, given,
+    )  # fmt: skip
+
+
+def lay_candidates(
+    predictor: Predictor, area: Any = None, *, height_m: float | None = None, sites: Any = None,
+    station_height_m: float | None = None, count: int = 100, antenna: Antenna = Antenna(),
+) -> tuple[Grid, np.ndarray, dict[str, np.ndarray]]:  # fmt: skip
+    """Return the area, places (n, 3) [m] where a station is tried, and other columns (n,) of their table.
+
+    Args:
+        predictor, antenna: see `place_station`, which can be asked about all that is returned.
+        area, height_m: see `predict_map`.
         sites: where a station may stand: GeoJSON of polygons or lines, or a table of places (see
             `read_query_places`), all of which are tried; None: the whole area.
         station_height_m: world; None: the middle height of the stations that stand.
         count: candidates, about.
-        antenna: of the new station.
-        promise: see `predict_map`, of the stations that stand.
-        error: see `new_station_error`; None: the model's own deviations.
-        dry: predict one square of each station that stands alone: whether everything asked for is possible.
 
     Raises:
         DataError: the model cannot predict a station that was never there, or anything else that is wrong.
@@ -144,80 +206,41 @@ def place_station(
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
-    antenna = antenna or Antenna()
-    still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]
-    height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
+    middle = float(np.median(site.stations.position[:, 2]) + site.origin[2])
+    height = middle if station_height_m is None else float(station_height_m)
     candidates, given = _candidates(grid, sites, predictor, height, count)
-    cells = grid.places()
     try:
-        _new(predictor, candidates[0], cells[:1], antenna)
-    except DataError:
-        raise
+        _new(predictor, candidates[0], grid.places()[:1], antenna)
     except ValueError as refused:
-        raise unheard_stations_error(f"{predictor.method.name} ({refused})") from None
-    left, right, south, north = grid.extent
-    now = predict_map(
-        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
-        threshold_db=threshold_db, promise=promise, dry=dry,
-    )  # fmt: skip
-    error = error or NewStationError()
-    # Refused squares are left out: as unserved they would count against the stations that stand,
-    # and draw a new one to where nothing was tested.
-    known = np.isfinite(now.outage[grid.inside])
-    if not known.any() and not dry:
-        raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
-    old_outage, cells = now.outage[grid.inside][known], cells[known]
-    # A 90 % interval of Student's t, as few stations tell the deviation: the normal's 1.645 held too little.
-    reach = float(t.ppf(0.95, max(error.stations, 1))) * error.offset_db
-
-    def tried(place: np.ndarray) -> np.ndarray:
-        level, spread = _new(predictor, place, cells, antenna)
-        goals = np.empty(3)
-        # A station's mean error shifts all its cells alike: hence intervals by shifts, not per cell.
-        for k, shift in enumerate((0.0, -reach, reach)):
-            wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
-            outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
-            goals[k] = np.mean(1 - old_outage * outage)  # its errors are its own
-        return goals
-
-    scores = np.full((len(candidates), 3), np.nan)
-    for row, goals in run_each(tried, list(candidates), "candidates", wanted=lambda place: not dry):
-        scores[row] = goals
-    before = np.nan if dry else float(np.mean(1 - old_outage))
-    order = np.argsort(-scores[:, 0], kind="stable")
-    given = {head: words[order] for head, words in given.items()}
-    value, low, high = scores[order].T
-    lost = 1 - float(known.mean())
-    return Placement(candidates[order], value, low, high, before, lost, grid, still[:, :2], error, given)
+        told = unheard_stations_error(f"{predictor.method.name} ({refused})")
+        raise refused if isinstance(refused, DataError) else told from None
+    return grid, candidates, given
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
-    """Leave out whole stations, up to `most`, and predict them from the others."""
-    data, known = learned.data, learned.rows
-    assert data.site.stations is not None and data.station is not None
-    heard = np.unique(data.station[known])
+    """Leave out whole sites, up to `most`, and predict their stations from the others.
+
+    A sector alone would be left to its site's others, which share its shadowing.
+    """
+    data, known, stations = learned.data, learned.rows, learned.data.site.stations
+    assert stations is not None and data.station is not None
+    site = number_sites(stations, stations.position)[data.station[known]]
+    heard = np.unique(site)
     if len(heard) < LEAST_STATIONS:
         return NewStationError()
-    # By the seed of the training: the same stations are left out whenever it is asked again.
+    # By the seed of the training: the same sites are left out whenever it is asked again.
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
-    # Without validation rows: the station left out is the test, all else is learned from.
+    # Without validation rows: the site left out is the test, all else is learned from.
     for one in chosen:
-        own = data.station[known] == one
+        own = site == one
         inner = Fold(known[~own], known[:0], known[own])
         parts.append(held_out_evidence(learned.unlearn(inner), data, inner, np.full(int(own.sum()), one)))
     parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
-    if not parts:
-        return NewStationError()
-    errors = [(one.level_db - one.mean_db)[one.side == 0] for one in parts]
-    means = np.array([error.mean() for error in errors])
-    pairs = zip(errors, means, parts, strict=True)
-    inside = [(error - mean) / one.spread_db[one.side == 0] for error, mean, one in pairs]
-    within = float(np.sqrt(np.mean(np.concatenate(inside) ** 2)))
-    return NewStationError(float(np.sqrt(np.mean(means**2))), within, len(means))
+    return NewStationError.from_evidence(parts) if parts else NewStationError()
 
 
-def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Candidates:
+def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Any:
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and is_table(sites):
         site, end = predictor.site, predictor.site.static_end or "tx"
@@ -234,7 +257,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
 
-def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna) -> Levels:
+def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna) -> Any:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
     known = predictor.predict_new(cells, place, antenna.sectors())
     if known is None and antenna.azimuth is not None:

@@ -87,7 +87,7 @@ def plan_measurements(
     predictor: Predictor | None, count: int = 20, area: Any = None, *, height_m: float | None = None,
     walkable: Any = None, plan: FloorPlan | None = None, stations: Sequence[str | int] | None = None,
     other_end: Sequence[float] | None = None, promise: Promise | None = None, least_gain_db: float = 0.0,
-    route: bool | None = None, start: Sequence[float] | None = None, route_m: float | None = None,
+    route: bool = True, start: Sequence[float] | None = None, route_m: float | None = None,
     length_m: float | None = None,
 ) -> Plan:  # fmt: skip
     """Choose places to measure next, as a batch.
@@ -105,7 +105,7 @@ def plan_measurements(
         stations, other_end: see `predict_map`; what is measured at a place is measured of all of them.
         promise: evidence of held-out blocks, which scales the model's own variances.
         least_gain_db: stop where a place takes less than this off the expected error.
-        route: whether places are put in the order of a short walk, or drive; None: with `walkable`.
+        route: whether places are put in the order of a short walk, or drive; else the most telling first.
         start: (2,) where the walk starts [m]; None: anywhere.
         route_m: longest walk [m]; None: any.
         length_m: before anything is measured, over which powers are alike [m].
@@ -134,14 +134,13 @@ def plan_measurements(
     wanted = np.arange(len(places)) < len(targets)
     before, before_db = mean_error(unknown), _expected(unknown, wanted)
     chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour)
-    walk = (walkable is not None if route is None else route) or route_m is not None
-    order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if walk else chosen)], np.int64)
-    path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if walk else np.zeros((0, 2))
+    order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64)
+    path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return Plan(
         places[first:][np.array(chosen, np.int64)[order]], np.array(expected)[order], before_db, order,
         float(tour.metres[-1:].sum()), grid, before[wanted], mean_error(unknown)[wanted], places[wanted],
-        scatter, tour.metres if walk else np.zeros(0), path, stopped,
+        scatter, tour.metres if route else np.zeros(0), path, stopped,
     )  # fmt: skip
 
 

@@ -76,9 +76,8 @@ class RunSettings(Checked):
             torch.set_num_threads(settings.threads)
         address = (values.get("ray") or {}).get("address")
         executor.use_engine(Engine(values.get("engine", "process"), values.get("workers"), address))
-        threadpool_limits(
-            1, "blas"
-        )  # NumPy's: two threads beside other work took 10 to 400 times as long as one
+        # NumPy's: two threads beside other work took 10 to 400 times as long as one.
+        threadpool_limits(1, "blas")
         return settings
 
 

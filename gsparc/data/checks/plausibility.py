@@ -178,7 +178,7 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
             f"{rows[step.last]} and {rows[step.first]}"
             for step in own
         )
-        first = ",".join(str(levels.file_rows[step.first]) for step in own)
+        first = ",".join(str(levels.file_row[step.first]) for step in own)
         setting = f"'dataset.level_steps={{{names[t]}:[{first}]}}' (rows from 0) makes it another station"
         setting = "" if names[t] == UNNAMED else f" {setting} from there on"
         warnings.append(f"{who} {said}, which the places do not explain: another gain or antenna?{setting}")
@@ -205,7 +205,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
     A long run is no outage but out of reach where the values beside it are near the station's weakest, and
     where fading makes its edges ragged.
     """
-    names, rows, weakest = levels.names, levels.rows, dict[str, float]()
+    names, rows, warnings = levels.names, levels.rows, list[str]()
     outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)  # by first row, last row, length
     silent, faint, plain = list[str](), dict[str, int](), dict[str, int]()  # how many, by station
     for t in np.unique(levels.station):
@@ -215,7 +215,7 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         if missing.all() or not missing.any():
             silent += [name] * bool(missing.all())
             continue
-        weak, weakest[name] = float(np.percentile(level[~missing], 1)) + WEAK_DB, float(level[~missing].min())
+        weak = float(np.percentile(level[~missing], 1)) + WEAK_DB
         absent, count, around = np.flatnonzero(missing), 0, list[float]()
         for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
             start, stop = int(piece[0]), int(piece[-1]) + 1
@@ -229,28 +229,19 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         if count:
             often = count >= FEW * len(used) and len(around) > 0
             (faint if often and np.median(around) < weak else plain)[name] = count
-    warnings = [
-        f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}: off, or not listed; "
-        "these rows are not used"
-        for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2])
-    ]
+    if faint:
+        # First of all: what is not heard and not said so leaves weak stations far too strong.
+        lost = f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the weakest ones"
+        advice = "not heard? then say dataset.absent=silent"
+        warnings.append(f"{advice}: {lost}; left out, weak levels are predicted too high")
+    for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2]):
+        where = f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}"
+        warnings.append(f"{where}: off, or not listed; these rows are not used")
     if silent:
         warnings.append(f"no level in any row{_of(silent, len(names))}")
-    if faint:
-        floor = np.floor(min(weakest[n] for n in faint))
-        # First of all: what is not heard and not said so leaves weak stations far too strong.
-        warnings.insert(
-            0,
-            "not heard? then say dataset.absent=silent (of empty cells also "
-            f"dataset.columns.sensitivity_db={floor:g} does): {sum(faint.values())} levels are "
-            f"missing{_of([*faint], len(names))}, beside the weakest ones; left out, weak levels are "
-            "predicted too high",
-        )
     if plain:
-        warnings.append(
-            f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}, few or beside strong "
-            "ones: lost or not listed; they are not used"
-        )
+        lost = f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}"
+        warnings.append(f"{lost}, few or beside strong ones: lost or not listed; they are not used")
     return warnings
 
 
@@ -267,7 +258,7 @@ class LinkLevels:
         station: (n,) int64.
         level_db: (n,) [dB], NaN where there is no value.
         rows: (n,) what messages call the row of the file.
-        file_rows: (n,) its number from 0.
+        file_row: (n,) its number from 0.
         names: (T,) of the stations.
         station_position: (T, 3), in the world [m]; None where it is not known.
     """
@@ -276,7 +267,7 @@ class LinkLevels:
     station: np.ndarray
     level_db: np.ndarray
     rows: list[str]
-    file_rows: Sequence[int]
+    file_row: np.ndarray
     names: list[str]
     station_position: np.ndarray | None
 
@@ -286,8 +277,13 @@ class LinkLevels:
             yield int(t), np.flatnonzero((self.station == t) & np.isfinite(self.level_db))
 
 
-def link_levels(data: Measurements) -> LinkLevels | None:
-    """Return levels of powers with one end that stands still; None of anything else."""
+def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkLevels | None:
+    """Return levels of powers with one end that stands still; None of anything else.
+
+    Args:
+        data: the measurements.
+        file_row: (S,) number of each row in its file; None: the row's own.
+    """
     site = data.site
     if site.kind != "rssi" or site.static_end is None:
         return None
@@ -301,8 +297,10 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     link, called = which.reshape(-1) * count + station, data.row_names
     rows = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
     absent = np.zeros(0, np.int64)
-    # What was not heard is known to be weak; a file with a station for each place has no empty cells.
-    if data.censored is None and len(first) < len(data):
+    # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
+    # with a station for each place has no empty cells.
+    told = data.censored is not None or data.provenance.get("absent") == "unknown"
+    if not told and len(first) < len(data):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
     parts = [] if stations is None else [name.split(FROM_ROW) for name in stations.name]
     for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
@@ -318,5 +316,5 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     known = site.static_position if stations is None else stations.position
     known = None if known is None else np.atleast_2d(known) + site.origin
     names = [UNNAMED] if stations is None else list(stations.name)
-    number = [data.file_rows[i] for i in of_row]
+    number = of_row if file_row is None else file_row[of_row]
     return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, number, names, known)

@@ -67,9 +67,12 @@ class Campaign(DataModule):
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what looks wrong is logged."""
         reading = interpret(self.raw(), self.file, self.selection)
+        self.notes = reading.notes
         for note in reading.notes:
-            log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", self.file, note)
-        for warning in _implausible(reading.data):
+            careful = isinstance(note, Caution)
+            if careful or note not in self.told:
+                log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
+        for warning in _implausible(reading.data, reading.file_row):
             log.warning("%s: %s", self.file, warning)
         for hint in unit_warnings(reading.data):
             log.warning("%s: %s", self.file, Severe(f"units? {hint}"))
@@ -79,13 +82,13 @@ class Campaign(DataModule):
 MOST_LINKS = 1_000_000  # of places and stations; all are held at once
 
 
-def _implausible(data: Measurements) -> list[str]:
+def _implausible(data: Measurements, file_row: np.ndarray | None) -> list[str]:
     """What `gsparc check` warns of, where that takes seconds."""
     stations = 1 if data.site.stations is None else len(data.site.stations)
     places = len(data) if data.place is None else len(np.unique(data.place))
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
-    levels = link_levels(data)
+    levels = link_levels(data, file_row)
     if levels is None:
         return [Severe(warning) for warning in convention_warnings(data)]
     return sanity_warnings(levels, find_level_steps(levels))

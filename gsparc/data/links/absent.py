@@ -46,7 +46,7 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
 def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) -> None:
     """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out.
 
-    Not `wanted`, lists of the strongest are said to flatter the figures of what they list.
+    Not `wanted`, these are said to flatter the figures of what they list; nothing else judges it.
     """
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
@@ -59,38 +59,35 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
     lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
     strongest = lists.are_strongest()
-    if not wanted:
-        flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
-        unknown = f"lists of the {lists.length} strongest of {count} stations with dataset.absent=unknown"
-        check.notes += [Severe(f"{unknown}: {flattered}; leave absent out")] if strongest else []
+    # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
+    said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
+    found = None if strongest or said else lists.below_floor()
+    if not strongest and found is None:
         return
-    if not strongest:
-        # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
-        said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
-        found = None if said else lists.below_floor()
-        if found is None:
-            return
-        floor, may = found
-        lists = replace(lists, length=0)
-        what = (
-            "levels are missing beside weak ones alone: not heard, below the weakest of each station "
-            f"({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
-        )
+    missing = f"lists of the {lists.length} strongest of {count} stations"
+    if found is not None:
+        (floor, may), lists = found, replace(lists, length=0)
+        missing = "levels are missing beside weak ones alone"
+        limits = f"{np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB"
+        how = f"not heard, below the weakest of each station ({limits})"
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
         may = np.isnan(lists.level)
-        what = (
-            f"lists of the {lists.length} strongest of {count} stations: one that a full list leaves out is"
-            f" below its weakest, in lists shorter than {lists.length}: below {floor.min():.4g} dB"
-        )
+        how = "one that a full list leaves out is below its weakest"
+        how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"
+    if not wanted:
+        flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
+        unknown = f"{missing} with dataset.absent=unknown: {flattered}; leave absent out"
+        check.notes.append(Severe(unknown))
+        return
     most, every = UNLISTED_EACH * len(heard), int(may.sum())
     of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
     used = f"{used} {every} unlisted are used (dataset.absent=unknown takes none)"
-    check.notes.append(f"{what}; beside {len(heard)} listed, {used}")
+    check.notes.append(f"{missing}: {how}; beside {len(heard)} listed, {used}")
 
 
 def _floors(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:

@@ -19,12 +19,6 @@ PERCENT = (
 # Quantities a column can hold: of an end (the moving one when it is not named), and of a row.
 ENDS = ("", "rx_", "tx_", "station_")
 AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longitude": "angle"}
-KINDS: dict[str, str] = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | {
-    **{"rssi_db": "level", "rssi": "power", "sensitivity_db": "level"},
-    **{"csi_re": "number", "csi_im": "number", "csi_amp": "number", "csi_phase": "phase"},
-    **{"carrier_hz": "frequency", "frequency_hz": "frequency"},
-    **{"station": "text", "run": "text", "row_name": "text"},
-}
 # May be several columns: stations, or frequencies.
 MANY = ("rssi_db", "rssi", "csi_re", "csi_im", "csi_amp", "csi_phase")
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
@@ -38,6 +32,7 @@ def meaning_by_word(table: str) -> dict[str, str]:
 
 SHEET: dict[str, Any] = yaml.safe_load(files(__package__).joinpath("words.yaml").read_text(encoding="utf-8"))
 LISTS = {name: set(words.split()) for name, words in SHEET.items() if isinstance(words, str)}
+KINDS = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | meaning_by_word("kinds")
 STATION_WORDS, END_WORDS = LISTS["station"], meaning_by_word("ends")
 TOGETHER = {word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()}
 _AXIS, _PART = meaning_by_word("axes"), meaning_by_word("part")

@@ -261,9 +261,8 @@ def _of_files(root: Path, files: Iterable[str]) -> str:
 def _content_of(file: str | Path) -> str:
     """The hash of a file, of Python of what it does."""
     if Path(file).suffix == ".py":
-        return sha256(
-            strip_comments(Path(file).read_text(encoding="utf-8", errors="replace")).encode()
-        ).hexdigest()
+        text = Path(file).read_text(encoding="utf-8", errors="replace")
+        return sha256(strip_comments(text).encode()).hexdigest()
     with open(file, "rb") as stream:
         return file_digest(stream, "sha256").hexdigest()
 

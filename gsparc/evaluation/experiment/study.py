@@ -80,9 +80,8 @@ class Condition:
 
     def change_test(self, data: Measurements, split: Split, seed: int) -> Measurements:
         """Return data whose test rows are asked about."""
-        return add_position_errors(
-            data, np.concatenate([fold.test for fold in split.folds]), self.amount, seed
-        )
+        rows = np.concatenate([fold.test for fold in split.folds])
+        return add_position_errors(data, rows, self.amount, seed)
 
 
 ROW = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -131,12 +131,17 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     return list(runs.values())
 
 
+def group_in_order(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
+    """Return items by what `key` returns of them, in order of appearance."""
+    groups: dict[Any, list[Any]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
 def group_by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     """Runs whose figures can be compared, by dataset and split, in order of appearance."""
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.study, []).append(run)
-    return groups
+    return group_in_order(runs, lambda run: run.study)
 
 
 def distinct_baselines(runs: Sequence[Run]) -> list[dict[str, Any]]:

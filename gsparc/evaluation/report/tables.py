@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
-from gsparc.evaluation.report.runs import Run, distinct_baselines
+from gsparc.evaluation.report.runs import Run, distinct_baselines, group_in_order
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
@@ -88,9 +88,7 @@ def has_draws(runs: Sequence[Run]) -> bool:
 
 def leads_of_baselines(group: Sequence[Run]) -> dict[str, Lead | None]:
     """Return what each baseline has more than a setting, see `lead_over_runs`."""
-    rows: dict[str, list[Row]] = {}
-    for base in (base for run in group for base in run.baselines):
-        rows.setdefault(base["method"], []).append(base)
+    rows = group_in_order((base for run in group for base in run.baselines), lambda base: base["method"])
     return {name: lead_over_runs(own, [run.row for run in group]) for name, own in rows.items()}
 
 
@@ -106,10 +104,7 @@ def _figures(row: Row) -> list[str]:
 
 def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Runs that differ by their seed only, by setting, in order of appearance."""
-    groups: dict[str, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.setting, []).append(run)
-    return groups
+    return group_in_order(runs, lambda run: run.setting)
 
 
 def _run_columns(runs: Sequence[Run]) -> list[Column]:
@@ -139,9 +134,8 @@ def table_of_seeds(runs: Sequence[Run]) -> Table:
     """Settings and baselines side by side, their spread over seeds or draws of the split, and their cost."""
     differs, several, spread = differing_settings(runs), has_draws(runs), _spread_columns(runs)
     also = [Column("differs, too", "")] if any(differs.values()) else []
-    groups: dict[str, list[Row]] = {}
-    for row in [*(run.row for run in runs), *distinct_baselines(runs)]:
-        groups.setdefault(row["setting"], []).append(row)
+    every = [*(run.row for run in runs), *distinct_baselines(runs)]
+    groups = group_in_order(every, lambda row: row["setting"])
     rows = []
     for setting, group in groups.items():
         draws = [row["draw"] for row in group]

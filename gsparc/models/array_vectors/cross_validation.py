@@ -89,7 +89,8 @@ def choose_kernel(
         return mean_log_error(samples.squared_errors(predicted))  # up to a factor, minus the PSNR
 
     starts = [np.log([length, NOISE]) for length in LENGTHS]
-    if len(positions) < FEW:
+    # Rows of one place lie within every gap: none is left to predict another.
+    if len(positions) < FEW or samples.distance[samples.centres].max() <= samples.gaps.min():
         return ChosenKernel(kernel_at(starts[0]), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
     first = min(starts, key=held_out_log_error)
     refined = refine_alignment(aligned, inverse_gram(kernel_at(first)), partner)

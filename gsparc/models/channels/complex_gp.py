@@ -166,12 +166,12 @@ class ComplexGP(ClosedForm):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
+        known, dtype = self._posterior(), query.tx.dtype
         assert self.site is not None
-        dtype, kernel = query.tx.dtype, self.kernel
-        posterior = self._posterior().answer(query.places(self.site), dtype == torch.float64)
-        share = posterior.variance / (1 + kernel.noise)
+        posterior = known.answer(query.places(self.site), dtype == torch.float64)
+        share = posterior.variance / (1 + self.kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
-        told = Prediction(mean, (kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
+        told = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
         return self.runs.apply_factors(told, query.run)
 
     def _posterior(self) -> Posterior:

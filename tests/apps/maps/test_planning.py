@@ -35,7 +35,7 @@ def test_gains_are_what_conditioning_takes_away():
 
 def test_error_falls_and_places_lie_where_data_do_not(predictor):
     area = [-40, 0, 80, 60]  # nobody was west of 0
-    found = plan_measurements(predictor, 8, area)
+    found = plan_measurements(predictor, 8, area, route=False)
     assert len(found.places) == 8 and found.after_db < found.before_db
     assert (np.diff(found.expected_db) < 0).all() and (found.places[:, 0] < 5).mean() > 0.7
     random = np.median(found.error_before)
@@ -46,7 +46,7 @@ def test_corridors_and_a_length(tmp_path, predictor):
     lines = {"type": "MultiLineString", "coordinates": [[[5, 5], [75, 5]], [[40, 5], [40, 55]]]}
     (tmp_path / "corridor.geojson").write_text(json.dumps(lines))
     found = plan_measurements(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5])
-    assert len(found.path) and not len(plan_measurements(predictor, 2).path)
+    assert len(found.path) and not len(plan_measurements(predictor, 2, route=False).path)
     on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
     assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
     short = plan_measurements(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)

@@ -68,6 +68,18 @@ def test_no_such_antenna_or_positions(tmp_path) -> None:
         load_argos(_copy(tmp_path), positions="true")
 
 
+def _without_third(places: np.ndarray) -> np.ndarray:
+    return np.where(np.arange(len(places))[:, None] == 2, np.nan, places)
+
+
+@pytest.mark.parametrize(("change", "words"), [(_without_third, "row 2"), (np.transpose, r"transposed\?")])
+def test_positions_that_are_none_are_refused(tmp_path, change, words) -> None:
+    place = shutil.copytree(folder(), tmp_path / "city")
+    np.save(place / "positions.npy", change(np.load(place / "positions.npy")))
+    with pytest.raises(DataError, match=words):
+        load_argos(place, positions="true")
+
+
 def test_absent_release_is_loud(caplog) -> None:
     stand_in = {"root": str(folder().parent), "count": 120, "seed": 1}
     data = load({"name": "argos", "root": None, "stand_in": stand_in})

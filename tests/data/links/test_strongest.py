@@ -5,6 +5,7 @@ import pytest
 from networks import network
 from releases import real
 
+from gsparc.data.checks.plausibility import link_levels, sanity_warnings
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.errors import DataError, Severe
 from gsparc.data.links.strongest import number_lists
@@ -34,6 +35,21 @@ def test_lists_with_unknown_absent_cells_looked_better_than_they_were():
     severe = [note for note in reading.notes if isinstance(note, Severe)]
     assert reading.data.censored is None and len(severe) == 1
     assert severe[0].startswith("lists of the 6 strongest of 30 stations with dataset.absent=unknown: ")
+
+
+@pytest.mark.parametrize("floor", [False, True])
+def test_check_advised_silent_beside_leave_absent_out(floor):
+    """Beside the one advice stood `say dataset.absent=silent`, and outages of what lists leave out."""
+    arrays = network(0).arrays(6)
+    if floor:
+        one = network(0)
+        moment, cell = np.nonzero(one.measured > np.quantile(one.measured, 0.6))
+        arrays |= {"rx_position": one.moment[moment], "station": cell, "rssi_db": one.measured[moment, cell]}
+    reading = interpret(Raw(arrays, {"absent": "unknown"}), "drive")
+    (said,) = [note for note in reading.notes if isinstance(note, Severe)]
+    assert "with dataset.absent=unknown: " in said and said.endswith("; leave absent out")
+    levels = link_levels(reading.data)
+    assert not [text for text in sanity_warnings(levels, []) if "absent" in text or "no level" in text]
 
 
 def test_silent_cells_of_a_wide_table_were_lost():

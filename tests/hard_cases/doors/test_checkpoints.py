@@ -117,7 +117,7 @@ def test_commands_refuse_them_in_one_line(sound, tmp_path):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.exec", "pathlib.Path.touch", "gsparc.models.checkpoint.os.system", "gsparc.data.load.log",
+    ["os.system", "builtins.exec", 3, "pathlib.Path.touch", "gsparc.models.checkpoint.os.system", "gsparc.data.load.log",
      "torch.load", "gsparc.models.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
 )  # fmt: skip
 def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
@@ -126,6 +126,8 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
     for name, changes in {
         "named": {"config": config, "target": target},
         "nested": {"config": f"model: {{_target_: gsparc.models.baselines.idw.InverseDistance, power: {config[7:-1]}}}\n",
+                   "target": "gsparc.models.baselines.idw.InverseDistance"},
+        "listed": {"config": f"model: {{_target_: gsparc.models.baselines.idw.InverseDistance, power: [{config[7:-1]}]}}\n",
                    "target": "gsparc.models.baselines.idw.InverseDistance"},
     }.items():  # fmt: skip
         assert_refused_here(altered(sound[0], tmp_path / f"{name}.ckpt", **changes), "")

@@ -1,7 +1,5 @@
 """Spectra of an array whose vectors are known."""
 
-from __future__ import annotations
-
 import pytest
 from known_arrays import array_site, measure, room_vectors, walk
 

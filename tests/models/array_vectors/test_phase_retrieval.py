@@ -1,7 +1,5 @@
 """Array vectors recovered from published spectra: residuals, ambiguities, scales, each solved once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The splatted field through an array: the posterior of the array's vectors, and what follows from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

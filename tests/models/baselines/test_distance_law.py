@@ -1,7 +1,5 @@
 """The distance law against what made the powers: exponent, floor, outliers, unknown places, moving ends."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -72,12 +70,6 @@ def test_outliers_bend_little():
 def test_few_rows_give_a_usual_law(count):
     law = fit_law(rows_of().subset(np.arange(count)), STILL)
     assert EXPONENTS[0] <= law.exponent <= EXPONENTS[1] and np.isfinite([law.level, law_variance(law)]).all()
-
-
-def test_all_rows_at_one_place():
-    rows = rows_of(20)
-    law = fit_law(replace(rows, places=np.tile(STILL, (20, 1))), STILL)
-    assert np.isfinite(law.mean(torch.from_numpy(rows.places)).numpy()).all()
 
 
 def test_the_density_has_mass_one_and_its_variance():

@@ -1,7 +1,5 @@
 """The Gaussian process against brute force, scikit-learn and the real data."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,10 +8,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.load import load, split_for
-from gsparc.data.query import Query
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, choose_left_out_kernel, principal_components
-from gsparc.ops import Pose
 from gsparc.processes.density import LeftOutDensity
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext
@@ -67,27 +63,6 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     assert torch.allclose(torch.view_as_real(found.mean), expected, atol=1e-4)
     # A complex entry holds two real numbers.
     assert torch.allclose(found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3)
-
-
-@pytest.mark.parametrize("rows", [1, 2, 3])
-def test_hardly_any_samples(campaign, folds, tmp_path, rows):
-    data = campaign("spectrum", 8)
-    fold = folds(8).folds[0]
-    few = type(fold)(fold.train[:rows], fold.val[:0], fold.test)
-    gp = GaussianProcess()
-    gp.fit(data, few, FitContext(tmp_path))
-    prediction = gp.predict(Query(*(lambda b: (b.tx, b.rx))(data.batch(fold.test))))
-    assert torch.isfinite(prediction.mean).all() and torch.isfinite(prediction.variance).all()
-
-
-def test_equal_samples_at_one_place(campaign, folds, tmp_path):
-    data = campaign("spectrum", 12)
-    data.tx[:] = data.tx[0]
-    data.target[:] = data.target[0]
-    gp = GaussianProcess()
-    gp.fit(data, folds(12).folds[0], FitContext(tmp_path))
-    found = gp.predict(Query(torch.zeros(2, 3), Pose(torch.zeros(3), torch.eye(3)))).mean
-    assert torch.allclose(found, data.targets(np.array([0, 0])), atol=1e-5)
 
 
 def test_few_components_say_so(campaign, folds, tmp_path):

@@ -1,7 +1,5 @@
 """The simple baselines, and what all of them share."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +13,6 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.registry import method_class
-from gsparc.models.target_rows import to_real, to_targets
-from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 
 NAMES = ("zero", "mean", "nearest", "idw", "gp")
@@ -98,20 +94,6 @@ def test_entries_never_measured_do_not_leak(campaign, folds, tmp_path, name):
         batch = masked.batch(fold.test)
         results.append(fitted(name, masked, fold, tmp_path).predict(batch).mean)
     assert torch.equal(*results)
-
-
-@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
-def test_encoding_is_undone(campaign, kind):
-    data = campaign(kind, 5)
-    rows = torch.from_numpy(to_real(data.target, kind))
-    assert torch.allclose(
-        to_targets(rows, kind, data.target.shape[1:]), data.targets(np.arange(5)), rtol=1e-5
-    )
-
-
-def test_asking_before_fitting_is_an_error():
-    with pytest.raises(ValueError, match="fit or restore"):
-        method_class("gp")().predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
 
 
 def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypatch):

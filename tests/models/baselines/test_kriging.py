@@ -1,7 +1,5 @@
 """Of many places each query is kriged from its nearest alone, and that is nearly what all of them say."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsparc.models.baselines import kriging

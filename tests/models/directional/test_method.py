@@ -1,7 +1,5 @@
 """Triangulated sources, their visibility, and channels from both."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A transmitter that moves before several antennas: all share the sources, each has its own images."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Stations learned together or each, where nobody says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 
@@ -109,12 +107,6 @@ def drawn(deviations: list[float], rows: int = 400, common: float = 0.0, seed: i
     """Errors (rows, K), a part of them common to all."""
     rng = np.random.default_rng(seed)
     return rng.normal(size=(rows, len(deviations))) * deviations + common * rng.normal(size=(rows, 1))
-
-
-def test_weights_are_those_of_inverse_variances_where_errors_are_independent():
-    weights = best_weights(np.diag([1.0, 4.0]))
-    assert weights == pytest.approx([0.8, 0.2], abs=1e-6)
-    assert best_weights(np.zeros((1, 1))) == pytest.approx([1.0])
 
 
 def test_no_weight_is_negative_where_plain_least_squares_has_one():

@@ -1,7 +1,5 @@
 """Each peer on a scene where its own idea must work."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -166,9 +164,6 @@ def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
     batch = data.batch(fold.test)
     said = method.predict(batch).mean
     assert said.shape == batch.target.shape and said.is_complex()
-    again = fitted("kriging", data, fold, tmp_path)
-    again.restore(data.site, method.state())
-    assert torch.equal(again.predict(batch).mean, said)
     rows = data.batch(fold.train)  # at a measured place the map is the measurement, less the nugget
     method.variogram = type(method.variogram)(0.0, method.variogram.variance, method.variogram.range)
     method._factor_system()

@@ -1,7 +1,5 @@
 """What docs/results/compare/settings.csv says of the peers' settings, and what `paper=nerf2` builds."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from published_table import FILE, settings, table

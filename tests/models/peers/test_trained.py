@@ -1,7 +1,5 @@
 """What every peer trained by gradient keeps to: its budget, its kinds, its checkpoint, the test rows."""
 
-from __future__ import annotations
-
 import signal
 from functools import partial
 from pathlib import Path
@@ -63,22 +61,6 @@ def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
     twin = brief(name)
     twin.fit(data, fold, FitContext(tmp_path))
     assert torch.equal(twin.predict(batch).mean, said), "the same steps give the same model"
-
-
-@pytest.mark.parametrize("name", ["gsrf", "newrf"])
-def test_no_test_row_is_looked_at(tmp_path, name):
-    data, fold, _ = room(40, directions=True)
-    batch = data.batch(fold.test)
-    answers = []
-    for rubbish in (False, True):
-        if rubbish:
-            data.target[fold.test] = np.nan
-            for i in fold.test:
-                data.directions[i] = np.full_like(data.directions[i], np.nan)
-        method = brief(name)
-        method.fit(data, fold, FitContext(tmp_path))
-        answers.append(method.predict(batch).mean)
-    assert torch.equal(*answers)
 
 
 def test_a_schedule_is_finished_whatever_the_clock_says(tmp_path, monkeypatch):
@@ -175,8 +157,6 @@ def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds)
         brief("newrf").fit(campaign("csi", 30, "tx"), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
         brief("ngrf").fit(campaign("spectrum", 30), fold, FitContext(tmp_path))
-    with pytest.raises(ValueError, match="gsrf: not fitted"):
-        brief("gsrf").predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
     with pytest.raises(ValueError, match="budget_s > 0"):
         brief("gsrf", budget_s=0)
 

@@ -1,7 +1,5 @@
 """The field of powers: the plain process without Gaussians, known walls, rows left out, slopes, state."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import replace
@@ -13,9 +11,7 @@ from closed import fitted_to, read_back
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
-from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.powers.field import PowerField
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
@@ -41,14 +37,6 @@ def town(count: int, walls: bool = True, seed: int = 0) -> Measurements:
     return from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
 
 
-def weak(data: Measurements, share: float) -> Measurements:
-    """The same by a receiver that hears nothing of the weaker rows."""
-    level = np.quantile(data.target, share)
-    silent = data.target[:, 0] < level
-    target = np.where(silent[:, None], level, data.target)
-    return replace(data, target=target, mask=~silent[:, None], censored=silent)
-
-
 def db(power: torch.Tensor) -> np.ndarray:
     return 10 * np.log10(power.numpy().astype(float)).reshape(-1)
 
@@ -61,23 +49,6 @@ def small_field(data: Measurements, two: bool = True) -> PowerField:
     field = PowerField()
     field.site, field.priors = data.site, ((1.0, Prior(kernel, Trend(-70.0))),)
     return field
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3])
-def test_of_few_rows_it_is_the_plain_process(share):
-    data = town(160)
-    data = weak(data, share) if share else data
-    rows = np.arange(90)
-    field, notes = fitted_to(PowerField(), data, rows)
-    field.condition(data, rows)
-    plain, batch = GaussianProcess(), data.batch(np.arange(120, 160))
-    said = plain.fit(data, Fold(rows, rows[:0], np.arange(120, 160)), FitContext()).notes
-    told, found = plain.predict(batch), field.predict(batch)
-    assert field.count_components() == 0 and found.explained is None and field.terms == ("residual",)
-    assert torch.allclose(found.mean, told.mean, rtol=1e-5)
-    assert torch.allclose(found.variance, told.variance, rtol=1e-4)
-    assert torch.allclose(found.unknown, 1 - told.confidence, atol=1e-5)
-    assert said[0] == f"gp: {notes[0]}"
 
 
 @pytest.fixture(scope="module")

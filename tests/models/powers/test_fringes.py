@@ -1,7 +1,5 @@
 """Coherent waves from powers alone: the fit, its worth beside a process, and the field with both."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

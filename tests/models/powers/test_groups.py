@@ -1,7 +1,5 @@
 """Groups of places, folds of them, and what one prior gains over another."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The mean of processes of powers, by squares of floor left out: its shares, variance, state and slopes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

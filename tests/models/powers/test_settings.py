@@ -1,7 +1,5 @@
 """The process of powers: its likelihood's slopes, its choices, and what it does with many rows."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

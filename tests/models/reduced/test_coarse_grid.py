@@ -1,7 +1,5 @@
 """A coarser grid, filled in: exact where the image is linear, wrapping where the grid does."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Channels of several runs, each with a phase of its own, and channels of which both ends move."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Faces joined to planes and rectangles, images in them against the simulator's, walls that paths cross."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """`init=scene`: known walls from few rows, and without walls' ends."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from closed import fitted_to, read_back

@@ -1,7 +1,5 @@
 """Powers of many ends in one field: exact conditioning, stations never heard, silent rows, wiring, state."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

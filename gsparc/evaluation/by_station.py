@@ -1,0 +1,94 @@
+"""Errors of powers station by station, and how often the strongest station is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
+from gsparc.evaluation.scores import FEW, Scores
+from gsparc.evaluation.table import Column, Table
+
+WORST = 3  # stations shown; the file has all
+ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
+
+
+def errors_by_station(scores: Scores, station: np.ndarray, name: str = ERRORS[0]) -> pd.DataFrame:
+    """Return `rows`, `bias` and `rmse` [dB] of the errors `name` of each `station` (n,) of all rows."""
+    errors = pd.DataFrame({"error": scores.samples[name], "square": scores.samples[name] ** 2})
+    by = errors.groupby(station[scores.row])
+    means = by.mean()
+    return pd.DataFrame({"rows": by["error"].count(), "bias": means.error, "rmse": means.square**0.5})
+
+
+def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
+    """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
+
+    Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
+    """
+    by = errors_by_station(scores, station)
+    # NaN where no row has an error.
+    mean = (by["rows"] * (by.rmse**2 - by.bias**2)).sum() / max(by["rows"].sum(), 1)
+    return float(mean**0.5) if by["rows"].any() else None
+
+
+def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
+    """Return the share of places, with rows of two stations or more, whose measured strongest is predicted.
+
+    What was not heard counts as weaker than all that was. Stations predicted alike share a place, so that
+    the order of rows does not count. Empty without such places.
+    """
+    if data.station is None:
+        return {}
+    row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
+    every = pd.DataFrame({
+        "fold": scores.fold, "place": place[row], "station": data.station[row],
+        "predicted": scores.samples["prediction"], "measured": scores.samples["target"],
+    })  # fmt: skip
+    # A station's rows of one place, of several visits, are one by their strongest.
+    links = every.groupby(["fold", "place", "station"]).max()
+    strongest = links == links.groupby(["fold", "place"]).transform("max")
+    strongest["right"] = strongest.predicted & strongest.measured
+    places = strongest.groupby(["fold", "place"])
+    found = places.sum()[(places.size() > 1) & places.measured.any()]
+    return {BEST_SERVER: float((found.right / found.predicted).mean())} if len(found) else {}
+
+
+def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[str, Any]:
+    """Return columns of `by_station.csv`: rows, rmse and bias of methods by the heads' beginning.
+
+    Of stations with scored rows; silent ones count in `rmse_db_with_silent`. Empty without stations.
+    """
+    if data.site.kind != "rssi" or data.station is None or data.site.stations is None:
+        return {}
+    columns: dict[str, Any] = {}
+    for stem, one in methods.items():
+        for name in [name for name in ERRORS if name in one.samples]:
+            by, figure = errors_by_station(one, data.station, name), name.replace("error", "rmse")
+            for head, names in data.site.stations.named.items():
+                columns.setdefault(head, np.array(names)[by.index])
+            columns |= {name.replace("error_db", "rows"): by["rows"], stem + figure: by.rmse}
+            columns |= {f"{stem}bias_db": by.bias} if name == ERRORS[0] else {}
+    return {name: np.asarray(values) for name, values in columns.items()}
+
+
+def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
+    """Return a table of the stations with the largest rmse, of those with rows enough, if these are several.
+
+    Baselines beside it tell whether a station is hard, its note at how many the method is better.
+    """
+    names = [name for name in columns if name.endswith("/rmse_db") and "/zero/" not in name]
+    heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
+    shown = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
+    shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
+    every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
+    rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
+    better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
+    note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
+    title = "rmse_db of the worst stations; by_station.csv has all"
+    worst = Table.from_rows(title, shown, rows[:WORST].to_dict("records"), note=note)
+    return [worst] if len(rows) > 1 else []

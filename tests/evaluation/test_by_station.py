@@ -1,0 +1,130 @@
+"""Errors of powers by station, the strongest station at a place, and leads with and without silent rows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.baselines import fit_baseline
+from gsparc.evaluation.by_station import best_server, rmse_after_constants, worst_stations
+from gsparc.evaluation.evaluate import evaluate
+from gsparc.evaluation.scores import Scores
+from gsparc.evaluation.summary import remarks, results_table
+from gsparc.prediction.timing import ClockSettings
+
+PLACES, NAMES = 60, ["north", "south", "roof"]
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """60 places along a line, three stations, the second of which scatters by 8 dB."""
+    rng = np.random.default_rng(1)
+    place, station = np.repeat(np.arange(PLACES), 3), np.tile(np.arange(3), PLACES)
+    level = -60 - 0.1 * place - 10.0 * station + rng.normal(size=3 * PLACES) * np.where(station == 1, 8, 0.5)
+    arrays = {
+        "rx_position": np.c_[place, np.zeros((len(place), 2))].astype(float), "station": station,
+        "station_position": np.array([[0.0, 9, 5], [30, 9, 5], [59, 9, 5]]), "rssi_db": level,
+        "station_name": np.array(NAMES),
+    }  # fmt: skip
+    return from_arrays(arrays, {"absent": "unknown"})
+
+
+def split_of(data, tested=5):
+    test = data.place % tested == 1
+    rows = np.arange(len(data))
+    return Split("every fifth", (Fold(rows[~test], rows[:0], rows[test]),), "")
+
+
+def evaluated(data, baselines):
+    split = split_of(data)
+    quick = ClockSettings(rounds=3, least=2, warmup=1)
+    return evaluate(
+        fit_baseline("nearest", data, split).methods, 1.0, data, split, baselines=baselines, clock=quick
+    )
+
+
+def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
+    """A planner saw one rmse for all stations, and not which row of per_sample.csv was of which."""
+    found = evaluated(drive, ["mean", "idw"])
+    found.write(tmp_path, run_id="one")
+    samples, stations = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("per_sample", "by_station"))
+    assert list(stations["station"]) == NAMES and set(samples["station"]) == set(NAMES)
+    own = samples.groupby("station")["error_db"]
+    rmse = own.apply(lambda error: np.sqrt(np.mean(error**2)))[NAMES]
+    assert stations["rows"].tolist() == [12, 12, 12]
+    np.testing.assert_allclose(stations["rmse_db"], rmse)
+    np.testing.assert_allclose(stations["bias_db"], own.mean()[NAMES])
+    assert stations["baseline/idw/rmse_db"].idxmax() == 1 and "baseline/mean/bias_db" in stations
+    (worst,) = worst_stations(found.stations, "nearest")
+    heads, rows = worst.texts()
+    assert heads == ["station", "rows", "nearest", "its bias_db", "mean", "idw"]
+    assert rows[0][:2] == ["south", "12"] and len(rows) == 3
+    ahead = [
+        int((stations["rmse_db"] < stations[f"baseline/{one}/rmse_db"]).sum()) for one in ("mean", "idw")
+    ]
+    assert worst.note == f"nearest is better than mean at {ahead[0]}, than idw at {ahead[1]} of 3 stations"
+    heads, rows = results_table(found.facts, "nearest").texts()
+    assert rows[-1][heads.index("best_server")] == f"{found.facts['test/best_server']:.1%}"
+
+
+def test_a_constant_of_each_station_is_what_is_left_out(drive):
+    """The figure is that of errors less the mean of their station."""
+    error = np.random.default_rng(0).normal(size=len(drive)) + 7.0 * drive.station
+    scores = scored(drive, np.ones(len(drive)), error)
+    means = np.array([error[drive.station == t].mean() for t in range(3)])
+    assert rmse_after_constants(scores, drive.station) == pytest.approx(
+        np.sqrt(np.mean((error - means[drive.station]) ** 2))
+    )
+    assert rmse_after_constants(scored(drive, error, error * np.nan), drive.station) is None
+
+
+def scored(data, prediction, error=None):
+    rows = np.arange(len(data))
+    target = data.target[:, 0].astype(float)
+    if data.censored is not None:
+        target[data.censored > 0] = np.nan
+    samples = {"prediction": np.asarray(prediction, float), "target": target, "error_db": error}
+    return Scores("rssi", 0 * rows, rows, samples, rows * np.nan, rows * np.nan)
+
+
+def test_the_strongest_is_told_where_it_is_and_equal_answers_tell_nothing(drive):
+    """Lists begin with the strongest: equal answers, as of `zero`, would be right by their order."""
+    truth = drive.target[:, 0].astype(float)
+    assert best_server(scored(drive, truth), drive) == {"best_server": 1.0}
+    assert best_server(scored(drive, -truth), drive) == {"best_server": 0.0}
+    assert best_server(scored(drive, 0 * truth), drive)["best_server"] == pytest.approx(1 / 3)
+    assert best_server(scored(drive, truth), replace(drive, station=None)) == {}
+    # Each visit to a place names its station again: one right answer, not half of one.
+    twice = replace(drive, place=drive.place // 2)
+    strongest = np.array([truth[(twice.place == p) & (twice.station == t)].max()
+                          for p, t in zip(twice.place, twice.station, strict=True)])  # fmt: skip
+    assert best_server(scored(twice, strongest), twice) == {"best_server": 1.0}
+
+
+def test_a_silent_station_that_is_predicted_strongest_is_wrong(drive):
+    """Rows below a level count as weaker than all that was heard there."""
+    truth, silent = drive.target[:, 0].astype(float), drive.station == 2
+    quiet = replace(drive, censored=silent.astype(np.int8))
+    assert best_server(scored(quiet, truth), quiet) == {"best_server": 1.0}
+    loud = np.where(silent & (quiet.place < PLACES // 2), 2 * truth.max(), truth)
+    assert best_server(scored(quiet, loud), quiet) == {"best_server": 0.5}
+
+
+def test_a_lead_with_silent_rows_hid_a_loss_on_heard_ones():
+    """`gsparc` was called better than all baselines, where kriging had 4.30 for 4.94 dB of heard rows."""
+    facts = {
+        "dataset/kind": "rssi", "model/label": "gsparc", "test/rmse_db": 4.94,
+        "test/rmse_db_with_silent": 3.0, "baseline/kriging/rmse_db": 4.30,
+        "baseline/kriging/rmse_db_with_silent": 4.0,
+        "baseline/kriging/ahead_db": -1.0, "baseline/kriging/ahead_error_db": 0.1,
+        "baseline/kriging/ahead_pairs": "900 test rows", "baseline/kriging/ahead_listed_db": 0.64,
+        "baseline/kriging/ahead_listed_error_db": 0.1, "baseline/kriging/ahead_listed_pairs": "300 test rows",
+    }  # fmt: skip
+    assert remarks(facts) == [
+        "gsparc is 1.00 ± 0.10 dB better over 900 test rows in rmse_db_with_silent than kriging, the best "
+        "baseline",
+        "the baseline kriging is 0.64 ± 0.10 dB better over 300 test rows in rmse_db of heard rows",
+    ]
