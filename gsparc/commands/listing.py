@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 
-from gsparc.data.files import read_shipped_table
-
 
 @dataclass(frozen=True)
 class Command:
@@ -18,13 +16,13 @@ class Command:
     Attributes:
         name: also of its configuration, `conf/<name>.yaml`.
         answers: one line for the list.
-        bare: setting that takes words without an equals sign, as a list of paths; empty: none does.
+        bare: setting that takes words without an equals sign, as a list of paths.
         configured: False for a command without a configuration: its module has `main(arguments)`.
     """
 
     name: str
     answers: str
-    bare: str = ""
+    bare: str | None = None
     configured: bool = True
 
     def arguments(self, words: Sequence[str]) -> list[str]:
@@ -52,8 +50,29 @@ class Command:
 
 
 COMMANDS = {
-    row["name"]: Command(row["name"], row["answers"], row["bare"], bool(row["configured"]))
-    for row in read_shipped_table(__package__, "commands.csv")
+    command.name: command
+    for command in (
+        Command("train", "train a method on a dataset and test it beside baselines"),
+        Command("evaluate", "test a checkpoint again: ckpt=FILE"),
+        Command("check", "what is in files of measurements, or what is wrong: FILE...", configured=False),
+        Command("data", "public sets of measurements: listed, or fetched by NAME", configured=False),
+        Command("predict", "predictions at places of a table: ckpt=FILE places=FILE"),
+        Command("simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
+        Command("study", "variants of one model: kind=effects, positions or measurements"),
+        Command("tradeoff", "accuracy against latency of one model: ckpt=FILE"),
+        Command("compare", "every method under the same data, metrics and clock"),
+        Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
+        Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
+        Command("export", "the model for other programs: ckpt=FILE to=c, taps, deepmimo"),
+        Command("serve", "answers over HTTP: ckpt=FILE"),
+        Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),
+        Command("map", "received power over an area with a promised error: ckpt=FILE"),
+        Command("view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
+        Command("plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"),
+        Command("place", "where one more station serves an area best: ckpt=FILE"),
+        Command("report", "one page about many runs: RUN...", bare="runs"),
+        Command("bench", "seconds of kernels beside plain PyTorch"),
+    )
 }
 
 

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
 from cycler import cycler
-from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from gsparc.data.files import read_shipped_table, whole_file
+from gsparc.data.files import whole_file
 from gsparc.data.limits import choice
 
 # Colours that are told apart with any colour vision (Okabe and Ito 2008, the yellow darker; Tol 2021).
@@ -23,7 +23,21 @@ PALETTE = (
     "#56B4E9", "#4B5320", "#000000", "#882255", "#332288",
 )  # fmt: skip
 STROKES = ("-", "--", ":", "-.")  # where there are more lines than colours
-STYLE: list[Any] = [f"{__package__}.style", {"axes.prop_cycle": cycler(color=PALETTE)}]
+GREY = "#6E6E6E"
+STYLE: dict[Any, Any] = {
+    "axes.prop_cycle": cycler(color=PALETTE),
+    "axes.formatter.useoffset": False,  # 29.114 is read, 0.004 beside +2.911e1 is not
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": "medium",
+    "figure.titlesize": "medium",
+    "font.size": 10.0,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.3,
+}
+
+
 PRINTED = choice("pdf", "svg")  # formats beside PNG
 
 
@@ -47,9 +61,18 @@ class MethodStyle(NamedTuple):
 
 # The same method looks the same everywhere; of two drawn together in one colour one is the second.
 METHODS = {
-    row["method"]: MethodStyle(row["colour"], row["mark"], bool(row["second"]))
-    for row in read_shipped_table(__package__, "methods.csv")
-}
+    "gsparc": MethodStyle("#D55E00", "*"), "blind": MethodStyle("#D55E00", "P", True),
+    "gp": MethodStyle("#0072B2", "s"), "complex_gp": MethodStyle("#0072B2", "D", True),
+    "idw": MethodStyle("#009E73", "o"), "calibrated_raytracer": MethodStyle("#009E73", "v", True),
+    "swiftwrf": MethodStyle("#CC79A7", "X"), "distance_law": MethodStyle("#CC79A7", "v"),
+    "newrf": MethodStyle("#CC79A7", "^", True), "paper": MethodStyle("#E69F00", "s"),
+    "gaussians": MethodStyle("#E69F00", "o", True), "kriging": MethodStyle("#56B4E9", "p"),
+    "residual": MethodStyle("#56B4E9", "h", True), "wrfgs": MethodStyle("#4B5320", "D"),
+    "array": MethodStyle("#4B5320", "X", True), "nerf2": MethodStyle("#000000", "o"),
+    "image_source_gp": MethodStyle("#000000", "v"), "nearest": MethodStyle("#332288", "^"),
+    "gsrf": MethodStyle("#882255", "P"), "ngrf": MethodStyle("#882255", "s", True),
+    "mean": MethodStyle(GREY, "o"), "zero": MethodStyle(GREY, "X", True),
+}  # fmt: skip
 OTHERS = "<>8H"  # marks of methods without an entry
 TOGETHER = "_together"  # ends the name of a method that serves all stations at once
 
@@ -76,7 +99,7 @@ def panels(
 
     At most 9 inches of width stay readable at 600 pixels.
     """
-    style.use(STYLE)  # text and lines that are added later read it too
+    matplotlib.rcParams.update(STYLE)  # text and lines that are added later read it too
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, **how)

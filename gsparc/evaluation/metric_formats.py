@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gsparc.data.files import read_shipped_table
 from gsparc.data.schema import Scored
 
 
@@ -27,20 +26,46 @@ class Figure:
 
 
 # SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default.
-ROWS = {row.pop("name"): row for row in read_shipped_table(__package__, "figures.csv")}
-FIGURES = {name: Figure(**row) for name, row in ROWS.items()}  # type: ignore[arg-type]
+FIGURES = {
+    "psnr_db": Figure("PSNR dB", ".2f"),
+    "ssim_gauss": Figure("SSIM (Gauss 11)"),
+    "ssim": Figure("SSIM (uniform 7)"),
+    "mse": Figure("MSE", ".3g", "ratio"),
+    "mae": Figure("MAE", ".3g", "smaller"),
+    "nmse": Figure("NMSE", ".3g", "ratio"),
+    "nmse_aligned": Figure("NMSE, rows aligned", ".3g", "ratio"),
+    "tone_rmse_db": Figure("RMSE of tones dB", ".2f", "smaller"),
+    "nmse_scalar": Figure("NMSE up to a scalar", ".3g", "ratio"),
+    "snr_db": Figure("SNR dB", ".2f"),
+    "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
+    "rmse_db": Figure("RMSE dB", ".2f", "smaller"),
+    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller"),
+    "mae_db": Figure("MAE dB", ".2f", "smaller"),
+    "error_db": Figure("error dB", ".2f", "smaller"),
+    "best_server": Figure("strongest told", ".1%"),
+    "skill": Figure("skill", ".3f"),
+    "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
+}
 WITH_SILENT = "rmse_db_with_silent"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
-KINDS = {row["kind"]: row for row in read_shipped_table(__package__, "kinds.csv")}
-TABLES = {kind: tuple(row["columns"].split()) for kind, row in KINDS.items()}
+# Order matters: `DECIDING` takes the first of each.
+TABLES: dict[Scored, tuple[str, ...]] = {
+    "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
+    "csi": ("nmse", "nmse_scalar", "snr_db"),
+    "aligned csi": ("nmse_aligned", "tone_rmse_db", "snr_db"),
+    "rssi": ("rmse_db", "mae_db"),
+}
 """The columns of a kind's tables; methods, fronts and effects are compared by the first."""
-DECIDING = {kind: names[0] for kind, names in TABLES.items()}
-PER_SAMPLE = {kind: row["per_sample"] for kind, row in KINDS.items()}
+DECIDING: dict[Scored, str] = {kind: names[0] for kind, names in TABLES.items()}
+PER_SAMPLE: dict[Scored, str] = {
+    "spectrum": "psnr_db",
+    "csi": "snr_db",
+    "aligned csi": "snr_db",
+    "rssi": "error_db",
+}
 """The figure of a single sample, in decibels."""
-SECOND = {kind: row["second"] for kind, row in KINDS.items()}  # beside the deciding one
-CDFS = {kind: tuple(row["distributions"].split()) for kind, row in KINDS.items()}  # figures of samples, drawn
 
 
 def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:

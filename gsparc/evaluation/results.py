@@ -5,14 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gsparc.data.files import read_shipped_table
 from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
 
 # Columns by the facts of a summary that they hold: of the run, of its own method, of any method.
-OF_RUN, OF_MODEL, COSTS = (
-    {row["column"]: row["fact"] for row in read_shipped_table(__package__, "results.csv") if row["of"] == of}
-    for of in ("run", "model", "cost")
-)
+OF_RUN = {
+    "dataset": "dataset/name", "split": "split/name", "seed": "seed", "kind": "dataset/kind",
+    "load": "machine/load", "data": "dataset/sha256", "git": "git", "simulate_s": "dataset/simulate_s",
+    "rows": "split/sha256",
+}  # fmt: skip
+OF_MODEL = {
+    "label": "model/label", "gaussians": "model/num_gaussians", "memory_mb": "memory/peak_mb",
+}  # fmt: skip
+COSTS = {
+    "train_s": "train_s", "train_cpu_s": "train_cpu_s", "query_ms": "render_ms_p50",
+    "query_p95_ms": "render_ms_p95", "batch_ms": "render_ms_batch64",
+}  # fmt: skip
 
 
 def facts_under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:

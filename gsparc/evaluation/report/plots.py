@@ -14,8 +14,9 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis, style_of
-from gsparc.evaluation.metric_formats import CDFS, PER_SAMPLE, heading_of, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.runs import Run, distinct_baselines, error_sizes
 from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
 from gsparc.prediction.pareto import pareto_front
@@ -23,6 +24,10 @@ from gsparc.prediction.pareto import pareto_front
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
 TIMES = "render_ms"  # of single queries, beside the figures of samples
+CDFS: dict[Scored, tuple[str, ...]] = {
+    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"),
+    "aligned csi": ("snr_db", "error_power"), "rssi": ("error_db",),
+}  # fmt: skip
 
 
 def to_svg(figure: Figure) -> str:
