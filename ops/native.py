@@ -10,10 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, calls, operators, validation
-from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
+from gsparc.ops import _native, calls, validation
+from gsparc.ops.geometry import Gaussians, SphereGrid
 from gsparc.ops.operators import (
-    Buffers,
     check_memory,
     composite,
     contiguous,
@@ -22,12 +21,9 @@ from gsparc.ops.operators import (
     mean_weights,
     register_kernel,
 )
-from gsparc.ops.results import Plan, Raster
-from gsparc.ops.settings import KernelSettings
+from gsparc.ops.results import Plan
 
-__all__ = ["composite", "draw_frozen", "freeze", "instruction_set", "make_plan", "mean_weights", "rasterize"]
-
-NO_PLAN = (None,) * len(Buffers._fields)
+__all__ = ["composite", "draw_frozen", "freeze", "instruction_set", "make_plan", "mean_weights"]
 
 
 def run_on_plan(
@@ -52,33 +48,6 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     buffers = plan.buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))
     call("entries", means, *buffers)
     return replace(plan, buffers=buffers)
-
-
-def rasterize(
-    gaussians: Gaussians, ids: Tensor | None, pose: Pose, features: Tensor, settings: KernelSettings
-) -> Raster:
-    """Render in one call that keeps no plan and passes no gradient.
-
-    Raises:
-        ValueError, MemoryError: as `make_plan` and `composite`.
-    """
-    means, poses, n = gaussians.means, len(pose), len(gaussians.means)
-    samples, _, channels = features.shape
-    size = settings.height, settings.width
-    image, transmittance = means.new_empty(samples, channels, *size), means.new_empty(poses, *size)
-    means2d, radii = means.new_empty(poses, n, 2), means.new_empty(poses, n)
-    visible = means.new_empty(poses, n, dtype=torch.bool)
-    inputs = contiguous((*gaussians, pose.position, pose.rotation, features))
-    tensors = (*NO_PLAN, *inputs, image, transmittance, *contiguous((ids,)), means2d, radii, visible)
-    # The kernel counts the entries, and refuses more than the bound before it allocates them.
-    sizes, bound = (poses, n, samples, channels), (operators.MEMORY_BOUND,)
-    status = calls.launch("rasterize", means, *tensors, sizes=sizes, numbers=bound, settings=settings)
-    if status <= _native.REFUSED:
-        check_memory(_native.REFUSED - status, 4)
-    if status == _native.UNSOUND_FEATURES:
-        validation.check_features(features)
-    validation.raise_for_status(status, pose)
-    return Raster(image, transmittance, radii, visible, means2d)
 
 
 @register_kernel("composite", "cpu")

@@ -13,8 +13,8 @@ from gsparc.ops.frozen import FrozenPlan
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.projection import Projection
 from gsparc.ops.results import Plan, Raster, Weights
-from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, kernel_settings
-from gsparc.ops.transforms import detach, is_differentiated, needs_reference, no_transforms
+from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics
+from gsparc.ops.transforms import detach, needs_reference, no_transforms
 
 
 def make_plan(
@@ -148,8 +148,6 @@ def rasterize(
 ) -> Raster:
     """Render features (N, C) or (B, N, C), real, in one call: `make_plan`, then `composite`; see there.
 
-    Where no gradient is asked for, the `cpu` backend does both in one call and keeps no plan; same bits.
-
     >>> pose, grid = Pose.identity(torch.zeros(3)), SphereGrid.hemisphere(9, 36)
     >>> means, quats = torch.tensor([[4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     >>> scales, opacities, features = torch.full((1, 3), 0.5), torch.tensor([0.8]), torch.ones(1, 1)
@@ -159,16 +157,8 @@ def rasterize(
     >>> bool(torch.allclose(raster.image[0], 1 - raster.transmittance, atol=1e-6))  # one feature, of 1
     True
     """
-    chosen = backends.choose_backend(backend, means.device)
-    at_once = getattr(chosen, "rasterize", None)
-    inputs = (means, quats, scales, opacities, features, pose.position, pose.rotation)
     gaussians = validation.check_gaussians(means, quats, scales, opacities, ids)
     optics = Optics(projection, low_pass, compensate, near, cutoff)
-    # Only without gradients: one call keeps no plan that a backward pass could read.
-    if at_once is not None and not is_differentiated(*inputs):
-        poses = validation.check_poses(pose, means)
-        values = validation.features_per_pose(features, means, poses)
-        return at_once(gaussians, ids, poses, values, kernel_settings(grid, optics))
     plan = _make_plan(gaussians, ids, pose, grid, optics, backend)
     return composite(plan, means, quats, scales, opacities, features)
 

@@ -30,7 +30,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     settings = to_dict(config)
     evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
-    draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
+    draws = int(config.draws), config.confidence, int(config.seed)
     divisions = [run_trials(evidence, promise, "random", *draws)]
     try:
         divisions.append(run_trials(evidence, promise, "spatial", *draws))
@@ -46,7 +46,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
-        how = promise, config.confidence, bool(config.spatial), int(config.seed), float(config.apart_m)
+        how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:
             stored, bound = calibrate_and_store(path, settings["dataset"], settings["split"], *how)
             # An infinite threshold accepts nobody, and JSON has no infinity.

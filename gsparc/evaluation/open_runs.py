@@ -400,14 +400,14 @@ def collect_evidence(
 
 def calibrate_and_store(
     path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: Guarantee, kind: str, spatial: bool,
-    seed: int, apart_m: float = 0.0,
+    seed: int,
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
     run, own, fold = _unseen(path, dataset, split)
     # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
-    how = kind, spatial, seed, apart_m
+    how = kind, spatial, seed
     kind_used, choice, _, choose_on = calibrate_threshold(evidence, guarantee, *how, tested=False)
     threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)

@@ -15,13 +15,11 @@ from torch import Tensor, nn
 from gsparc.data.limits import Checked, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
-from gsparc.ops.channels import channels
 from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering_matrix
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.waves import LIGHT
 
 SLOPE_ENDS = 1e-12  # of an unknown share: its square root has a finite slope above
-UNEVEN = 1e-6  # tones this far off an even comb, in spacings, are evaluated one by one
 
 
 @dataclass(frozen=True)
@@ -66,20 +64,14 @@ class ChannelResponse(nn.Module):
             numbers = (tones_hz - tones_hz[0]).double() / band * subcarriers
         numbers = numbers - numbers.mean()
         self.register_buffer("numbers", numbers, persistent=False)
-        self.first = float(numbers[0])  # known from the start: asking a GPU later would wait for it
-        self.even = len(numbers) < 3 or float((numbers.diff() - numbers.diff().mean()).abs().max()) < UNEVEN
         turns = lengths / LIGHT * band if band else torch.zeros_like(lengths)
         # In cells of 1 / bandwidth: a step of Adam then means the same on every band.
         self.delays = nn.Parameter(turns.float(), requires_grad=subcarriers > 1)
 
     def forward(self, weighted: Tensor) -> Tensor:
         """Return channels (B, A, K) complex of visible gains (B, N) complex."""
-        gains = torch.view_as_real(weighted)
         delays = self.delays.double() / self.subcarriers  # in periods of the mean tone spacing
-        if self.even:
-            result = channels(gains, self.steering, delays, self.first, 1.0, self.subcarriers)
-            return torch.view_as_complex(result)
-        phase = -2 * math.pi * torch.outer(delays, self.numbers).float()
+        phase = -2 * math.pi * torch.outer(delays, self.numbers).to(weighted.real.dtype)
         comb = torch.polar(torch.ones_like(phase), phase)
         return torch.einsum("bn,na,nk->bak", weighted, torch.view_as_complex(self.steering), comb)
 

@@ -18,7 +18,6 @@ from gsparc.field.losses import spectrum_loss
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
-from gsparc.ops.channels import channels, plain_channels
 from gsparc.ops.networks import networks, plain_networks
 from gsparc.ops.projection import Projection
 
@@ -29,8 +28,6 @@ EMISSION = EmissionSettings(EncodingSettings("raw"), 16, "sigmoid", log_distance
 # Dense tensors of one forward pass of 1,000 Gaussians are 1.6 GB: the reference of more is not called.
 MOST_DENSE = 1000
 STEPPED, BATCH = 100, 16  # Gaussians and spectra of a training step
-ANTENNAS, SUBCARRIERS = 64, 26  # of the Argos release
-TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
 
 
 @dataclass(frozen=True)
@@ -69,9 +66,8 @@ def random_model(
 
 def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Iterator[Case]:
     """Yield the kernels of a field of N Gaussians, two real channels wide."""
-    means, quats, scales, opacities = (
-        t.detach() for t in random_model(count, projection, device=device).gaussians.geometry()
-    )
+    model = random_model(count, projection, device=device)
+    means, quats, scales, opacities = (t.detach() for t in model.gaussians.geometry())
     geometry = means, quats, scales, opacities
     pose = Pose.identity(torch.tensor([0.5, -0.5, 0.2])).to(device)
     draw = torch.Generator().manual_seed(0)
@@ -116,25 +112,11 @@ def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Ite
     yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), reference)
     yield make_case("forward and gradients", backward)
     yield make_case("weights of channels", weights)
-    yield from _network_cases(count, draw, device)
-
-
-def _network_cases(count: int, generator: torch.Generator, device: str) -> Iterator[Case]:
-    """What stands beside the rasterizer: networks of emission and the sum of a channel."""
-    emission = random_model(count, "tangent", device=device).emission
+    emission = model.emission
     layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
-    encoded = emission.encoding(torch.randn(BATCH, 3, generator=generator).to(device))
+    encoded = emission.encoding(torch.randn(BATCH, 3, generator=draw).to(device))
     of = f"{count} x {BATCH}"
     yield Case("emission", of, lambda: networks(encoded, *layers), lambda: plain_networks(encoded, *layers))
-    steering = torch.randn(count, ANTENNAS, 2, generator=generator).to(device)
-    # Up to 100 ns, as in a room, and in float64: at 2.4 GHz these are 240 turns.
-    delays = 1e-7 * torch.rand(count, generator=generator, dtype=torch.float64).to(device)
-    gains = torch.randn(1, count, 2, generator=generator).to(device)
-    yield Case(
-        "channel", f"{count} to {ANTENNAS} x {SUBCARRIERS}",
-        lambda: channels(gains, steering, delays, *TONES, SUBCARRIERS),
-        lambda: plain_channels(gains, steering, delays, TONES, SUBCARRIERS),
-    )  # fmt: skip
 
 
 def loss_case(device: str = "cpu") -> Case:

@@ -19,7 +19,6 @@ from scipy.special import betainc, log_expit
 from scipy.stats import binom, binomtest, chi2, spearmanr
 
 from gsparc.data.limits import SHARE, Checked, setting
-from gsparc.data.spacing import thin_rows
 from gsparc.processes.stored import Stored
 
 RIVALS = ("distance", "gp_variance")
@@ -341,12 +340,12 @@ def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0, effect: 
 
 
 def relax_guarantee(
-    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int, apart_m: float
+    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int
 ) -> Guarantee | None:
     """Return the same promise with the least larger limit [whole dB] that these positions keep; or None."""
     for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(guarantee, limit_db=float(limit))
-        if calibrate_threshold(evidence, other, kind, spatial, seed, apart_m, False).threshold.accepted:
+        if calibrate_threshold(evidence, other, kind, spatial, seed, tested=False).threshold.accepted:
             return other
     return None
 
@@ -400,7 +399,7 @@ def explain_kind(evidence: Evidence, rows: np.ndarray) -> str:
 
 def calibrate_threshold(
     evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int | list[int],
-    apart_m: float = 0, tested: bool = True,
+    tested: bool = True,
 ) -> CalibratedThreshold:  # fmt: skip
     """Choose a confidence and its threshold.
 
@@ -418,8 +417,6 @@ def calibrate_threshold(
     score, bad = evidence.scores[used], guarantee.is_bad(evidence.error)
     if not tested:
         calibrate, test = np.concatenate([calibrate, test]), test[:0]
-    if apart_m > 0:  # neighbours err together and count as one
-        calibrate = thin_rows(evidence.position, calibrate, apart_m, rng)
     # Divided at random, accepted positions are independent draws, and their counts are binomial.
     patch = number_patches(evidence.position)[calibrate] if spatial else None
     levels = threshold_levels(score[choose_on], bad[choose_on], guarantee, len(calibrate))
@@ -428,9 +425,8 @@ def calibrate_threshold(
 
 
 def run_trials(
-    evidence: Evidence, guarantee: Guarantee, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
-    seed: int = 0,
-) -> Trial:  # fmt: skip
+    evidence: Evidence, guarantee: Guarantee, how: How, draws: int, kind: str = "auto", seed: int = 0
+) -> Trial:
     """Resample `draws` calibration sets.
 
     Args:
@@ -439,14 +435,13 @@ def run_trials(
         how: `random` or `spatial` division.
         draws: calibration sets.
         kind: a confidence, or `auto`: the best on the positions set aside for choosing.
-        apart_m: calibration positions nearer to each other than this are thinned [m].
         seed: of the draws.
     """
     realised, coverage, kinds = [], [], []
     bad, spatial = guarantee.is_bad(evidence.error), how == "spatial"
     for draw in range(draws):
         drawn = [seed, draw]
-        used, threshold, test, _ = calibrate_threshold(evidence, guarantee, kind, spatial, drawn, apart_m)
+        used, threshold, test, _ = calibrate_threshold(evidence, guarantee, kind, spatial, drawn)
         accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
         realised.append(bad[accepted].mean() if len(accepted) else np.nan)

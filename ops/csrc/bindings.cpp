@@ -32,18 +32,13 @@ NB_MODULE(_native, module) {
     module.attr("STRIP_ROWS") = kStripRows;
     module.attr("UNSOUND_POSE") = kUnsoundPose;
     module.attr("EQUAL_IDS") = kEqualIds;
-    module.attr("UNSOUND_FEATURES") = kUnsoundFeatures;
-    module.attr("REFUSED") = kRefused;
     module.attr("TILE_WIDTH") = kTileWidth;
     module.attr("TILE_HEIGHT") = kTileHeight;
     module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;
     module.attr("SIMILARITY_HEIGHT") = kSimilarityHeight;
     module.attr("RADIUS") = kRadius;
-    module.attr("MOST_INPUTS") = kMostInputs;
-    module.attr("MOST_OUTPUTS") = kMostOutputs;
     define(module, "plan", plan);
     define(module, "entries", entries);
-    define(module, "rasterize", rasterize);
 #define X(name) define(module, #name, [](const Call& call) { return (call.twice ? kernels<double>().name : kernels<float>().name)(call); });
     GSPARC_KERNELS(X)
 #undef X

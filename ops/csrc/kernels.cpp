@@ -1,8 +1,6 @@
 // The kernels, compiled once per instruction set (GSPARC_ISA names it); results do not depend on the threads.
 #define GSPARC_PACKS
 #include "backward.h"
-#include "bins.h"
-#include "channels.h"
 #include "frozen.h"
 #include "networks.h"
 #include "project.h"
@@ -14,7 +12,7 @@ namespace gsparc {
 namespace GSPARC_ISA {
 
 #define X(name) name<S>,
-template <class S> constexpr Kernels<S> all_kernels() { return {project_range<S>, kBinStrip, GSPARC_KERNELS(X)}; }
+template <class S> constexpr Kernels<S> all_kernels() { return {project_range<S>, GSPARC_KERNELS(X)}; }
 #undef X
 extern const Kernels<float> single_kernels = all_kernels<float>();
 extern const Kernels<double> double_kernels = all_kernels<double>();

@@ -17,12 +17,11 @@ template <class S> struct ProjectArgs {
 // Kernels of Python, each a `template <class S> int64_t NAME(const Call&)` in a header of kernels.cpp.
 #define GSPARC_KERNELS(X) \
     X(composite) X(composite_backward) X(weights) X(weights_backward) X(freeze) X(thaw) X(networks) X(networks_backward) \
-    X(similarity) X(channels) X(channels_backward) X(array_spectrum) X(nearest_weights)
+    X(similarity) X(array_spectrum) X(nearest_weights)
 
 template <class S> struct Kernels {
     // Returns -1, or 4 * Gaussian + (0 means, 1 quats, 2 scales, 3 opacities) for the first that is not sound.
     int64_t (*project)(const ProjectArgs<S>&, int begin, int end);
-    void (*bin_strip)(const int16_t* first, const int16_t* last, int count, int strip, int32_t* to);  // see bins.h; may be null
 #define X(name) int64_t (*name)(const Call&);
     GSPARC_KERNELS(X)
 #undef X
@@ -33,10 +32,8 @@ const char* instruction_set();
 bool use_instruction_set(const char* name);  // for tests; false if this machine or build lacks it
 
 // Of plan.cpp. The first fills a plan but for its entries; returns -1, the first unsound Gaussian as `Kernels::project`
-// does, or kUnsoundPose. The second fills the entries. The third makes a plan that it keeps to itself, and its image:
-// returns as the first, kUnsoundFeatures, or kRefused less the entries where they need more bytes than numbers[0].
+// does, or kUnsoundPose. The second fills the entries.
 int64_t plan(const Call& call);
 int64_t entries(const Call& call);
-int64_t rasterize(const Call& call);
 
 }  // namespace gsparc

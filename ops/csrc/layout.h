@@ -33,8 +33,8 @@ constexpr int kLanes = 16;      // most pixels done at a time by any instruction
 
 // What a plan returns of a pose, and of equal ids at one distance; of a Gaussian 4 i + parameter.
 constexpr int64_t kUnsoundPose = int64_t(1) << 62, kEqualIds = int64_t(1) << 61;
-// What a rasterization returns besides.
-constexpr int64_t kUnsoundFeatures = int64_t(1) << 60, kRefused = -2;
+// What an image of a frozen view returns besides.
+constexpr int64_t kUnsoundFeatures = int64_t(1) << 60;
 
 // A strip is kStripRows rows of the image, the unit of work. Row-wise strips let azimuth wrap without tiles.
 constexpr int kStripRows = 4;
@@ -42,11 +42,9 @@ constexpr int kStripRows = 4;
 // Taps of the similarity's window to either side of the middle one.
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
 
-// Of the CUDA kernels: pixels of a tile, which a warp takes at a time; of a block of the similarity; the most inputs and
-// outputs of a network, whose weights pass through registers.
+// Of the CUDA kernels: pixels of a tile, which a warp takes at a time; of a block of the similarity.
 constexpr int kTileWidth = 8, kTileHeight = 4;
 constexpr int kSimilarityWidth = 32, kSimilarityHeight = 8;
-constexpr int kMostInputs = 256, kMostOutputs = 4;
 
 // A footprint's rows [row0, row1) and columns column0 + [0, columns), modulo the width.
 struct Box {
@@ -60,7 +58,7 @@ template <class S> struct PlanView {
     const Box* boxes;            // (P, N) by rank
     const int32_t* order;        // (P, N) rank -> Gaussian
     const int32_t* shown;        // (P,) how many ranks are visible
-    const int64_t* slots;        // (P, N + 1) first entry of each rank, over all poses; null for an image alone
+    const int64_t* slots;        // (P, N + 1) first entry of each rank, over all poses
     const int64_t* strip_starts; // (P strips + 1) into entries
     const int32_t* entries;      // (E,) ranks, front to back within each strip
 };

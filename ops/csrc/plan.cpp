@@ -7,7 +7,6 @@
 #include <utility>
 #include <vector>
 
-#include "finite.h"
 #include "kernels.h"
 #include "pool.h"
 #include "pose.h"
@@ -170,10 +169,10 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
         const int pose = task / chunks;
         const int64_t base = pose * count, begin = int64_t(task % chunks) * chunk, end = std::min(begin + chunk, count);
         Ends ends(a.strips);
-        int64_t* slots = a.slots ? a.slots + pose * (count + 1) : nullptr;
+        int64_t* slots = a.slots + pose * (count + 1);
         int64_t total = 0;
         for (int64_t rank = begin; rank < end; ++rank) {
-            if (slots) slots[rank] = total;
+            slots[rank] = total;
             if (rank < a.shown[pose]) {
                 if (rank + kAhead < end) __builtin_prefetch(boxes.data + base + a.order[base + rank + kAhead]);
                 const Box box = a.boxes[base + rank] = boxes.data[base + a.order[base + rank]];
@@ -196,8 +195,8 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
         for (int64_t rank = begin; rank < end; ++rank) slots[rank] += per_chunk[task];
         if (end == count) slots[count] = task + 1 < a.poses * chunks ? per_chunk[task + 1] : before;
     };
-    if (a.slots) parallel_for(a.poses * chunks, a.threads, shift);
-    if (a.slots && count == 0) std::fill_n(a.slots, a.poses, 0);
+    parallel_for(a.poses * chunks, a.threads, shift);
+    if (count == 0) std::fill_n(a.slots, a.poses, 0);
     a.strip_starts[0] = 0;
     for (int64_t pose = 0, at = 0; pose < a.poses; ++pose)
         for (int strip = 0; strip < a.strips; ++strip, ++at) {
@@ -208,33 +207,8 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     return -1;
 }
 
-constexpr int kMostSearched = 64;  // strips that each look at all footprints; of more, footprints look for their strips
-
-// Each strip picks its footprints.
-template <class S> void search_entries(const PlanView<S>& plan, int threads, int32_t* entries) {
-    const int64_t room = (int64_t(plan.count) + kLanes - 1) / kLanes * kLanes;
-    const Workspace<int16_t> first(plan.poses * room), last(plan.poses * room);
-    const int chunks = int((plan.count + kBinned - 1) / kBinned);
-    auto note = [&](int task, int) {
-        const int64_t pose = task / chunks, begin = int64_t(task % chunks) * kBinned, shown = plan.shown[pose];
-        const Box* boxes = plan.boxes + pose * plan.count;
-        for (int64_t rank = begin; rank < std::min(begin + kBinned, room); ++rank) {
-            const bool seen = rank < shown;
-            first[pose * room + rank] = int16_t(seen ? boxes[rank].row0 / kStripRows : kMostSearched);
-            last[pose * room + rank] = int16_t(seen ? (boxes[rank].row1 - 1) / kStripRows : 0);
-        }
-    };
-    parallel_for(plan.poses * chunks, threads, note);
-    auto pick = [&](int task, int) {
-        const int64_t pose = task / plan.strips, base = pose * room;
-        kernels<S>().bin_strip(first.data + base, last.data + base, plan.shown[pose], task % plan.strips, entries + plan.strip_starts[task]);
-    };
-    parallel_for(plan.poses * plan.strips, threads, pick);
-}
-
 // Each chunk of ranks writes its own stretch of every strip, so ranks stay in order whoever writes.
 template <class S> void fill_entries(const PlanView<S>& plan, int threads, int32_t* entries) {
-    if (kernels<S>().bin_strip && plan.strips <= kMostSearched) return search_entries(plan, threads, entries);
     const Bins bins(plan.poses, plan.count, plan.strips);
     std::vector<int32_t> counts(bins.size());
     auto each = [&](int task, auto visit) {
@@ -281,44 +255,9 @@ template <class S> int64_t entries_of(const Call& call) {
     return 0;
 }
 
-// The plan's tensors are absent from the call: they are in borrowed memory, which the image alone reads.
-template <class S> int64_t rasterize_of(const Call& given) {
-    Call call = given;
-    Reader in(call);
-    const ViewArgs<S> view(call, in);
-    PlanArgs<S> a;
-    int samples, channels;
-    const S *features, *image, *transmittance;
-    in.sizes(samples, channels);
-    in.read(features, image, transmittance, a.ids, a.means2d, a.radii, a.visible);
-    a.model = view.model;
-    a.poses = view.plan.poses, a.count = view.plan.count, a.strips = view.plan.strips;
-    a.threads = view.threads, a.settings = view.settings;
-    const int64_t all = int64_t(a.poses) * a.count, strips = int64_t(a.poses) * a.strips;
-    const Workspace<S> records(all * kRecord);
-    const Workspace<Box> boxes(all);
-    const Workspace<int32_t> order(all), shown(a.poses);
-    const Workspace<int64_t> starts(strips + 1);
-    a.records = records.data, a.boxes = boxes.data, a.order = order.data, a.shown = shown.data;
-    a.slots = nullptr, a.strip_starts = starts.data;  // slots are for sums of each footprint
-    const int64_t status = make_plan(a);
-    if (status >= 0) return status;
-    const int64_t count = starts[strips];
-    if (count * int64_t(sizeof(int32_t)) > int64_t(call.numbers[0])) return kRefused - count;
-    if (!all_finite(features, int64_t(samples) * a.count * channels)) return kUnsoundFeatures;
-    const Workspace<int32_t> entries(count);
-    const void* const buffers[] = {a.records, a.boxes, a.order, a.shown, a.slots, a.strip_starts, entries.data};
-    for (int k = 0; k < 7; ++k) call.tensors[k] = uint64_t(uintptr_t(buffers[k]));
-    Reader again(call);
-    fill_entries(ViewArgs<S>(call, again).plan, a.threads, entries.data);
-    kernels<S>().composite(call);
-    return -1;
-}
-
 }  // namespace
 
 int64_t plan(const Call& call) { return call.twice ? plan_of<double>(call) : plan_of<float>(call); }
 int64_t entries(const Call& call) { return call.twice ? entries_of<double>(call) : entries_of<float>(call); }
-int64_t rasterize(const Call& call) { return call.twice ? rasterize_of<double>(call) : rasterize_of<float>(call); }
 
 }  // namespace gsparc

@@ -37,32 +37,12 @@ struct Batch {
     explicit Batch(int tiles) : hits(int64_t(kBatch) * (tiles + 1) + kBlock, false), words(Bits::size(tiles), false) {}
 };
 
-#if defined(__AVX2__) && !defined(__AVX512F__)
-// The numbers of the bits that are set in a byte, side by side, a byte each.
-struct SetBits {
-    uint64_t of[256] = {};
-    constexpr SetBits() {
-        for (int byte = 0; byte < 256; ++byte)
-            for (int bit = 0, at = 0; bit < 8; ++bit)
-                if (byte >> bit & 1) of[byte] |= uint64_t(bit) << 8 * at++;
-    }
-};
-constexpr SetBits kSetBits;
-#endif
-
 // Appends those tiles from `first` on whose bit, of kBlock, is set.
 GSPARC_INLINE int32_t* append(int32_t* hit, int first, unsigned tiles) {
 #if defined(__AVX512F__)
     const __m512i all = _mm512_add_epi32(_mm512_set1_epi32(first), _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0));
     _mm512_storeu_si512(hit, _mm512_maskz_compress_epi32(__mmask16(tiles), all));
     return hit + __builtin_popcount(tiles);
-#elif defined(__AVX2__)
-    for (int half = 0; half < 2; ++half, tiles >>= 8, first += 8) {  // without a branch
-        const __m128i which = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(kSetBits.of + (tiles & 255)));
-        _mm256_storeu_si256(reinterpret_cast<__m256i*>(hit), _mm256_add_epi32(_mm256_set1_epi32(first), _mm256_cvtepu8_epi32(which)));
-        hit += __builtin_popcount(tiles & 255);
-    }
-    return hit;
 #else
     for (int k = 0; k < kBlock; ++k) {
         *hit = first + k;

@@ -152,8 +152,6 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     assert re.search(r"accepted from \S+, \d+% of 900 test positions: at most 10% of the accepted are", said)
     assert said.endswith("which fails in at most 10% of cases; threshold stored in a.ckpt")
     assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better - 1), *how)[1]
-    # Rows of one patch count as one, which the stored threshold did not do.
-    assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better), *how, 0.8)[1]
     # Fewer than alpha were bad, and a confidence was blamed; rows of patches that err together were too few.
     evidence.error[:] = np.where(np.arange(900) % 8 == 0, 10.0, 0.01)
     said = command.calibrate_and_store("", {}, {}, Guarantee(alpha=0.144), "auto", False, 2)[1]

@@ -17,7 +17,7 @@ import torch
 from rasters import GRIDS, origin, poses, random_scene, render
 from shim import INCLUDES, KEPT, SHIM, fingerprint, serving
 
-from gsparc.ops import SphereGrid, calls, cuda_library, freeze, make_plan, mean_weights, networks
+from gsparc.ops import SphereGrid, calls, cuda_library, freeze, make_plan, mean_weights
 from gsparc.ops.similarity import similarity_op
 
 REPLAY = Path(__file__).parent / "replay.cpp"
@@ -115,9 +115,6 @@ def everything(dtype: torch.dtype) -> None:
     images = torch.rand(2, 23, 40, generator=torch.Generator().manual_seed(0))
     for slope in (True, False):
         similarity_op(images, images.flip(0), [1 / 11] * 11, [1e-4, 9e-4], slope)
-    weights = [torch.ones(shape, requires_grad=True) for shape in ((9, 19, 24), (9, 24), (9, 24, 2), (9, 2))]
-    for samples in (1, 21):
-        networks.networks(torch.ones(samples, 19), *weights).sum().backward()
 
 
 def test_every_kernel_runs(where):

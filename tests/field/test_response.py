@@ -19,7 +19,7 @@ GRID = SphereGrid.hemisphere(8, 16)
 # ---- factored channels ----
 @pytest.mark.parametrize("tones", [2.4e9 + 1e6 * np.arange(7), 2.4e9 + 1e6 * np.array([0, 1, 2.5, 5])])
 def test_channels_are_steering_times_gain_times_delay(tones):
-    """Even combs by recurrence, uneven ones one by one; both are the sum written out."""
+    """Even combs and uneven ones are the sum written out."""
     lengths = torch.tensor([0.0, 3.0, 40.0])
     response = ChannelResponse(2, len(tones), torch.from_numpy(tones), lengths)
     with torch.no_grad():

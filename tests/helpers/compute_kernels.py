@@ -10,11 +10,9 @@ from torch import Tensor
 
 from gsparc.field.losses import _Kernel, _ssim_by_convolution
 from gsparc.ops import _native, backends
-from gsparc.ops.channels import channels, plain_channels
 from gsparc.ops.networks import networks, plain_networks
 
 backends.backend_named("cpu")  # the operators find its kernels
-TONES = (2.4e9, 312_500.0)
 SETS = pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
 
 
@@ -28,12 +26,6 @@ def layers(samples: int, count: int, inputs: int, hidden: int, outputs: int) -> 
     """Encoded positions, then weights and biases of networks."""
     shapes = (count, inputs, hidden), (count, hidden), (count, hidden, outputs), (count, outputs)
     return random((samples, inputs), *shapes)
-
-
-def sources(samples: int, count: int, antennas: int, subcarriers: int = 0) -> list[Tensor]:
-    """Gains, steering and delays of channels."""
-    gains, steering, delays = random((samples, count, 2), (count, antennas, 2), (count,))
-    return [gains, steering, 1e-7 * delays.abs()]
 
 
 def images(*shape: int) -> list[Tensor]:
@@ -61,14 +53,8 @@ class Kind:
     tolerance: dict[torch.dtype, tuple[float, float]]
 
     def cast(self, shape: tuple[int, ...], dtype: torch.dtype) -> list[Tensor]:
-        """Inputs in a precision; delays [s] stay in float64."""
-        tensors = self.inputs(*shape)
-        return [t if self.kernel is band and i == 2 else t.to(dtype) for i, t in enumerate(tensors)]
-
-
-def band(shape: tuple[int, ...], *inputs: Tensor) -> Tensor:
-    """Channels at `TONES`, by the kernel."""
-    return channels(*inputs, *TONES, shape[-1])
+        """Inputs in a precision."""
+        return [tensor.to(dtype) for tensor in self.inputs(*shape)]
 
 
 KINDS = {
@@ -78,11 +64,6 @@ KINDS = {
         ((1, 5, 3, 16, 2), (7, 70, 4, 16, 1), (3, 9, 6, 21, 2), (5, 2, 30, 32, 3), (2, 0, 3, 4, 1),
          (0, 3, 2, 5, 1), (5, 9, 33, 40, 1), (37, 9, 256, 32, 4)),
         {torch.float64: (1e-12, 1e-12), torch.float32: (2e-5, 2e-5)},
-    ),
-    "channels": Kind(
-        band, lambda shape, *inputs: plain_channels(*inputs, TONES, shape[-1]), sources, slice(None),
-        ((1, 37, 4, 26), (3, 5, 1, 1), (2, 18, 3, 70), (2, 0, 2, 3)),
-        {torch.float64: (1e-9, 1e-9), torch.float32: (1e-5, 1e-5)},
     ),
     "similarity": Kind(
         lambda shape, *pair: _Kernel.apply(*pair), lambda shape, *pair: _ssim_by_convolution(*pair), images,

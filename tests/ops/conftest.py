@@ -13,11 +13,11 @@ from gsparc.ops import cuda_library
 HERE = Path(__file__).parent
 ENGINES = ["cpu", "shim"] if cuda_library.missing_device() else ["cpu", "shim", "gpu"]
 OF_THE_CPU = {
-    *("test_operators", "test_at_once", "test_queries"),  # files
+    *("test_operators", "test_queries"),  # files
     "test_compute_kernels",  # tests/cuda/test_cuda.py has those of a GPU, in float32
     *("test_absent_backends_say_why", "test_every_instruction_set", "test_spans_cut_no_pixel_off"),
     "test_kernels_of_another_compiler_were_the_slowest_ones",
-    "test_networks_channels_and_similarity_have_forward_mode",  # in float64
+    "test_networks_and_similarity_have_forward_mode",  # in float64
     "test_thousands_are_ordered_alike_by_any_threads",
 }
 

@@ -1,4 +1,4 @@
-"""Kernels of networks, channels and the similarity against their definitions in PyTorch."""
+"""Kernels of networks and of the similarity against their definitions in PyTorch."""
 
 import pytest
 import torch
@@ -6,19 +6,16 @@ from compute_kernels import (
     KIND_SHAPES,
     KINDS,
     SETS,
-    TONES,
     assert_equals_reference,
     assert_threads_agree,
     evaluated,
     instruction_set,
     layers,
-    sources,
 )
 
-from gsparc.ops.channels import channels
 from gsparc.ops.networks import networks
 
-LARGE = {"networks": (6, 700, 3, 16, 2), "channels": (2, 301, 5, 26), "similarity": (5, 30, 50)}
+LARGE = {"networks": (6, 700, 3, 16, 2), "similarity": (5, 30, 50)}
 
 
 @SETS
@@ -52,16 +49,6 @@ def test_networks_strides():
     assert torch.equal(networks(encoded, wide, *rest), networks(encoded, weight1, *rest))
 
 
-def test_phase_after_ten_kilometres_at_60_ghz():
-    """10 km is two million turns: the recurrence starts from turns reduced in float64."""
-    gains, steering = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[1.0, 0.0]]])
-    delays = torch.tensor([1e4 / 299_792_458.0], dtype=torch.float64)
-    got = torch.view_as_complex(channels(gains, steering, delays, 60e9, 120e3, 512))[0, 0]
-    turns = (60e9 + 120e3 * torch.arange(512, dtype=torch.float64)) * delays
-    want = torch.polar(torch.ones(512, dtype=torch.float64), -2 * torch.pi * turns.frac())
-    assert (got - want).abs().max() < 1e-4
-
-
 @pytest.mark.parametrize(
     "part,shape",
     [(0, (2, 2)), (0, (2, 200)), (1, (4, 15)), (2, (0,)), (2, (4, 2)), (3, (2, 5, 2)), (3, (4, 3, 2)),
@@ -82,15 +69,3 @@ def test_network_dtypes_that_the_kernel_misread(part):
     tensors[part] = tensors[part].float()
     with pytest.raises(TypeError, match="encoded, weights and biases share a dtype"):
         networks(*tensors)
-
-
-def test_channels_refuse_what_does_not_fit():
-    gains, steering, delays = sources(1, 3, 2)
-    for given, count, error, message in (
-        ((gains, steering, delays.float()), 4, TypeError, "delays are float64"),
-        ((gains, steering, delays[:2]), 4, ValueError, "are needed"),
-        ((gains.half(), steering.half(), delays), 4, TypeError, "both float32 or both float64"),
-        ((gains, steering, delays), -1, ValueError, "-1 subcarriers are none"),
-    ):
-        with pytest.raises(error, match=message):
-            channels(*given, *TONES, count)

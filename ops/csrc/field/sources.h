@@ -82,8 +82,7 @@ private:
     // Tones of one comb, written from number `at` on of `width`.
     void sum(const float* place, double first, double step, int tones_wanted, int width, int at, float* values, Scratch scratch) const {
         const Memory own(*this, tones_wanted, scratch);
-        ChannelArgs<float> tuned;
-        tuned.subcarriers = tones_wanted, tuned.first = first, tuned.step = step;
+        const Comb tuned{tones_wanted, first, step};
         const int wide = padded_tones<float>(tones_wanted), places_each = antennas * still;
         for (int e = 0; e < places_each; ++e) {
             const double* shift = moving + 3 * (antennas > 1 ? e : 0);
