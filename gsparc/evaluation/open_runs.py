@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
@@ -123,10 +124,7 @@ def open_files(
     # Folds of two runs are of two splits: a test row of one may have taught the other.
     if len({one.extra.get("run_id") for one in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
-    # A class is imported only where the caller named it, never because a file does.
-    chosen_class = "_target_" in (dataset or {})
-    module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
-    data = align_to_site(module.measurements, stored[0].site)
+    data = align_to_site(module_of(stored[0], dataset).measurements, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
     # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
@@ -142,14 +140,37 @@ def open_files(
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
-def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> Measurements:
-    """Return the measurements of another file, read with the settings of a model's data, in its coordinates.
+def read_table_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measurements, bool]:
+    """Return the measurements of another table, read as a model's data were, in its coordinates.
+
+    Returns:
+        They, and whether the table has places; without, rows lie apart at arbitrary ones.
 
     Raises:
-        ValueError: the file, or the settings, cannot be read.
+        ValueError: the table, or the settings, cannot be read.
     """
-    module = datamodule(_settings("dataset", stored, {"file": str(path)}), trusted=False)
-    return align_to_site(module.measurements, stored.site)
+    from gsparc.data.tables.places import place_by_row  # here, as pandas takes half a second
+
+    before = stored.configuration.get("dataset") or {}
+    apart = place_by_row(path, before.get("columns") or {}, stored.site.moving_end)
+    settings = {"file": str(path)} | ({"columns": apart} if apart else {})
+    return align_to_site(module_of(stored, settings).measurements, stored.site), not apart
+
+
+def module_of(stored: checkpoint.Stored, dataset: Mapping[str, Any] | None) -> DataModule:
+    """Return what reads a model's data with settings that replace those stored; nothing is read yet.
+
+    Raises:
+        ValueError: a setting that its data do not have, or no name.
+    """
+    # A class is imported only where the caller named it, never because a file does.
+    return datamodule(_settings("dataset", stored, dataset), trusted="_target_" in (dataset or {}))
+
+
+def check_dataset(path: str | Path, dataset: Mapping[str, Any]) -> None:
+    """Raise ValueError for a setting that the data of a checkpoint do not have, before they are needed."""
+    if any(value is not None for value in dataset.values()):
+        module_of(checkpoint.read(path), dataset)
 
 
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -245,7 +266,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
     site = stored[0].site
     try:
         if data.site.sha256 != site.sha256:
-            data = datamodule(_settings("dataset", stored[0], None), trusted=False).measurements
+            data = module_of(stored[0], None).measurements
             # The file was changed or exchanged after training: its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None
@@ -336,8 +357,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
     number = np.empty(len(ours), np.int64)
     for t, name in enumerate(ours.name):
         near = np.linalg.norm(ours.position[t] + shift - theirs.position, axis=1) <= SAME_PLACE_M
-        if np.isnan(ours.position[t]).any():  # nobody knows where: by the name alone
-            near = np.isnan(theirs.position).any(axis=1) & (np.array(theirs.name) == name)
+        if np.isnan(ours.position[t]).any():  # the file does not say where: by the name alone
+            near = np.array(theirs.name) == name
         here = np.flatnonzero(near).tolist()
         # Sectors of one mast share a place: there the name decides.
         called = [i for i in here if theirs.name[i] == name]
@@ -347,8 +368,11 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
     if np.array_equal(number, np.arange(len(theirs))) and ours.name == theirs.name:
         return data
     assert data.station is not None
+    station = number[data.station]
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
-    return replace(data, station=number[data.station], site=facts)
+    end = "tx" if site.static_end == "tx" else "rx_position"
+    where, model = getattr(data, end), theirs.position[station] - shift
+    return replace(data, station=station, site=facts, **{end: np.where(np.isnan(where), model, where)})
 
 
 def _times(values: Any, factor: float) -> Any:

@@ -14,7 +14,7 @@ from gsparc.commands.locate import locate
 from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
 
-UNPLACED = {"x", "y", "z", "area_m2", "modes", "doubt"}
+UNPLACED = {"row", "x", "y", "z", "area_m2", "modes", "doubt"}
 PLACED = UNPLACED | {"x_true", "y_true", "z_true", "error_m", "inside"}
 
 

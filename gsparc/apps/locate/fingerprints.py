@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.apps.locate.judging import Localisation, sample_rows
+from gsparc.apps.locate.judging import Localisation, columns_of_places, sample_rows
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
 from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
@@ -50,7 +50,8 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
         "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
     }  # fmt: skip
     placed = bool(np.isfinite(heard.position).all())
-    return Localisation(METHOD, place, *both, np.zeros(3), placed, {}, None, each_ms, "", facts)
+    columns = columns_of_places(place, both[0].place if placed else None)
+    return Localisation(METHOD, place, *both, placed, columns, each_ms, "", facts)
 
 
 def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,13 +24,14 @@ from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
+from gsparc.data.executor import SAY_S
+from gsparc.data.links.georeference import Georeference
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
 from gsparc.data.tables import is_table
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, align_to_site, open_files, read_like_stored
-from gsparc.evaluation.scores import rows_to_score
+from gsparc.evaluation.open_runs import Opened, align_to_site, open_files, read_table_like_stored
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Table
 from gsparc.prediction.predictor import update_extra
@@ -37,6 +39,8 @@ from gsparc.prediction.predictor import update_extra
 log = logging.getLogger(__name__)
 
 SHOWN = 6  # snapshots, evenly over all
+ABOUT = {"area_m2": "area", "modes": "modes", "doubt": "doubt", "inside": "inside"}  # columns of `Located`
+TRUST_IS_OF = ("calibrate", "share", "prior", "plan", "plan_points", "phase_known", "offset_db")  # settings
 
 
 @dataclass(frozen=True)
@@ -47,10 +51,8 @@ class Localisation:
         method: name.
         places: (n, 3) [m, local], by it.
         heard, trained: what was located, and what was learned from.
-        origin: (3,) of local coordinates [m].
         placed: whether the places of `heard` are known.
-        about: further columns of `locate.csv`, n values each; `area_m2` where there are areas.
-        inside: (n,) whether true places lie in these areas; None where either is unknown.
+        columns: of `locate.csv`, n values each; `area_m2` where there are areas.
         each_ms: median milliseconds of a snapshot.
         promise: what the areas promise, in words.
         facts: for the summary.
@@ -60,22 +62,26 @@ class Localisation:
     places: np.ndarray
     heard: Snapshots
     trained: Snapshots
-    origin: np.ndarray
     placed: bool
-    about: dict[str, list[Any]]
-    inside: np.ndarray | None
+    columns: dict[str, list[Any]]
     each_ms: float
     promise: str
     facts: dict[str, Any]
 
-    def columns(self) -> dict[str, Any]:
-        """Return the columns of `locate.csv`, in the world's coordinates [m]."""
-        place, true = self.places, self.heard.place
-        columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
-        if self.placed:
-            columns |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
-            columns |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
-        return columns | self.about | ({} if self.inside is None else {"inside": (1 * self.inside).tolist()})
+
+def columns_of_places(
+    place: np.ndarray, true: np.ndarray | None, origin: Any = 0.0, earth: Georeference | None = None
+) -> dict[str, list[Any]]:
+    """Return columns of places (n, 3) [m, local] in the world's coordinates, and errors by `true` ones."""
+    world = place + origin
+    columns: dict[str, list[Any]] = dict(zip("xyz", world.T.tolist(), strict=True))
+    if earth is not None:
+        degrees = earth.to_degrees(world[:, :2]).T.round(8).tolist()
+        columns |= dict(zip(("latitude", "longitude"), degrees, strict=True))
+    if true is not None:
+        columns |= dict(zip(("x_true", "y_true", "z_true"), (true + origin).T.tolist(), strict=True))
+        columns["error_m"] = np.linalg.norm(place - true, axis=1).tolist()
+    return columns
 
 
 def report(
@@ -90,13 +96,13 @@ def report(
     """
     heard, facts = result.heard, dict(result.facts)
     places, stems = {result.method: result.places}, {result.method: "locate"}
-    write_samples(run_dir / "locate.csv", result.columns())
-    area = result.about.get("area_m2")
+    write_samples(run_dir / "locate.csv", result.columns)
+    area, inside = result.columns.get("area_m2"), result.columns.get("inside")
     facts |= {
         "locate/snapshots": len(heard), "time/locate_ms_p50": result.each_ms,
         "locate/area_m2": None if area is None else float(np.median(area)),
     }  # fmt: skip
-    doubts = _doubts(result, facts)
+    doubts = _doubts(result.columns, facts)
     if not result.placed:
         return facts, [], doubts
     for name in dict.fromkeys(against):
@@ -111,8 +117,8 @@ def report(
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
-    facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
-    if result.inside is None:
+    facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
+    if inside is None:
         return facts, shown, doubts
     sentence = (
         f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
@@ -121,27 +127,28 @@ def report(
     return facts, shown, [sentence, *doubts]
 
 
-def _doubts(result: Localisation, facts: dict[str, Any]) -> list[str]:
+def _doubts(columns: dict[str, list[Any]], facts: dict[str, Any]) -> list[str]:
     """A sentence on each doubt about areas; their counts go to `facts`."""
-    doubt, lines = np.array(result.about.get("doubt", []), str), []
+    doubt, lines = np.array(columns.get("doubt", []), str), []
     for key, why in locating.DOUBTS.items():
         facts[f"locate/{key}"] = count = int((doubt == why).sum())
         if count:
             of = f"{count} of {len(doubt)} snapshots"
             lines.append(f"{of}: {why}, where areas promise nothing (locate.csv, doubt)")
-    if lines and result.inside is not None and (sure := doubt == "").any():
-        lines.append(f"areas of the other {sure.sum()} hold {result.inside[sure].mean():.0%} of places")
+    if lines and "inside" in columns and (sure := doubt == "").any():
+        held = np.mean(np.array(columns["inside"])[sure])
+        lines.append(f"areas of the other {sure.sum()} hold {held:.0%} of places")
     return lines
 
 
 def locate_by_model(
     config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
 ) -> Localisation:
-    """Locate the test rows of a trained model, or those of a file.
+    """Locate the test rows of a trained model, or those of a file; `locate.csv` grows meanwhile.
 
     Args:
         config: see conf/locate.yaml.
-        run_dir: of trainings that learn how far the model is trusted.
+        run_dir: of `locate.csv`, and of trainings that learn how far the model is trusted.
         open_at: which of places (n, 2) [m, world] one can stand at; None: everywhere.
 
     Raises:
@@ -151,39 +158,66 @@ def locate_by_model(
     data, fold, method = run.data, run.split.folds[0], run.methods[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
+    how = {name: to_dict(config)[name] for name in TRUST_IS_OF}
+    stored = run.stored[0].extra.get(locating.KEY, {})
+    anew = config.calibrate and (config.renew or stored.get("how") != how)
     # What was learned earlier for other settings is refused: its areas would hold another share.
-    start = Trust() if config.calibrate else locating.restore_trust(run.stored[0].extra, unknown, share)
+    start = Trust() if anew else locating.restore_trust(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
-    east_north = data.site.origin[:2]
-    light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
+    origin, earth = data.site.origin, data.site.georeference
+    light = None if open_at is None else lambda places: open_at(places[:, :2] + origin[:2])
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
-    field, count = SiteField(run.predictor), 0
     box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
-    locator = Locator(field, box, wider, unknown, start, share)
-    if config.calibrate:
+    locator = Locator(SiteField(run.predictor), box, wider, unknown, start, share)
+    count = stored.get("count", 0)
+    if anew:
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
         if config.store:
-            update_extra(config.ckpt, locating.trust_state(trust, unknown, share))
-    located, trained, origin = locator.locate(heard), group_snapshots(data, learned), data.site.origin
-    own, level = "by the model's own variances, which nothing tested (calibrate=0)", locator.trust.level
-    own = "are promised" if config.calibrate or locating.KEY in run.stored[0].extra else own
-    promise = f"{locator.share:.0%} {own}; {float(locator.cells.volume.sum()):.3g} m2 were searched"
-    beyond = int(beyond_box(heard.place, locator.cells.box()).sum()) if placed else 0
+            update_extra(config.ckpt, locating.trust_state(trust, unknown, share, how=how, count=count))
+    elif config.calibrate:
+        log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
+
+    def columns(located: Sequence[Located]) -> dict[str, list[Any]]:
+        first = slice(len(located))
+        table = {} if heard.row is None else {"row": heard.row[first].tolist()}
+        true = heard.place[first] if placed else None
+        table |= columns_of_places(np.array([one.place for one in located]), true, origin, earth)
+        about = ABOUT if placed else {head: name for head, name in ABOUT.items() if head != "inside"}
+        return table | {head: [getattr(one, name) for one in located] for head, name in about.items()}
+
+    located = _written(locator.locate(heard), run_dir / "locate.csv", columns)
+    trained = group_snapshots(data, learned)
+    own = "by the model's own variances, which nothing tested (calibrate=0)"
+    own = "are promised" if config.calibrate or stored else own
+    promise = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
+    beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
     promise += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
-    pairs = zip(located, heard.place, strict=True)
-    inside = np.array([one.posterior.mass_above(at) <= level for one, at in pairs]) if placed else None
-    places = np.array([one.place for one in located])
-    about = dict[str, list[Any]](area_m2=[at.area for at in located], modes=[at.modes for at in located])
-    about["doubt"] = [at.doubt for at in located]
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
-    facts = {**run.facts(), "locate/calibrated_on": count}
-    known = method.name, places, heard, trained, origin, placed, about
-    return Localisation(*known, inside, each_ms, promise, facts)
+    facts, places = {**run.facts(), "locate/calibrated_on": count}, np.array([one.place for one in located])
+    known = method.name, places, heard, trained, placed, columns(located)
+    return Localisation(*known, each_ms, promise, facts)
+
+
+def _written(
+    found: Iterable[Located], path: Path, columns: Callable[[Sequence[Located]], dict[str, list[Any]]]
+) -> list[Located]:
+    """What was located, written as it comes: nothing is lost where it is interrupted."""
+    located, written = list[Located](), time.monotonic()
+    try:
+        for one in found:
+            located.append(one)
+            if time.monotonic() - written > SAY_S:
+                write_samples(path, columns(located))
+                written = time.monotonic()
+    finally:
+        if located:
+            write_samples(path, columns(located))
+    return located
 
 
 def _trust(
@@ -201,12 +235,15 @@ def _trust(
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
-    """The snapshots, and whether their places are known."""
-    site, placed = run.data.site, True
+    """The snapshots, NaN for unknown places, and whether these are known."""
+    site, placed, rows = run.data.site, True, None
     if config.data is None:
-        data, rows = run.data, rows_to_score(run.split.folds[0], config.eval_on)
+        data, rows = run.data, getattr(run.split.folds[0], config.eval_on)
+        if not len(rows):
+            which = f"eval_on={config.eval_on}: the split has no {config.eval_on} rows"
+            raise DataError(f"{which}; say data=FILE of what is to be located, or eval_on=train")
     elif is_table(config.data):
-        data = read_like_stored(run.stored[0], config.data)
+        data, placed = read_table_like_stored(run.stored[0], config.data)
     else:
         raw, place = read_raw(config.data), f"{site.moving_end}_position"
         placed = place in raw.arrays
@@ -216,7 +253,8 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
             # Any places will do, as rows must have some; a diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
         data = align_to_site(interpret_and_log(raw, config.data), site)
-    heard = group_snapshots(data, rows if config.data is None else np.arange(len(data)))
+    heard = group_snapshots(data, np.arange(len(data)) if rows is None else rows)
+    heard = heard if placed else replace(heard, place=np.full_like(heard.place, np.nan))
     return heard.subset(sample_rows(config, len(heard))), placed
 
 

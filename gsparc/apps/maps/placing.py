@@ -145,8 +145,11 @@ def place_station(
         raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
     antenna = antenna or Antenna()
-    still, heights = site.stations.position + site.origin, site.stations.position[:, 2] + site.origin[2]
-    height = float(np.median(heights)) if station_height_m is None else float(station_height_m)
+    still = site.stations.position + site.origin
+    known = still[np.isfinite(still[:, 2]), 2]
+    if station_height_m is None and not len(known):
+        raise DataError("station_height_m: no station's height is known; say station_height_m=METRES")
+    height = float(np.median(known) if station_height_m is None else station_height_m)
     candidates, given = _candidates(grid, sites, predictor, height, count)
     cells = grid.places()
     try:
