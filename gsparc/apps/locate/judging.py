@@ -76,7 +76,7 @@ def columns_of_places(
     world = place + origin
     columns: dict[str, list[Any]] = dict(zip("xyz", world.T.tolist(), strict=True))
     if earth is not None:
-        degrees = earth.to_degrees(world[:, :2]).T.round(8).tolist()
+        degrees = np.round(earth.to_degrees(world[:, :2]), 8).tolist()
         columns |= dict(zip(("latitude", "longitude"), degrees, strict=True))
     if true is not None:
         columns |= dict(zip(("x_true", "y_true", "z_true"), (true + origin).T.tolist(), strict=True))
