@@ -14,8 +14,11 @@ from scipy.spatial import cKDTree
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, split_for
+from gsparc.data.own import interpret_and_log
+from gsparc.data.raw import read_raw
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.data.tables import is_table
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.folds import effort_settings
@@ -140,21 +143,30 @@ def open_files(
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
-def read_table_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measurements, bool]:
-    """Return the measurements of another table, read as a model's data were, in its coordinates.
+def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measurements, bool]:
+    """Return the measurements of another file, read as a model's data were, in its coordinates.
 
     Returns:
-        They, and whether the table has places; without, rows lie apart at arbitrary ones.
+        They, and whether the file has places; without, rows lie apart at arbitrary ones.
 
     Raises:
-        ValueError: the table, or the settings, cannot be read.
+        ValueError: the file, or the settings, cannot be read.
     """
+    site = stored.site
+    if not is_table(path):
+        raw, place = read_raw(path), f"{site.moving_end}_position"
+        placed = place in raw.arrays
+        if not placed:
+            count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
+            # A diagonal, so that no two are one.
+            raw.arrays[place] = np.linspace(*(site.moving_box + site.origin), count)
+        return align_to_site(interpret_and_log(raw, path), site), placed
     from gsparc.data.tables.places import place_by_row  # here, as pandas takes half a second
 
     before = stored.configuration.get("dataset") or {}
-    apart = place_by_row(path, before.get("columns") or {}, stored.site.moving_end)
+    apart = place_by_row(path, before.get("columns") or {}, site.moving_end)
     settings = {"file": str(path)} | ({"columns": apart} if apart else {})
-    return align_to_site(module_of(stored, settings).measurements, stored.site), not apart
+    return align_to_site(module_of(stored, settings).measurements, site), not apart
 
 
 def module_of(stored: checkpoint.Stored, dataset: Mapping[str, Any] | None) -> DataModule:

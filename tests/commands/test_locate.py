@@ -10,9 +10,9 @@ import towns
 from campaigns import compose, powers, spectra
 from PIL import Image
 
-from gsparc.apps.locate import judging
 from gsparc.commands.locate import locate
 from gsparc.data.errors import DataError
+from gsparc.evaluation.summary import write_as_found
 from gsparc.models import checkpoint
 
 UNPLACED = {"row", "x", "y", "z", "area_m2", "modes", "doubt"}
@@ -157,7 +157,7 @@ def test_ctrl_c_lost_all_that_was_located(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        judging._written(found(), tmp_path / "locate.csv", lambda some: {"x": some})
+        write_as_found(found(), tmp_path / "locate.csv", lambda some: {"x": some})
     assert (tmp_path / "locate.csv").read_text().split() == ["x", "0", "1", "2"]
 
 

@@ -50,8 +50,8 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
         "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
     }  # fmt: skip
     placed = bool(np.isfinite(heard.position).all())
-    columns = columns_of_places(place, both[0].place if placed else None)
-    return Localisation(METHOD, place, *both, placed, columns, each_ms, "", facts)
+    columns = columns_of_places(place, heard.position if placed else None)
+    return Localisation(METHOD, *both, placed, columns, each_ms, "", facts)
 
 
 def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,17 +23,12 @@ from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
-from gsparc.data.executor import SAY_S
-from gsparc.data.links.georeference import Georeference
-from gsparc.data.own import interpret_and_log
-from gsparc.data.raw import read_raw
-from gsparc.data.tables import is_table
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, align_to_site, open_files, read_table_like_stored
-from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
+from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Table
-from gsparc.prediction.predictor import update_extra
+from gsparc.prediction.predictor import Predictor, update_extra
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +43,6 @@ class Localisation:
 
     Attributes:
         method: name.
-        places: (n, 3) [m, local], by it.
         heard, trained: what was located, and what was learned from.
         placed: whether the places of `heard` are known.
         columns: of `locate.csv`, n values each; `area_m2` where there are areas.
@@ -59,29 +52,24 @@ class Localisation:
     """
 
     method: str
-    places: np.ndarray
     heard: Snapshots
     trained: Snapshots
     placed: bool
-    columns: dict[str, list[Any]]
+    columns: dict[str, Any]
     each_ms: float
     promise: str
     facts: dict[str, Any]
 
 
 def columns_of_places(
-    place: np.ndarray, true: np.ndarray | None, origin: Any = 0.0, earth: Georeference | None = None
-) -> dict[str, list[Any]]:
-    """Return columns of places (n, 3) [m, local] in the world's coordinates, and errors by `true` ones."""
-    world = place + origin
-    columns: dict[str, list[Any]] = dict(zip("xyz", world.T.tolist(), strict=True))
-    if earth is not None:
-        degrees = np.round(earth.to_degrees(world[:, :2]), 8).tolist()
-        columns |= dict(zip(("latitude", "longitude"), degrees, strict=True))
-    if true is not None:
-        columns |= dict(zip(("x_true", "y_true", "z_true"), (true + origin).T.tolist(), strict=True))
-        columns["error_m"] = np.linalg.norm(place - true, axis=1).tolist()
-    return columns
+    world: np.ndarray, true: np.ndarray | None, predictor: Predictor | None = None
+) -> dict[str, Any]:
+    """Return columns of world places (n, 3) [m], and errors where `true` ones are known."""
+    columns = coordinates(world, predictor)
+    if true is None:
+        return columns
+    columns |= {f"{axis}_true": values for axis, values in coordinates(true, None).items()}
+    return columns | {"error_m": np.linalg.norm(world - true, axis=1)}
 
 
 def report(
@@ -95,7 +83,7 @@ def report(
         run_dir: where the file goes.
     """
     heard, facts = result.heard, dict(result.facts)
-    places, stems = {result.method: result.places}, {result.method: "locate"}
+    errors, stems = {result.method: result.columns.get("error_m")}, {result.method: "locate"}
     write_samples(run_dir / "locate.csv", result.columns)
     area, inside = result.columns.get("area_m2"), result.columns.get("inside")
     facts |= {
@@ -106,13 +94,14 @@ def report(
     if not result.placed:
         return facts, [], doubts
     for name in dict.fromkeys(against):
-        if name not in places:
+        if name not in errors:
             stems[name] = stem = f"baseline/{name}"
-            beside = locate_by_neighbours(name, result.trained, heard)
-            places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
+            place, *seconds = locate_by_neighbours(name, result.trained, heard)
+            facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = seconds
+            errors[name] = np.linalg.norm(place - heard.place, axis=1)
     rows = []
-    for name, place in places.items():
-        median, p90 = np.quantile(np.linalg.norm(place - heard.place, axis=1), [0.5, 0.9]).tolist()
+    for name, error in errors.items():
+        median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
         facts |= {f"{stems[name]}/median_m": median, f"{stems[name]}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
@@ -127,7 +116,7 @@ def report(
     return facts, shown, [sentence, *doubts]
 
 
-def _doubts(columns: dict[str, list[Any]], facts: dict[str, Any]) -> list[str]:
+def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
     """A sentence on each doubt about areas; their counts go to `facts`."""
     doubt, lines = np.array(columns.get("doubt", []), str), []
     for key, why in locating.DOUBTS.items():
@@ -155,7 +144,7 @@ def locate_by_model(
         ValueError: the model states no variance, or does not name its settings.
     """
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
-    data, fold, method = run.data, run.split.folds[0], run.methods[0]
+    data, fold = run.data, run.split.folds[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
     how = {name: to_dict(config)[name] for name in TRUST_IS_OF}
@@ -164,7 +153,7 @@ def locate_by_model(
     # What was learned earlier for other settings is refused: its areas would hold another share.
     start = Trust() if anew else locating.restore_trust(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
-    origin, earth = data.site.origin, data.site.georeference
+    origin = data.site.origin
     light = None if open_at is None else lambda places: open_at(places[:, :2] + origin[:2])
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
@@ -179,15 +168,15 @@ def locate_by_model(
     elif config.calibrate:
         log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
 
-    def columns(located: Sequence[Located]) -> dict[str, list[Any]]:
+    def columns(located: Sequence[Located]) -> dict[str, Any]:
         first = slice(len(located))
-        table = {} if heard.row is None else {"row": heard.row[first].tolist()}
-        true = heard.place[first] if placed else None
-        table |= columns_of_places(np.array([one.place for one in located]), true, origin, earth)
+        table = {} if heard.row is None else {"row": heard.row[first]}
+        world = np.array([one.place for one in located]) + origin
+        table |= columns_of_places(world, heard.place[first] + origin if placed else None, run.predictor)
         about = ABOUT if placed else {head: name for head, name in ABOUT.items() if head != "inside"}
         return table | {head: [getattr(one, name) for one in located] for head, name in about.items()}
 
-    located = _written(locator.locate(heard), run_dir / "locate.csv", columns)
+    located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
     own = "by the model's own variances, which nothing tested (calibrate=0)"
     own = "are promised" if config.calibrate or stored else own
@@ -198,26 +187,8 @@ def locate_by_model(
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
-    facts, places = {**run.facts(), "locate/calibrated_on": count}, np.array([one.place for one in located])
-    known = method.name, places, heard, trained, placed, columns(located)
-    return Localisation(*known, each_ms, promise, facts)
-
-
-def _written(
-    found: Iterable[Located], path: Path, columns: Callable[[Sequence[Located]], dict[str, list[Any]]]
-) -> list[Located]:
-    """What was located, written as it comes: nothing is lost where it is interrupted."""
-    located, written = list[Located](), time.monotonic()
-    try:
-        for one in found:
-            located.append(one)
-            if time.monotonic() - written > SAY_S:
-                write_samples(path, columns(located))
-                written = time.monotonic()
-    finally:
-        if located:
-            write_samples(path, columns(located))
-    return located
+    known = run.methods[0].name, heard, trained, placed, columns(located), each_ms, promise
+    return Localisation(*known, {**run.facts(), "locate/calibrated_on": count})
 
 
 def _trust(
@@ -236,23 +207,14 @@ def _trust(
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     """The snapshots, NaN for unknown places, and whether these are known."""
-    site, placed, rows = run.data.site, True, None
+    placed, rows = True, None
     if config.data is None:
         data, rows = run.data, getattr(run.split.folds[0], config.eval_on)
         if not len(rows):
             which = f"eval_on={config.eval_on}: the split has no {config.eval_on} rows"
             raise DataError(f"{which}; say data=FILE of what is to be located, or eval_on=train")
-    elif is_table(config.data):
-        data, placed = read_table_like_stored(run.stored[0], config.data)
     else:
-        raw, place = read_raw(config.data), f"{site.moving_end}_position"
-        placed = place in raw.arrays
-        if not placed:  # anywhere: nothing is compared with it
-            count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
-            low, high = site.moving_box + site.origin
-            # Any places will do, as rows must have some; a diagonal, so that no two are one.
-            raw.arrays[place] = np.linspace(low, high, count)
-        data = align_to_site(interpret_and_log(raw, config.data), site)
+        data, placed = read_like_stored(run.stored[0], config.data)
     heard = group_snapshots(data, np.arange(len(data)) if rows is None else rows)
     heard = heard if placed else replace(heard, place=np.full_like(heard.place, np.nan))
     return heard.subset(sample_rows(config, len(heard))), placed
