@@ -44,9 +44,7 @@ class Localisation:
     Attributes:
         method: name.
         heard, trained: what was located, and what was learned from.
-        placed: whether the places of `heard` are known.
-        columns: of `locate.csv`, n values each; `area_m2` where there are areas.
-        each_ms: median milliseconds of a snapshot.
+        columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
         promise: what the areas promise, in words.
         facts: for the summary.
     """
@@ -54,9 +52,7 @@ class Localisation:
     method: str
     heard: Snapshots
     trained: Snapshots
-    placed: bool
     columns: dict[str, Any]
-    each_ms: float
     promise: str
     facts: dict[str, Any]
 
@@ -83,26 +79,23 @@ def report(
         run_dir: where the file goes.
     """
     heard, facts = result.heard, dict(result.facts)
-    errors, stems = {result.method: result.columns.get("error_m")}, {result.method: "locate"}
     write_samples(run_dir / "locate.csv", result.columns)
     area, inside = result.columns.get("area_m2"), result.columns.get("inside")
-    facts |= {
-        "locate/snapshots": len(heard), "time/locate_ms_p50": result.each_ms,
-        "locate/area_m2": None if area is None else float(np.median(area)),
-    }  # fmt: skip
+    facts["locate/snapshots"] = len(heard)
+    facts["locate/area_m2"] = None if area is None else float(np.median(area))
     doubts = _doubts(result.columns, facts)
-    if not result.placed:
+    if "error_m" not in result.columns:
         return facts, [], doubts
-    for name in dict.fromkeys(against):
-        if name not in errors:
-            stems[name] = stem = f"baseline/{name}"
+    rows = []
+    for name in dict.fromkeys([result.method, *against]):
+        stem, error = "locate", result.columns["error_m"]
+        if name != result.method:
+            stem = f"baseline/{name}"
             place, *seconds = locate_by_neighbours(name, result.trained, heard)
             facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = seconds
-            errors[name] = np.linalg.norm(place - heard.place, axis=1)
-    rows = []
-    for name, error in errors.items():
+            error = np.linalg.norm(place - heard.place, axis=1)
         median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
-        facts |= {f"{stems[name]}/median_m": median, f"{stems[name]}/p90_m": p90}
+        facts |= {f"{stem}/median_m": median, f"{stem}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
@@ -111,7 +104,7 @@ def report(
         return facts, shown, doubts
     sentence = (
         f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
-        f"{result.promise}; {result.each_ms:.3g} ms a snapshot"
+        f"{result.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
     )
     return facts, shown, [sentence, *doubts]
 
@@ -187,8 +180,8 @@ def locate_by_model(
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
-    known = run.methods[0].name, heard, trained, placed, columns(located), each_ms, promise
-    return Localisation(*known, {**run.facts(), "locate/calibrated_on": count})
+    facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
+    return Localisation(run.methods[0].name, heard, trained, columns(located), promise, facts)
 
 
 def _trust(
