@@ -158,8 +158,9 @@ def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measu
         placed = place in raw.arrays
         if not placed:
             count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
+            low, high = site.moving_box + site.origin
             # A diagonal, so that no two are one.
-            raw.arrays[place] = np.linspace(*(site.moving_box + site.origin), count)
+            raw.arrays[place] = np.linspace(low, high, count)
         return align_to_site(interpret_and_log(raw, path), site), placed
     from gsparc.data.tables.places import place_by_row  # here, as pandas takes half a second
 
