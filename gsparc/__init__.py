@@ -33,6 +33,10 @@ __all__ = ["Pose", "Predictor", "SphereGrid", "fit", "load"]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("gsparc")
     if name not in _PUBLIC:
         raise AttributeError(f"module 'gsparc' has no attribute {name!r}")
     return getattr(import_module(_PUBLIC[name]), name)

@@ -278,6 +278,7 @@ def test_a_wheel_installed_elsewhere_trains(tmp_path):
     assert (home / "run" / "summary.json").exists()
     code = """
 import gsparc, gsparc.ops, gsparc.conf
+assert gsparc.__version__[0].isdigit()
 print(gsparc.__file__, gsparc.ops.__file__, *gsparc.conf.__path__)
 print(*gsparc.load("run/model.ckpt").spectrum(tx=[[0, -0.1, 0.1 * i] for i in range(5)]).shape)"""
     where, shape = say("-c", code).splitlines()
