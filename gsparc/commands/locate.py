@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.locate.fingerprints import locate_fingerprints
-from gsparc.apps.locate.judging import locate_by_model, report
+from gsparc.apps.locate.judging import locate_by_model
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.commands.shared.output import finish_run, run_directory
@@ -34,9 +34,9 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     for name in config.against:
         choice(*PLAIN).check("against", name)
     if config.dataset.name == "fingerprints":
-        localisation = locate_fingerprints(config)
+        facts, tables, lines = locate_fingerprints(config, run_dir)
     else:
         plan = read_plan_settings(to_dict(config))
-        localisation = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
-    facts, tables, lines = report(localisation, config.against, run_dir)
+        open_at = None if plan is None else plan.is_open
+        facts, tables, lines = locate_by_model(config, run_dir, open_at)
     return finish_run(run_dir, facts, *tables, lines=lines)

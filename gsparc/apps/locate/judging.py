@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,66 +32,51 @@ from gsparc.prediction.predictor import Predictor, update_extra
 
 log = logging.getLogger(__name__)
 
+Report = tuple[dict[str, Any], list[Table], list[str]]  # facts, tables and sentences
 SHOWN = 6  # snapshots, evenly over all
 ABOUT = {"area_m2": "area", "modes": "modes", "doubt": "doubt", "inside": "inside"}  # columns of `Located`
 TRUST_IS_OF = ("calibrate", "share", "prior", "plan", "plan_points", "phase_known", "offset_db")  # settings
 
 
-@dataclass(frozen=True)
-class Localisation:
-    """Snapshots, and where each was heard.
-
-    Attributes:
-        method: name.
-        heard, trained: what was located, and what was learned from.
-        columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
-        promise: what the areas promise, in words.
-        facts: for the summary.
-    """
-
-    method: str
-    heard: Snapshots
-    trained: Snapshots
-    columns: dict[str, Any]
-    promise: str
-    facts: dict[str, Any]
-
-
 def columns_of_places(
-    world: np.ndarray, true: np.ndarray | None, predictor: Predictor | None = None
+    world: np.ndarray, true: np.ndarray, predictor: Predictor | None = None
 ) -> dict[str, Any]:
-    """Return columns of world places (n, 3) [m], and errors where `true` ones are known."""
+    """Return columns of world places (n, 3) [m], and errors where `true` ones are not NaN."""
     columns = coordinates(world, predictor)
-    if true is None:
+    if np.isnan(true).any():
         return columns
     columns |= {f"{axis}_true": values for axis, values in coordinates(true, None).items()}
     return columns | {"error_m": np.linalg.norm(world - true, axis=1)}
 
 
 def report(
-    result: Localisation, against: Sequence[str], run_dir: Path
-) -> tuple[dict[str, Any], list[Table], list[str]]:
+    run_dir: Path, against: Sequence[str], method: str, heard: Snapshots, trained: Snapshots,
+    columns: dict[str, Any], facts: dict[str, Any], promise: str = "",
+) -> Report:  # fmt: skip
     """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
 
     Args:
-        result: what was located.
-        against: names of plain methods beside it.
         run_dir: where the file goes.
+        against: names of plain methods beside it.
+        method: name.
+        heard, trained: what was located, and what was learned from.
+        columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
+        facts: for the summary, with the milliseconds of a snapshot.
+        promise: what the areas promise, in words.
     """
-    heard, facts = result.heard, dict(result.facts)
-    write_samples(run_dir / "locate.csv", result.columns)
-    area, inside = result.columns.get("area_m2"), result.columns.get("inside")
+    write_samples(run_dir / "locate.csv", columns)
+    area, inside = columns.get("area_m2"), columns.get("inside")
     facts["locate/snapshots"] = len(heard)
     facts["locate/area_m2"] = None if area is None else float(np.median(area))
-    doubts = _doubts(result.columns, facts)
-    if "error_m" not in result.columns:
+    doubts = _doubts(columns, facts)
+    if "error_m" not in columns:
         return facts, [], doubts
     rows = []
-    for name in dict.fromkeys([result.method, *against]):
-        stem, error = "locate", result.columns["error_m"]
-        if name != result.method:
+    for name in dict.fromkeys([method, *against]):
+        stem, error = "locate", columns["error_m"]
+        if name != method:
             stem = f"baseline/{name}"
-            place, *seconds = locate_by_neighbours(name, result.trained, heard)
+            place, *seconds = locate_by_neighbours(name, trained, heard)
             facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = seconds
             error = np.linalg.norm(place - heard.place, axis=1)
         median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
@@ -100,13 +85,10 @@ def report(
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
-    if inside is None:
-        return facts, shown, doubts
-    sentence = (
-        f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
-        f"{result.promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot"
-    )
-    return facts, shown, [sentence, *doubts]
+    if inside is not None:
+        areas = f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places"
+        doubts.insert(0, f"{areas}, {promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot")
+    return facts, shown, doubts
 
 
 def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
@@ -125,8 +107,8 @@ def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
 
 def locate_by_model(
     config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
-) -> Localisation:
-    """Locate the test rows of a trained model, or those of a file; `locate.csv` grows meanwhile.
+) -> Report:
+    """Locate and report on the test rows of a trained model, or those of a file.
 
     Args:
         config: see conf/locate.yaml.
@@ -165,7 +147,7 @@ def locate_by_model(
         first = slice(len(located))
         table = {} if heard.row is None else {"row": heard.row[first]}
         world = np.array([one.place for one in located]) + origin
-        table |= columns_of_places(world, heard.place[first] + origin if placed else None, run.predictor)
+        table |= columns_of_places(world, heard.place[first] + origin, run.predictor)
         about = ABOUT if placed else {head: name for head, name in ABOUT.items() if head != "inside"}
         return table | {head: [getattr(one, name) for one in located] for head, name in about.items()}
 
@@ -181,7 +163,8 @@ def locate_by_model(
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
-    return Localisation(run.methods[0].name, heard, trained, columns(located), promise, facts)
+    result = run.methods[0].name, heard, trained, columns(located), facts, promise
+    return report(run_dir, config.against, *result)
 
 
 def _trust(

@@ -14,7 +14,7 @@ from gsparc.apps.maps import levels
 from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import station_numbers
 from gsparc.data.schema import End, Measurements, Site
-from gsparc.evaluation.open_runs import align_to_site, check_dataset, open_files
+from gsparc.evaluation.open_runs import align_to_site, open_files
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 
@@ -128,7 +128,6 @@ def open_model(
     """
     notes: list[str] = []
     data = None
-    check_dataset(path, dataset or {})  # what is wrong below is a note alone
     try:
         run = open_files([path], dataset)
         predictor, data = run.predictor, run.data
