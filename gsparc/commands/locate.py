@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.locate.fingerprints import locate_fingerprints
-from gsparc.apps.locate.judging import locate_by_model, report
+from gsparc.apps.locate.judging import locate_by_model
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.commands.shared.output import finish_run, run_directory
@@ -18,6 +18,7 @@ from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number,
 LIMITS = {
     "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)),
     "calibrate": whole(0), "calibrate_s": POSITIVE, "rows": or_null(whole(1)), "phase_known": switch(),
+    "renew": switch(),
 }  # fmt: skip
 
 
@@ -33,9 +34,9 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
     for name in config.against:
         choice(*PLAIN).check("against", name)
     if config.dataset.name == "fingerprints":
-        localisation = locate_fingerprints(config)
+        facts, tables, lines = locate_fingerprints(config, run_dir)
     else:
         plan = read_plan_settings(to_dict(config))
-        localisation = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
-    facts, tables, lines = report(localisation, config.against, run_dir)
+        open_at = None if plan is None else plan.is_open
+        facts, tables, lines = locate_by_model(config, run_dir, open_at)
     return finish_run(run_dir, facts, *tables, lines=lines)

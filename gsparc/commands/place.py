@@ -10,9 +10,9 @@ from omegaconf import DictConfig
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promised import read_or_gather, reopen_training
-from gsparc.commands.shared.output import coordinates, finish_run, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.prediction.operating_point import load

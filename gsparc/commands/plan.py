@@ -13,9 +13,9 @@ from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promised import read_or_gather
 from gsparc.commands.map import settings_of, stations_of
-from gsparc.commands.shared.output import coordinates, finish_run, run_directory
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import to_dict
-from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.prediction.operating_point import load
 
 

@@ -20,6 +20,7 @@ from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import whole
+from gsparc.evaluation.open_runs import check_dataset
 from gsparc.prediction.timing import peak_memory
 
 log = logging.getLogger(__name__)
@@ -58,6 +59,7 @@ def check(save: Path | None, port: int) -> None:
 def view_of(settings: dict[str, Any]) -> SiteView:
     """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
     plan = read_plan_settings(settings)
+    check_dataset(settings["ckpt"], settings["dataset"])  # what else is wrong with data is a note alone
     viewed = open_model(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     at, other = (None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end"))
     return SiteView(viewed, plan, lay_power_plane(viewed, settings, plan), at, other)

@@ -11,11 +11,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, list_first
 from gsparc.data.links.stations import all_names
 from gsparc.data.load import datamodule, split_for
+from gsparc.data.own import interpret_and_log
+from gsparc.data.raw import read_raw
 from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.data.tables import is_table
 from gsparc.data.units import WATTS
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.folds import effort_settings
@@ -124,9 +128,7 @@ def open_files(
     # Folds of two runs are of two splits: a test row of one may have taught the other.
     if len({one.extra.get("run_id") for one in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
-    # A class is imported only where the caller named it, never because a file does.
-    own = _read(stored[0], dataset, trusted="_target_" in (dataset or {}))
-    data = align_to_site(own, stored[0].site)
+    data = align_to_site(module_of(stored[0], dataset).measurements, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
     # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
@@ -142,22 +144,51 @@ def open_files(
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
-def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> Measurements:
-    """Return the measurements of another file, read with the settings of a model's data, in its coordinates.
+def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measurements, bool]:
+    """Return the measurements of another file, read as a model's data were, in its coordinates.
+
+    Returns:
+        They, and whether the file has places; without, rows lie apart at arbitrary ones.
 
     Raises:
         ValueError: the file, or the settings, cannot be read.
     """
-    return align_to_site(_read(stored, {"file": str(path)}), stored.site)
+    site = stored.site
+    if not is_table(path):
+        raw, place = read_raw(path), f"{site.moving_end}_position"
+        placed = place in raw.arrays
+        if not placed:
+            count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
+            low, high = site.moving_box + site.origin
+            # A diagonal, so that no two are one.
+            raw.arrays[place] = np.linspace(low, high, count)
+        return align_to_site(interpret_and_log(raw, path), site), placed
+    from gsparc.data.tables.places import place_by_row  # here, as pandas takes half a second
+
+    before = stored.configuration.get("dataset") or {}
+    apart = place_by_row(path, before.get("columns") or {}, site.moving_end)
+    settings = {"file": str(path)} | ({"columns": apart} if apart else {})
+    return align_to_site(module_of(stored, settings).measurements, site), not apart
 
 
-def _read(
-    stored: checkpoint.Stored, overrides: Mapping[str, Any] | None = None, trusted: bool = False
-) -> Measurements:
-    """The measurements that `_settings` name; how they are read is said unless training said it."""
-    module = datamodule(_settings("dataset", stored, overrides), trusted=trusted)
+def module_of(stored: checkpoint.Stored, dataset: Mapping[str, Any] | None) -> DataModule:
+    """Return what reads a model's data with settings that replace those stored; nothing is read yet.
+
+    How they are read is said unless training said it.
+
+    Raises:
+        ValueError: a setting that its data do not have, or no name.
+    """
+    # A class is imported only where the caller named it, never because a file does.
+    module = datamodule(_settings("dataset", stored, dataset), trusted="_target_" in (dataset or {}))
     module.told = stored.extra.get("read_notes", ())
-    return module.measurements
+    return module
+
+
+def check_dataset(path: str | Path, dataset: Mapping[str, Any]) -> None:
+    """Raise ValueError for a setting that the data of a checkpoint do not have, before they are needed."""
+    if any(value is not None for value in dataset.values()):
+        module_of(checkpoint.read(path), dataset)
 
 
 def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -253,7 +284,7 @@ def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[M
     site = stored[0].site
     try:
         if data.site.sha256 != site.sha256:
-            data = _read(stored[0])
+            data = module_of(stored[0], None).measurements
             # The file was changed or exchanged after training: its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None

@@ -7,16 +7,19 @@ import math
 import platform
 import re
 import subprocess
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
+import numpy as np
 import pandas as pd
 
+from gsparc.data.executor import SAY_S
 from gsparc.data.files import write_whole
 from gsparc.evaluation.metric_formats import (
     BEST_SERVER,
@@ -32,8 +35,10 @@ from gsparc.evaluation.metric_formats import (
 from gsparc.evaluation.paired import Lead
 from gsparc.evaluation.results import facts_under, result_rows, row_of_method
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
+from gsparc.prediction.predictor import Predictor
 from gsparc.training.cost import LINE
 
+_Found = TypeVar("_Found")
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
@@ -72,6 +77,33 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
     # object: pandas would write whole numbers beside empty cells as 3.0.
     frame = pd.DataFrame(columns, dtype=object)
     write_whole(path, frame.to_csv(index=False, lineterminator="\n"))
+
+
+def write_as_found(
+    found: Iterable[_Found], path: Path, columns: Callable[[list[_Found]], Any]
+) -> list[_Found]:
+    """Return all that is found; its columns are written meanwhile, so that an interrupt loses nothing."""
+    so_far, written = list[_Found](), time.monotonic()
+    try:
+        for one in found:
+            so_far.append(one)
+            if time.monotonic() - written > SAY_S:
+                write_samples(path, columns(so_far))
+                written = time.monotonic()
+    finally:
+        if so_far:
+            write_samples(path, columns(so_far))
+    return so_far
+
+
+def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:
+    """Return columns of places (n, 3) [m], in degrees, too, where the model knows its place on Earth."""
+    # Tenths of a millimetre here, about a millimetre in 1e-8 degrees.
+    columns = dict(zip(("x", "y", "z"), places.T.round(4), strict=True))
+    if predictor is not None and predictor.site.georeference is not None and len(places):
+        latitude, longitude, _ = predictor.degrees(places)
+        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
+    return columns
 
 
 def new_run_id() -> str:

@@ -30,6 +30,10 @@ REFUSED = [
     (f"{MAP} plan_points=[[0,0,0,0],[1,1,1,1]]", "goes with an image"),
     (f"{MAP} promise.share=1.5", "share=1.5"),
     (f"{MAP} dataset.file=gone.npz renew=true", "gone.npz"),
+    # As of all nine that open data: settings beside name, root and file were refused, and unknown ones are.
+    (f"{MAP} dataset.nonsense=1 promised=false", "dataset.nonsense: no such setting of dataset=own"),
+    ("view ckpt={town} save=page.html dataset.nonsense=1", "dataset.nonsense: no such setting"),
+    ("calibrate ckpt={town} dataset.nonsense=1", "dataset.nonsense: no such setting"),
     ("plan ckpt={town} count=0", "at least 1"),
     ("place ckpt={town}", "train with stations=together"),
     ("locate calibrate=0", "ckpt is not set"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import towns
 import yaml
-from campaigns import channels, powers
+from campaigns import channels, compose, powers
 from doors import assert_refused, knock
 from mirrors import mirrored
 
@@ -216,3 +216,11 @@ def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatc
         given = [f"ckpt={bad}", f"hydra.run.dir={tmp_path / command}", "threads=1", *more]
         assert_refused(knock(COMMANDS[command].run, command, given), refused)
     assert not mirror.asked
+
+
+@pytest.mark.parametrize("name", ["calibrate", "link", "locate", "tradeoff", "map", "place", "plan", "view"])
+def test_settings_of_data_were_refused_beside_their_file(name):
+    """`dataset.not_heard: no such setting; there are file, name, root`, where `evaluate` took it."""
+    given = "ckpt=model.ckpt", "dataset.not_heard=[100]", "dataset.columns.lat=B"
+    found = compose(*given, config=name).dataset
+    assert found == {"name": None, "root": None, "file": None, "not_heard": [100], "columns": {"lat": "B"}}

@@ -12,9 +12,10 @@ from PIL import Image
 
 from gsparc.commands.locate import locate
 from gsparc.data.errors import DataError
+from gsparc.evaluation.summary import write_as_found
 from gsparc.models import checkpoint
 
-UNPLACED = {"x", "y", "z", "area_m2", "modes", "doubt"}
+UNPLACED = {"row", "x", "y", "z", "area_m2", "modes", "doubt"}
 PLACED = UNPLACED | {"x_true", "y_true", "z_true", "error_m", "inside"}
 
 
@@ -81,6 +82,83 @@ def test_a_table_was_refused_and_after_the_calibration(tmp_path):
     assert len(found) == 20 and facts["locate/median_m"] < 3
     with pytest.raises(DataError, match="no such file"):  # at once
         located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/c.csv'")
+
+
+@pytest.fixture(scope="module")
+def roofs(tmp_path_factory):
+    """A model of all rows of a table in degrees with listed stations, and a phone's log of levels."""
+    folder, rng = tmp_path_factory.mktemp("roofs"), np.random.default_rng(0)
+    east_north, masts = rng.uniform(0, 300, (120, 2)), np.array([[0, 0], [300, 0], [150, 300.0]])
+    level = -40 - 20 * np.log10(5 + np.linalg.norm(east_north[:, None] - masts, axis=2))
+    level += rng.normal(0, 0.5, level.shape)
+
+    def degrees(places):
+        return np.column_stack([48 + places[:, 1] / 111_200, 11 + places[:, 0] / 74_500])
+
+    names = "roof-1,roof-2,roof-3"
+    listed = [f"roof-{i + 1},{a:.7f},{b:.7f},30" for i, (a, b) in enumerate(degrees(masts))]
+    (folder / "masts.csv").write_text("\n".join(["name,latitude,longitude,height", *listed]) + "\n")
+    log = [f"{i},{a:.2f},{'' if i == 3 else f'{b:.2f}'},{c:.2f}" for i, (a, b, c) in enumerate(level[100:])]
+    (folder / "phone.csv").write_text("\n".join([f"scan,{names}", *log]) + "\n")
+    known = np.hstack([degrees(east_north), np.full((120, 1), 1.5), level])[:100]
+    head = f"latitude,longitude,height,{names}"
+    np.savetxt(folder / "walk.csv", known, "%.7f", ",", header=head, comments="")
+    more = f"dataset.stations_file='{folder}/masts.csv'", "split=none", "eval_on=train"
+    ckpt = towns.trained(folder / "walk.csv", "gp", *more)
+    return ckpt, folder, degrees(east_north[100:])
+
+
+def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
+    """`no coordinates among ...; say dataset.columns.x=COLUMN`, where Python located the same levels."""
+    ckpt, folder, true = roofs
+    facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")
+    assert set(found[0]) == UNPLACED | {"latitude", "longitude"} and "locate/median_m" not in facts
+    assert [row["row"] for row in found] == [str(number) for number in range(20)]
+    off = (np.stack([column(found, name) for name in ("latitude", "longitude")], 1) - true) * [
+        111_200,
+        74_500,
+    ]
+    assert np.median(np.linalg.norm(off, axis=1)) < 30
+    rows = (folder / "phone.csv").read_text().splitlines()
+    long = ["scan,cell,rssi", *(f"{row.split(',')[0]},roof-1,{row.split(',')[1]}" for row in rows[1:])]
+    (tmp_path / "long.csv").write_text("\n".join(long) + "\n")
+    with pytest.raises(DataError, match="expected one row a moment with a column of levels per station"):
+        located(tmp_path / "long", f"ckpt={ckpt}", f"data='{tmp_path}/long.csv'", "calibrate=0")
+
+
+def test_a_final_model_spoke_of_test_rows_alone(roofs, tmp_path):
+    """`eval_on=test: the split has no test rows`, and no word of what to do."""
+    with pytest.raises(
+        DataError, match=r"has no test rows; say data=FILE of what is to be located, or eval_on"
+    ):
+        located(tmp_path / "run", f"ckpt={roofs[0]}")
+
+
+def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, caplog):
+    """Areas were calibrated anew by every call, though the checkpoint held what was learned."""
+    ckpt = shutil.copy(roofs[0], tmp_path / "model.ckpt")
+    given = f"ckpt={ckpt}", f"data='{roofs[1]}/phone.csv'", "rows=3"
+    first, rows = located(tmp_path / "first", *given, "calibrate=2")
+    with caplog.at_level("INFO"):
+        again, same = located(tmp_path / "again", *given, "calibrate=2")
+    assert "calibrated before, on" in caplog.text and same == rows
+    assert again["locate/calibrated_on"] == first["locate/calibrated_on"] > 0
+    caplog.clear()
+    with caplog.at_level("INFO"):
+        located(tmp_path / "other", *given, "calibrate=2", "share=0.8")
+    assert "calibration 1 of 2" in caplog.text
+
+
+def test_ctrl_c_lost_all_that_was_located(tmp_path):
+    """`locate.csv` was written at the end alone."""
+
+    def found():
+        yield from range(3)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_as_found(found(), tmp_path / "locate.csv", lambda some: {"x": some})
+    assert (tmp_path / "locate.csv").read_text().split() == ["x", "0", "1", "2"]
 
 
 def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsaid(tmp_path, capsys):

@@ -6,11 +6,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.apps.locate.judging import Localisation, sample_rows
+from gsparc.apps.locate.judging import Report, columns_of_places, report, sample_rows
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
 from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
@@ -19,11 +18,12 @@ from gsparc.data.limits import POSITIVE, SHARE
 METHOD = "weighted_knn"
 
 
-def locate_fingerprints(config: DictConfig) -> Localisation:
-    """Locate rows of a file by its others, or rows of another file.
+def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
+    """Locate and report on rows of a file by its others, or rows of another file.
 
     Args:
         config: see conf/locate.yaml.
+        run_dir: of `locate.csv`.
 
     Raises:
         ValueError: no file, a checkpoint as well, or settings that only a trained model has.
@@ -48,9 +48,10 @@ def locate_fingerprints(config: DictConfig) -> Localisation:
     facts = {
         "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
         "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
+        "time/locate_ms_p50": each_ms,
     }  # fmt: skip
-    placed = bool(np.isfinite(heard.position).all())
-    return Localisation(METHOD, place, *both, np.zeros(3), placed, {}, None, each_ms, "", facts)
+    columns = columns_of_places(place, heard.position)
+    return report(run_dir, config.against, METHOD, *both, columns, facts)
 
 
 def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,167 +23,148 @@ from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.errors import DataError
-from gsparc.data.own import interpret_and_log
-from gsparc.data.raw import read_raw
-from gsparc.data.tables import is_table
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.open_runs import Opened, align_to_site, open_files, read_like_stored
-from gsparc.evaluation.scores import rows_to_score
-from gsparc.evaluation.summary import write_samples
+from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
+from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Table
-from gsparc.prediction.predictor import update_extra
+from gsparc.prediction.predictor import Predictor, update_extra
 
 log = logging.getLogger(__name__)
 
+Report = tuple[dict[str, Any], list[Table], list[str]]  # facts, tables and sentences
 SHOWN = 6  # snapshots, evenly over all
+ABOUT = {"area_m2": "area", "modes": "modes", "doubt": "doubt", "inside": "inside"}  # columns of `Located`
+TRUST_IS_OF = ("calibrate", "share", "prior", "plan", "plan_points", "phase_known", "offset_db")  # settings
 
 
-@dataclass(frozen=True)
-class Localisation:
-    """Snapshots, and where each was heard.
-
-    Attributes:
-        method: name.
-        places: (n, 3) [m, local], by it.
-        heard, trained: what was located, and what was learned from.
-        origin: (3,) of local coordinates [m].
-        placed: whether the places of `heard` are known.
-        about: further columns of `locate.csv`, n values each; `area_m2` where there are areas.
-        inside: (n,) whether true places lie in these areas; None where either is unknown.
-        each_ms: median milliseconds of a snapshot.
-        promise: what the areas promise, in words.
-        facts: for the summary.
-    """
-
-    method: str
-    places: np.ndarray
-    heard: Snapshots
-    trained: Snapshots
-    origin: np.ndarray
-    placed: bool
-    about: dict[str, list[Any]]
-    inside: np.ndarray | None
-    each_ms: float
-    promise: str
-    facts: dict[str, Any]
-
-    def columns(self) -> dict[str, Any]:
-        """Return the columns of `locate.csv`, in the world's coordinates [m]."""
-        place, true = self.places, self.heard.place
-        columns: dict[str, Any] = dict(zip("xyz", (place + self.origin).T.tolist(), strict=True))
-        if self.placed:
-            columns |= dict(zip(("x_true", "y_true", "z_true"), (true + self.origin).T.tolist(), strict=True))
-            columns |= {"error_m": np.linalg.norm(place - true, axis=1).tolist()}
-        return columns | self.about | ({} if self.inside is None else {"inside": (1 * self.inside).tolist()})
+def columns_of_places(
+    world: np.ndarray, true: np.ndarray, predictor: Predictor | None = None
+) -> dict[str, Any]:
+    """Return columns of world places (n, 3) [m], and errors where `true` ones are not NaN."""
+    columns = coordinates(world, predictor)
+    if np.isnan(true).any():
+        return columns
+    columns |= {f"{axis}_true": values for axis, values in coordinates(true, None).items()}
+    return columns | {"error_m": np.linalg.norm(world - true, axis=1)}
 
 
 def report(
-    result: Localisation, against: Sequence[str], run_dir: Path
-) -> tuple[dict[str, Any], list[Table], list[str]]:
+    run_dir: Path, against: Sequence[str], method: str, heard: Snapshots, trained: Snapshots,
+    columns: dict[str, Any], facts: dict[str, Any], promise: str = "",
+) -> Report:  # fmt: skip
     """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
 
     Args:
-        result: what was located.
-        against: names of plain methods beside it.
         run_dir: where the file goes.
+        against: names of plain methods beside it.
+        method: name.
+        heard, trained: what was located, and what was learned from.
+        columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
+        facts: for the summary, with the milliseconds of a snapshot.
+        promise: what the areas promise, in words.
     """
-    heard, facts = result.heard, dict(result.facts)
-    places, stems = {result.method: result.places}, {result.method: "locate"}
-    write_samples(run_dir / "locate.csv", result.columns())
-    area = result.about.get("area_m2")
-    facts |= {
-        "locate/snapshots": len(heard), "time/locate_ms_p50": result.each_ms,
-        "locate/area_m2": None if area is None else float(np.median(area)),
-    }  # fmt: skip
-    doubts = _doubts(result, facts)
-    if not result.placed:
+    write_samples(run_dir / "locate.csv", columns)
+    area, inside = columns.get("area_m2"), columns.get("inside")
+    facts["locate/snapshots"] = len(heard)
+    facts["locate/area_m2"] = None if area is None else float(np.median(area))
+    doubts = _doubts(columns, facts)
+    if "error_m" not in columns:
         return facts, [], doubts
-    for name in dict.fromkeys(against):
-        if name not in places:
-            stems[name] = stem = f"baseline/{name}"
-            beside = locate_by_neighbours(name, result.trained, heard)
-            places[name], facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = beside
     rows = []
-    for name, place in places.items():
-        median, p90 = np.quantile(np.linalg.norm(place - heard.place, axis=1), [0.5, 0.9]).tolist()
-        facts |= {f"{stems[name]}/median_m": median, f"{stems[name]}/p90_m": p90}
+    for name in dict.fromkeys([method, *against]):
+        stem, error = "locate", columns["error_m"]
+        if name != method:
+            stem = f"baseline/{name}"
+            place, *seconds = locate_by_neighbours(name, trained, heard)
+            facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = seconds
+            error = np.linalg.norm(place - heard.place, axis=1)
+        median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
+        facts |= {f"{stem}/median_m": median, f"{stem}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
     title = f"{facts['dataset/name']}, {len(heard)} snapshots"
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
-    facts["locate/coverage"] = None if result.inside is None else float(np.mean(result.inside))
-    if result.inside is None:
-        return facts, shown, doubts
-    sentence = (
-        f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {facts['locate/coverage']:.0%} of places, "
-        f"{result.promise}; {result.each_ms:.3g} ms a snapshot"
-    )
-    return facts, shown, [sentence, *doubts]
+    facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
+    if inside is not None:
+        areas = f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places"
+        doubts.insert(0, f"{areas}, {promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot")
+    return facts, shown, doubts
 
 
-def _doubts(result: Localisation, facts: dict[str, Any]) -> list[str]:
+def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
     """A sentence on each doubt about areas; their counts go to `facts`."""
-    doubt, lines = np.array(result.about.get("doubt", []), str), []
+    doubt, lines = np.array(columns.get("doubt", []), str), []
     for key, why in locating.DOUBTS.items():
         facts[f"locate/{key}"] = count = int((doubt == why).sum())
         if count:
             of = f"{count} of {len(doubt)} snapshots"
             lines.append(f"{of}: {why}, where areas promise nothing (locate.csv, doubt)")
-    if lines and result.inside is not None and (sure := doubt == "").any():
-        lines.append(f"areas of the other {sure.sum()} hold {result.inside[sure].mean():.0%} of places")
+    if lines and "inside" in columns and (sure := doubt == "").any():
+        held = np.mean(np.array(columns["inside"])[sure])
+        lines.append(f"areas of the other {sure.sum()} hold {held:.0%} of places")
     return lines
 
 
 def locate_by_model(
     config: DictConfig, run_dir: Path, open_at: Callable[[np.ndarray], np.ndarray] | None
-) -> Localisation:
-    """Locate the test rows of a trained model, or those of a file.
+) -> Report:
+    """Locate and report on the test rows of a trained model, or those of a file.
 
     Args:
         config: see conf/locate.yaml.
-        run_dir: of trainings that learn how far the model is trusted.
+        run_dir: of `locate.csv`, and of trainings that learn how far the model is trusted.
         open_at: which of places (n, 2) [m, world] one can stand at; None: everywhere.
 
     Raises:
         ValueError: the model states no variance, or does not name its settings.
     """
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
-    data, fold, method = run.data, run.split.folds[0], run.methods[0]
+    data, fold = run.data, run.split.folds[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
+    how = {name: to_dict(config)[name] for name in TRUST_IS_OF}
+    stored = run.stored[0].extra.get(locating.KEY, {})
+    anew = config.calibrate and (config.renew or stored.get("how") != how)
     # What was learned earlier for other settings is refused: its areas would hold another share.
-    start = Trust() if config.calibrate else locating.restore_trust(run.stored[0].extra, unknown, share)
+    start = Trust() if anew else locating.restore_trust(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
-    east_north = data.site.origin[:2]
-    light = None if open_at is None else lambda places: open_at(places[:, :2] + east_north)
+    origin = data.site.origin
+    light = None if open_at is None else lambda places: open_at(places[:, :2] + origin[:2])
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
-    field, count = SiteField(run.predictor), 0
     box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
-    locator = Locator(field, box, wider, unknown, start, share)
-    if config.calibrate:
+    locator = Locator(SiteField(run.predictor), box, wider, unknown, start, share)
+    count = stored.get("count", 0)
+    if anew:
         trust, count = _trust(config, run, locator, cells, run_dir)
         locator = replace(locator, trust=trust)
         if config.store:
-            update_extra(config.ckpt, locating.trust_state(trust, unknown, share))
-    located, trained, origin = locator.locate(heard), group_snapshots(data, learned), data.site.origin
-    own, level = "by the model's own variances, which nothing tested (calibrate=0)", locator.trust.level
-    own = "are promised" if config.calibrate or locating.KEY in run.stored[0].extra else own
-    promise = f"{locator.share:.0%} {own}; {float(locator.cells.volume.sum()):.3g} m2 were searched"
-    beyond = int(beyond_box(heard.place, locator.cells.box()).sum()) if placed else 0
+            update_extra(config.ckpt, locating.trust_state(trust, unknown, share, how=how, count=count))
+    elif config.calibrate:
+        log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
+
+    def columns(located: Sequence[Located]) -> dict[str, Any]:
+        first = slice(len(located))
+        table = {} if heard.row is None else {"row": heard.row[first]}
+        world = np.array([one.place for one in located]) + origin
+        table |= columns_of_places(world, heard.place[first] + origin, run.predictor)
+        about = ABOUT if placed else {head: name for head, name in ABOUT.items() if head != "inside"}
+        return table | {head: [getattr(one, name) for one in located] for head, name in about.items()}
+
+    located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
+    trained = group_snapshots(data, learned)
+    own = "by the model's own variances, which nothing tested (calibrate=0)"
+    own = "are promised" if config.calibrate or stored else own
+    promise = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
+    beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
     promise += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
-    pairs = zip(located, heard.place, strict=True)
-    inside = np.array([one.posterior.mass_above(at) <= level for one, at in pairs]) if placed else None
-    places = np.array([one.place for one in located])
-    about = dict[str, list[Any]](area_m2=[at.area for at in located], modes=[at.modes for at in located])
-    about["doubt"] = [at.doubt for at in located]
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
-    facts = {**run.facts(), "locate/calibrated_on": count}
-    known = method.name, places, heard, trained, origin, placed, about
-    return Localisation(*known, inside, each_ms, promise, facts)
+    facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
+    result = run.methods[0].name, heard, trained, columns(located), facts, promise
+    return report(run_dir, config.against, *result)
 
 
 def _trust(
@@ -201,22 +182,17 @@ def _trust(
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
-    """The snapshots, and whether their places are known."""
-    site, placed = run.data.site, True
+    """The snapshots, NaN for unknown places, and whether these are known."""
+    placed, rows = True, None
     if config.data is None:
-        data, rows = run.data, rows_to_score(run.split.folds[0], config.eval_on)
-    elif is_table(config.data):
-        data = read_like_stored(run.stored[0], config.data)
+        data, rows = run.data, getattr(run.split.folds[0], config.eval_on)
+        if not len(rows):
+            which = f"eval_on={config.eval_on}: the split has no {config.eval_on} rows"
+            raise DataError(f"{which}; say data=FILE of what is to be located, or eval_on=train")
     else:
-        raw, place = read_raw(config.data), f"{site.moving_end}_position"
-        placed = place in raw.arrays
-        if not placed:  # anywhere: nothing is compared with it
-            count = max(len(raw.arrays.get(site.kind, ())), len(raw.arrays.get("rssi_db", ())))
-            low, high = site.moving_box + site.origin
-            # Any places will do, as rows must have some; a diagonal, so that no two are one.
-            raw.arrays[place] = np.linspace(low, high, count)
-        data = align_to_site(interpret_and_log(raw, config.data), site)
-    heard = group_snapshots(data, rows if config.data is None else np.arange(len(data)))
+        data, placed = read_like_stored(run.stored[0], config.data)
+    heard = group_snapshots(data, np.arange(len(data)) if rows is None else rows)
+    heard = heard if placed else replace(heard, place=np.full_like(heard.place, np.nan))
     return heard.subset(sample_rows(config, len(heard))), placed
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,7 @@ from gsparc.apps.locate.posterior import Posterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
 from gsparc.apps.locate.site_field import Moments, SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
-from gsparc.data.executor import run_all
+from gsparc.data.executor import run_all, run_each
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 
@@ -48,6 +48,7 @@ class Located:
         seconds: that it took.
         doubt: why its area promises nothing: it lies beyond the places that were learned from, or the
             snapshot fits no place; empty: neither.
+        inside: 1 where the true place lies in that area, else 0; None where it is unknown.
     """
 
     place: np.ndarray
@@ -56,6 +57,7 @@ class Located:
     posterior: Posterior
     seconds: float
     doubt: str = ""
+    inside: int | None = None
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,8 @@ class Locator:
             current = Search(cells.subset(rest).join(finer), others + more)
         return current
 
-    def locate(self, heard: Snapshots) -> list[Located]:
-        """Each of n snapshots on its own."""
+    def locate(self, heard: Snapshots) -> Iterator[Located]:
+        """Yield where each of n snapshots was heard."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
         further, box = replace(self, cells=self.wider), self.cells.box()
 
@@ -121,9 +123,11 @@ class Locator:
             posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
             area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
             known = posterior.peak(), area, posterior.count_modes(mass), posterior
-            return Located(*known, time.perf_counter() - started, doubt)
+            seconds, true = time.perf_counter() - started, heard.place[number]
+            inside = int(posterior.mass_above(true) <= mass) if np.isfinite(true).all() else None
+            return Located(*known, seconds, doubt, inside)
 
-        return run_all(one, range(len(heard)), "snapshots")
+        yield from (found for _, found in run_each(one, range(len(heard)), "snapshots"))
 
 
 def learn_trust(
@@ -158,9 +162,9 @@ def learn_trust(
     return calibrate_level(trust, looks(trust), places, locator.share), len(places)
 
 
-def trust_state(trust: Trust, unknown: Nuisances, share: float) -> dict[str, Any]:
-    """Return what `restore_trust` reads again, for a checkpoint's `extra`."""
-    return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share}}
+def trust_state(trust: Trust, unknown: Nuisances, share: float, **learned: Any) -> dict[str, Any]:
+    """Return what `restore_trust` reads again, for a checkpoint's `extra`, with how it was learned."""
+    return {KEY: {"trust": asdict(trust), "unknown": asdict(unknown), "share": share, **learned}}
 
 
 def restore_trust(extra: Mapping[str, Any], unknown: Nuisances, share: float) -> Trust:

@@ -23,12 +23,14 @@ class Snapshots:
         values: (n, P) float64 spectra, or complex128 channels, or decibels; NaN where missing.
         floor: (n, P) levels [dB] of powers that were too weak to be heard, NaN of the rest; None without any.
         place: (n, 3) [m, local], where they were heard.
+        row: (n,) number from 0 of each one's first row in its file; None: not known.
     """
 
     kind: Kind
     values: Tensor
     floor: Tensor | None
     place: np.ndarray
+    row: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.values)
@@ -37,7 +39,8 @@ class Snapshots:
         """Return the snapshots `chosen`."""
         index = torch.from_numpy(np.asarray(chosen))
         floor = None if self.floor is None else self.floor[index]
-        return Snapshots(self.kind, self.values[index], floor, self.place[chosen])
+        row = None if self.row is None else self.row[chosen]
+        return Snapshots(self.kind, self.values[index], floor, self.place[chosen], row)
 
 
 def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
@@ -64,7 +67,8 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     quiet = torch.zeros(values.shape, dtype=torch.bool)
     quiet[which, station] = (side > 0)[:, None]
     own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
-    return Snapshots(site.kind, *own, data.moving[rows][first])
+    number = np.array(data.file_rows)[rows][first] if data.file_rows else None
+    return Snapshots(site.kind, *own, data.moving[rows][first], number)
 
 
 def snapshots_of_values(

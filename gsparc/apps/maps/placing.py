@@ -206,8 +206,10 @@ def lay_candidates(
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
-    middle = float(np.median(site.stations.position[:, 2]) + site.origin[2])
-    height = middle if station_height_m is None else float(station_height_m)
+    known = site.stations.position[:, 2] + site.origin[2]
+    if station_height_m is None and np.isnan(known).all():
+        raise DataError("station_height_m: no station's height is known; say station_height_m=METRES")
+    height = float(np.nanmedian(known) if station_height_m is None else station_height_m)
     candidates, given = _candidates(grid, sites, predictor, height, count)
     try:
         _new(predictor, candidates[0], grid.places()[:1], antenna)

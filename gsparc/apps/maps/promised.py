@@ -10,7 +10,7 @@ from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.intervals import Coverage
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
 from gsparc.data.errors import DataError
-from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.open_runs import check_dataset, open_files
 from gsparc.models import checkpoint
 from gsparc.prediction.refit import Learned
 
@@ -28,6 +28,7 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
         DataError: the training data are gone, or are others.
     """
     how = PromiseSettings(**settings["promise"])
+    check_dataset(path, settings["dataset"])
     if not settings["promised"]:
         return None
     stored = checkpoint.read(path)

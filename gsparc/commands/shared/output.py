@@ -1,4 +1,4 @@
-"""Where a command writes, what it says at its end, and rows as columns of a file."""
+"""Where a command writes, and what it says at its end."""
 
 from __future__ import annotations
 
@@ -7,14 +7,12 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from rich.console import RenderableType
 
 from gsparc.evaluation.console import open_console, repeated_warnings
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
 
 
@@ -55,13 +53,3 @@ def finish_run(
     write_summary(run_dir / "summary.json", whole)
     show_result(run_dir, *tables, **how)
     return whole
-
-
-def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:
-    """Return columns of places (n, 3) [m], in degrees, too, where the model knows its place on Earth."""
-    # Tenths of a millimetre here, about a millimetre in 1e-8 degrees.
-    columns = dict(zip(("x", "y", "z"), places.T.round(4), strict=True))
-    if predictor is not None and predictor.site.georeference is not None and len(places):
-        latitude, longitude, _ = predictor.degrees(places)
-        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
-    return columns

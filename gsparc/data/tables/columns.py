@@ -27,6 +27,7 @@ _STATIONS = "|".join(sorted(heads.STATION_WORDS))
 # A letter or a number that remains of a head names a station; a whole word says another quantity.
 STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
 MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
+BY_ROW = "#"  # in place of a head: the number of the row
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -36,7 +37,7 @@ class Column(Head):
 
     Attributes:
         head: of the column; None for a number.
-        value: the number, or the first and the last of evenly spaced ones.
+        value: the number, or the first and the last of evenly spaced ones; none: the number of the row.
         **rest: see `Head`; no unit is the schema's, no word a column that was said.
     """
 
@@ -44,8 +45,15 @@ class Column(Head):
     head: str | None = None
     value: tuple[float, ...] = ()
 
+    @property
+    def by_row(self) -> bool:
+        """Whether it is the number of the row."""
+        return self.head is None and not self.value
+
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
         """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
+        if self.by_row:
+            return pd.factorize(np.array(sheet.rows))[0].astype(float)
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not unit_suits(self.role, self.unit):
@@ -231,6 +239,8 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
+    if text == BY_ROW:
+        return (Column(role),)
     # A factor, as in `pathloss*-1`, is looked for after the head as it is: heads may hold a `*`.
     times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text)
     head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None

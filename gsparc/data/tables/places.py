@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import Caution, list_first
+from gsparc.data.errors import Caution, DataError, list_first
 from gsparc.data.links.stations import PER_STATION, SECTOR
-from gsparc.data.tables.columns import Chosen, choose_columns, rename_for_stations
-from gsparc.data.tables.heads import STATION_WORDS, TOGETHER, parse_head, words_of
+from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations
+from gsparc.data.tables.heads import AXES, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
+from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.data.tables.sheet import Sheet
 
@@ -32,6 +34,11 @@ class Places:
     across: np.ndarray
     height: np.ndarray | None
     degrees: bool
+
+    @staticmethod
+    def unknown(count: int, degrees: bool = False) -> Places:
+        """Return so many that nobody knows."""
+        return Places(np.full((count, 2), np.nan), np.full(count, np.nan), degrees)
 
     def all(self) -> np.ndarray:
         """Return (n, 2) or (n, 3)."""
@@ -70,6 +77,30 @@ def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -
             _on_earth(sheet, chosen, roles, across)
         return Places(across, height, degrees)
     return None
+
+
+def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> dict[str, object]:
+    """Return `dataset.columns` that put rows of a table without places apart; empty: it has places.
+
+    Args:
+        path: of the table.
+        columns: settings of the training.
+        end: that moved, `tx` or `rx`.
+
+    Raises:
+        DataError: rows are of one station each, and nothing says which of them are of one moment.
+    """
+    sheet, _ = read_sheet(path)
+    roles = [f"{before}{axis}" for before in ("", "rx_", "tx_") for axis in AXES]
+    said = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
+    here = {key: head for key, head in said.items() if head in sheet.heads}
+    chosen, _ = choose_columns(sheet, here, {}, [*roles, "station"])
+    if any(role in chosen for role in roles):
+        return {}
+    if "station" in chosen:
+        fault = "no coordinates, and rows of one station each: which are of one moment?"
+        raise DataError(f"{path}: {fault} expected one row a moment with a column of levels per station")
+    return {**dict.fromkeys(said), f"{end}_x": BY_ROW, f"{end}_y": BY_ROW, f"{end}_z": 0}
 
 
 def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np.ndarray | None:

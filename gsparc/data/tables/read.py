@@ -219,7 +219,9 @@ class Builder:
             self.arrays["station_name"] = np.array(stations.names)
             self.arrays |= {} if stations.label is None else {"station_label": np.array(stations.label)}
             self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
-            others["station"] = stations.places
+            # A list in degrees does not go with rows that are apart in metres, of which nobody knows where.
+            apart = any(column.by_row for column in self.chosen.get(f"{moving}_x", ()))
+            others["station"] = Places.unknown(len(stations.names)) if apart else stations.places
         self._add_places(moving, where)
         for name, other in others.items():
             if other.degrees != where.degrees:
@@ -305,9 +307,8 @@ class Builder:
 
     def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
         """Stations at places that nobody gave."""
-        nowhere = np.full((len(names), 3), np.nan)
         self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
-        return StationList(names, Places(nowhere[:, :2], nowhere[:, 2], degrees), index=index)
+        return StationList(names, Places.unknown(len(names), degrees), index=index)
 
     def _wide(self, labels: tuple[str, ...], where: Places | None, degrees: bool) -> StationList | None:
         if self.listed is None and where is not None:

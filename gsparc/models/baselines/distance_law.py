@@ -144,7 +144,7 @@ def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
 def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     """Return the place (3,) [m] of a still end that explains powers best, from several starts.
 
-    Heights above and below the places' own plane fit alike: one of the two is found.
+    Heights above and below the places' own plane fit alike: of places at one height the upper one is taken.
     """
     rng = np.random.default_rng(seed)
     if len(rows.places) > LOOKED_AT:
@@ -153,6 +153,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     size = max(float(np.linalg.norm(high - low)), TINY_M)
     bounds = np.stack([low - size, high + size], 1)
     loud = np.argsort(np.where(rows.side > 0, -np.inf, rows.decibels))[::-1]
+    flat = high - low <= 1e-3 * size
     starts = [rows.places[loud[0]], rows.places[loud[: max(1, len(loud) // 20)]].mean(0)]
     starts += list(rng.uniform(low - size / 2, high + size / 2, (STARTS, len(low))))
     tiny = (1e-3 * size) ** 2  # a row on the very place must not decide alone
@@ -167,7 +168,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     limits = [(None, None), EXPONENTS, tuple(np.log(SPREADS_DB)), *(bounds / size)]
     result = []
     for place in starts:
-        place = place + 0.05 * size * (high - low <= 1e-3 * size)  # in the plane itself heights have no slope
+        place = place + 0.05 * size * flat  # in the plane itself heights have no slope
         loss = to_decibels(((place - rows.places) ** 2).sum(1) + tiny) / 2
         start = np.concatenate([_initial_parameters(loss, rows), place / size])
         result.append(
@@ -175,7 +176,16 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
                 neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late
             )
         )
-    return min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size
+    place = min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size
+    if flat[2]:  # its mirror image fits as well, and few stations stand under the ground
+        place[2] = low[2] + abs(place[2] - low[2])
+    return place
+
+
+def say_estimated(place: np.ndarray) -> str:
+    """Say that a place was not given but found, at world (3,) [m]."""
+    where = ", ".join(f"{value:.4g}" for value in place)
+    return f"is not given; estimated from powers at ({where}) m, its height least surely"
 
 
 def fit_site_law(rows: PowerRows, site: Site) -> tuple[Law, tuple[str, ...]]:
@@ -186,8 +196,7 @@ def fit_site_law(rows: PowerRows, site: Site) -> tuple[Law, tuple[str, ...]]:
         return fit_law(rows, site.static_position), ()
     place = locate_still_end(rows)
     end = "transmitter" if site.static_end == "tx" else "receiver"
-    where = ", ".join(f"{value:.4g}" for value in place + site.origin)
-    return fit_law(rows, place), (f"the {end}'s place is not given; estimated from powers at ({where}) m",)
+    return fit_law(rows, place), (f"the {end}'s place {say_estimated(place + site.origin)}",)
 
 
 class DistanceLaw(Differentiable):

@@ -171,3 +171,13 @@ def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
     assert assumption(two, 8.0, Antenna([0, 120])).startswith(
         "assumed: 8 m high in the band of 1800 MHz, sect"
     )
+
+
+def test_a_station_of_no_known_height_was_nan():
+    """`position= holds NaN` where the places of all stations were estimated from powers."""
+    predictor = gsparc.load(town_model())
+    stations = predictor.site.stations
+    lost = replace(stations, position=np.full_like(stations.position, np.nan))
+    predictor.site = replace(predictor.site, stations=lost)
+    with pytest.raises(DataError, match="no station's height is known; say station_height_m=METRES"):
+        place_station(predictor)

@@ -97,6 +97,12 @@ def test_slopes_of_the_misfit():
     assert by_scale == pytest.approx((ends[1] - ends[0]) / 1e-5, rel=1e-4)
 
 
+def test_an_estimated_station_stood_under_the_ground():
+    """Powers at places of one height fit a station 78 m below these as well as one above."""
+    rows = rows_of(noise=4.0, count=60)
+    assert [round(locate_still_end(rows, seed)[2], 1) for seed in range(3)] == [7.4] * 3
+
+
 def test_a_place_nobody_gave_is_estimated_and_said():
     rows = rows_of(noise=1.0)
     place = locate_still_end(rows)

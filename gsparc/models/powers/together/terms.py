@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.models.baselines.distance_law import locate_still_end
+from gsparc.models.baselines.distance_law import locate_still_end, say_estimated
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances, matern32
@@ -80,9 +80,8 @@ def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, 
         own = rows[data.station[rows] == number]
         if len(own):
             places[number] = locate_still_end(power_rows(data, own))
-            where = ", ".join(f"{value:.4g}" for value in places[number] + site.origin)
-            name = site.stations.name[number]
-            notes.append(f"the place of station {name} is not given; estimated from powers at ({where}) m")
+            said = say_estimated(places[number] + site.origin)
+            notes.append(f"the place of station {site.stations.name[number]} {said}")
     return places, tuple(notes)
 
 
