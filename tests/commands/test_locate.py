@@ -113,7 +113,7 @@ def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
     ckpt, folder, true = roofs
     facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")
     assert set(found[0]) == UNPLACED | {"latitude", "longitude"} and "locate/median_m" not in facts
-    assert [row["row"] for row in found] == [str(number) for number in range(20)]
+    assert [row["row"] for row in found] == [f"line {number + 2}" for number in range(20)]
     off = (np.stack([column(found, name) for name in ("latitude", "longitude")], 1) - true) * [
         111_200,
         74_500,

@@ -23,7 +23,7 @@ class Snapshots:
         values: (n, P) float64 spectra, or complex128 channels, or decibels; NaN where missing.
         floor: (n, P) levels [dB] of powers that were too weak to be heard, NaN of the rest; None without any.
         place: (n, 3) [m, local], where they were heard.
-        row: (n,) number from 0 of each one's first row in its file; None: not known.
+        row: (n,) what each one's first row in its file is called; None: not known.
     """
 
     kind: Kind
@@ -67,8 +67,8 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     quiet = torch.zeros(values.shape, dtype=torch.bool)
     quiet[which, station] = (side > 0)[:, None]
     own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
-    number = np.array(data.file_rows)[rows][first] if data.file_rows else None
-    return Snapshots(site.kind, *own, data.moving[rows][first], number)
+    names = [data.row_names[i].partition(", station")[0] for i in rows[first]] if data.row_names else None
+    return Snapshots(site.kind, *own, data.moving[rows][first], names and np.array(names))
 
 
 def snapshots_of_values(
