@@ -50,8 +50,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
     result = compile_model(predictor, int(config.places))
-    origin = np.asarray(predictor.site.origin)
-    blob = pack_form(result.form, origin, result.error, result.worst)
+    blob = pack_form(result.form, np.asarray(predictor.site.origin), result.error, result.worst)
     (folder / "field.gsparc").write_bytes(blob)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
     shutil.copytree(SOURCES, folder / "source", ignore=OTHERS)

@@ -46,7 +46,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     study = LinkStudy(run, settings)
     facts = {**run.facts(), **study.facts, **study.beams()}
     title = f"{run.data.site.name}, {study.method.name}"
-    levels = settings["mcs"]["snr_db"]
     points = {name: values for name, values in settings["pusch"]["ebno_db"].items() if values}
     errors, surest = {}, {}
     rates, own = study.rates()
@@ -62,7 +61,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
-    return finish_run(run_dir, facts, *tables(facts, title, list(points), levels))
+    return finish_run(run_dir, facts, *tables(facts, title, list(points), settings["mcs"]["snr_db"]))
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:

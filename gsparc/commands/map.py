@@ -112,5 +112,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     before = f"{facts['map/cells']} squares, {facts['map/stations']} station(s)"
     if field.calibrated:
         before += f", expected error {facts['map/expected_error_db']:.2f} dB of the strongest"
-    before += "; map "
-    return finish_run(run_dir, facts, lines=lines, before=before)
+    return finish_run(run_dir, facts, lines=lines, before=f"{before}; map ")

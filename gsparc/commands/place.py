@@ -53,14 +53,17 @@ def task(config: DictConfig) -> dict[str, Any]:
         "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
-    told = "with a station at " + at + ", {nearest_m:.4g} m from the next: {coverage:.1%}, gaining {gain:.1%}"
+    told = "with a station at " + at + ", {nearest_m:.4g} m from the next: {coverage:.1%}, gaining "
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
-        interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain {gain_low:.1%} to {gain_high:.1%}"
+        low, high = found.between[:, 2:].T
+        alike = ((low <= found.gain[0]) & (found.gain[0] <= high))[1:].sum()
+        interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain " + f"{100 * low[0]:.1f} to "
+        interval += f"{100 * high[0]:.1f} points, not told apart from {alike} of {len(low) - 1} others"
     lines = [
         placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
         f"now {found.before:.1%} of the area with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
-        told.format(**best), interval.format(**best),
+        told.format(**best) + f"{100 * found.gain[0]:.1f} points", interval.format(**best),
     ]  # fmt: skip
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

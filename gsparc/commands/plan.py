@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from omegaconf import DictConfig
 
 from gsparc.apps.maps.floor_plan import read_plan_settings
-from gsparc.apps.maps.geojson import write_line
+from gsparc.apps.maps.geojson import write_shapes
 from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promised import read_or_gather
@@ -37,12 +38,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
     # Rows are in the order of the walk; the rank is that of their gains.
     columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
-    walk = len(plan.path) > 0
-    columns |= {"way_m": plan.metres.round(1)} if walk else {}
+    if len(plan.path):
+        columns["way_m"] = plan.metres.round(1)
+        way = pd.DataFrame(coordinates(np.pad(plan.path, ((0, 0), (0, 1))), predictor))
+        at = ["longitude", "latitude"] if "longitude" in way else ["x", "y"]
+        stops = [("Point", [row[k] for k in at], row) for row in pd.DataFrame(columns).to_dict("records")]
+        write_shapes(run_dir / "plan.geojson", [("LineString", way[at].to_numpy().tolist(), {}), *stops])
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
-    if walk:
-        origin = None if predictor is None else predictor.site.georeference
-        write_line(run_dir / "plan.geojson", plan.path, origin)
     draw_measurement_plan(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
         "plan/places": len(plan.places), "plan/expected_error_db": plan.after_db,
@@ -56,5 +58,5 @@ def task(config: DictConfig) -> dict[str, Any]:
         every = "all stations alike (a map shows the strongest)"
         before += f" of {every if stations is None else ', '.join(map(str, stations))}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
-    before += f", a way of {plan.length_m:.0f} m, {kind}; plan "
+    before += f", a way of {plan.length_m:.0f} m, {kind}; rows logged on the way come on top; plan "
     return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)

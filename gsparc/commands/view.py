@@ -82,12 +82,11 @@ def write(view: SiteView, path: Path) -> str:
         from gsparc.apps.view.server.page import render_page
 
         write_whole(path, render_page(view))
-    else:
-        name = view.viewed.stations[0]
-        cloud = model_gaussians(view.viewed, name, view.station(name).measured)
-        if cloud is None:
-            model = f"{view.viewed.predictor.method.name} of {view.viewed.site.name}"
-            raise DataError(f"save={path}: {model} holds no Gaussians to write; save=FILE.html draws it")
-        write_ply(path, cloud, cloud_colours(cloud)[1])
-        return f"{len(cloud)} Gaussians written to {path}"
-    return f"written to {path}"
+        return f"written to {path}"
+    name = view.viewed.stations[0]
+    cloud = model_gaussians(view.viewed, name, view.station(name).measured)
+    if cloud is None:
+        model = f"{view.viewed.predictor.method.name} of {view.viewed.site.name}"
+        raise DataError(f"save={path}: {model} holds no Gaussians to write; save=FILE.html draws it")
+    write_ply(path, cloud, cloud_colours(cloud)[1])
+    return f"{len(cloud)} Gaussians written to {path}"

@@ -46,17 +46,11 @@ def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", 
 
 def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
     """Draw a dart at each of places (n, 2) [m] towards its azimuth (n,) [deg from north]."""
-    how: dict[str, Any] = {
-        "linestyle": "",
-        "color": "k",
-        "markeredgecolor": "white",
-        "markersize": 17,
-        "zorder": 4,
-    }
     # Azimuths turn clockwise from north, matplotlib's angles anticlockwise: hence the sign.
     for where, turn in zip(places, azimuth, strict=True):
-        axis.plot(*where, marker=MarkerStyle(DART, transform=Affine2D().rotate_deg(-turn)), **how)
-    axis.plot([], [], marker="d", label="sector", **how | {"markersize": 7})
+        dart = MarkerStyle(DART, transform=Affine2D().rotate_deg(-turn))
+        draw_stations(axis, where, None, marker=dart, markersize=17)
+    draw_stations(axis, places[:0], "sector", marker="d", markersize=7)
 
 
 def draw_measured(axis: Any, places: np.ndarray) -> None:

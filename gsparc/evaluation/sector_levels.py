@@ -14,9 +14,9 @@ from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
-from gsparc.processes.sectors import NO_AZIMUTH, Sectors
+from gsparc.processes.sectors import NO_AZIMUTH
 
-MOST, ACROSS = 12, 4  # sectors drawn, those with most rows; beside each other
+MOST, ACROSS = 12, 4  # sectors drawn, contradicted azimuths and then most rows first; beside each other
 LEAST = 10  # rows that were heard of a sector
 
 
@@ -26,33 +26,36 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
     field = None if every is None else every.joint_method()
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
         return
-    trend = field.own.never.trend
-    assert isinstance(trend, Sectors)
+    trend = field.network
     heard = rows_of_stations(data, np.r_[fold.train, fold.val], field.places).measured_rows
     count = np.bincount(heard.station, minlength=len(field.places))
+    azimuth, stations = trend.table[:, 0].numpy(), data.site.stations
     # Without an azimuth there is no angle to draw over.
-    count[trend.table[:, 0].numpy() == NO_AZIMUTH] = 0
-    chosen = [int(t) for t in np.argsort(-count, kind="stable")[:MOST] if count[t] >= LEAST]
+    count[azimuth == NO_AZIMUTH] = 0
+    given = azimuth if stations.sector is None else stations.sector[:, 0] % 360
+    turned = ~np.isclose(azimuth, given)  # as levels contradict what was given
+    chosen = [int(t) for t in np.lexsort((-count, ~turned)) if count[t] >= LEAST][:MOST]
     if not chosen:
         return
     down = -(-len(chosen) // ACROSS)
     figure, axes = panels(9, 2.0 * down + 0.8, down, ACROSS, sharex=True, sharey=True)
     for axis, t in zip(axes.flat, chosen, strict=False):
         at = torch.from_numpy(np.c_[heard.select_station(t).places, np.full(count[t], t)])
-        angle, distance = _about(at, float(trend.table[t, 0]))
+        angle, distance = _about(at, azimuth[t])
         rest = torch.from_numpy(heard.select_station(t).decibels) - trend.mean(at) - trend.pattern_loss(at)
         axis.plot(angle, rest, ".", color=PALETTE[0], markersize=3, alpha=0.5)
         turn = np.linspace(-180, 180, 181)
         # Bearings from north, clockwise: east = sin, north = cos.
-        bearing = np.radians(turn + float(trend.table[t, 0]))
+        bearing = np.radians(turn + azimuth[t])
         ring = np.median(distance) * np.c_[np.sin(bearing), np.cos(bearing)]
         height = np.full((len(ring), 1), float(at[:, 2].median()))
         around = np.c_[ring + field.places[t, :2], height, np.tile(np.r_[field.places[t], t], (len(ring), 1))]
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.pattern_loss(at)).median())
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
-        axis.set(title=f"{data.site.stations.shown[t]}, {float(trend.table[t, 0]):.0f} deg", xlim=(-180, 180))
-        axis.set_xticks([-180, -90, 0, 90, 180])
+        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {given[t]:.0f})" * int(turned[t])
+        axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
+    figure.suptitle(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first")
     for axis in axes.flat[len(chosen) :]:
         axis.set_visible(False)
     figure.supxlabel("angle from the azimuth that is used [deg]")

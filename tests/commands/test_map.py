@@ -76,8 +76,23 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     lines = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(lines) == 7 and lines[0].endswith(",way_m") and (tmp_path / "plan.png").exists()
-    way = np.array(json.loads((tmp_path / "plan.geojson").read_text())["coordinates"])
-    assert np.hypot(*np.diff(way, axis=0).T).sum() == pytest.approx(facts["plan/length_m"])
+    assert "rows logged on the way come on top" in said
+
+
+def test_the_file_of_a_way_held_no_stops(model, tmp_path):
+    assert run("plan", f"ckpt={model}", "count=6", "promised=false", folder=tmp_path).status == 0
+    way, *stops = json.loads((tmp_path / "plan.geojson").read_text())["features"]
+    length_m = np.hypot(*np.diff(way["geometry"]["coordinates"], axis=0).T).sum()
+    assert way["geometry"]["type"] == "LineString"
+    assert length_m == pytest.approx(
+        json.loads((tmp_path / "summary.json").read_text())["plan/length_m"], abs=0.01
+    )
+    assert [one["properties"] for one in stops] == pd.read_csv(tmp_path / "plan.csv").to_dict("records")
+    assert all(one["geometry"]["type"] == "Point" for one in stops)
+    first = stops[0]["properties"]
+    assert (
+        stops[0]["geometry"]["coordinates"] == [first["x"], first["y"]] and {"rank", "order"} <= first.keys()
+    )
 
 
 def test_a_plan_for_some_stations_spoke_of_all(model, tmp_path):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -88,8 +89,10 @@ def read_shapes(
     return shapely.union_all(shapely.make_valid(polygons)), list(lines)
 
 
-def write_line(path: Path, corners: np.ndarray, origin: Georeference | None) -> None:
-    """Write a line of corners (n, 2) [m], in degrees where their place on Earth is known."""
-    if origin is not None:
-        corners = np.column_stack(origin.to_degrees(corners)[::-1])
-    write_whole(path, json.dumps({"type": "LineString", "coordinates": corners.tolist()}))
+def write_shapes(path: Path, shapes: Iterable[tuple[str, Any, Any]]) -> None:
+    """Write shapes, each its type, coordinates and properties."""
+    features = [
+        {"type": "Feature", "properties": facts, "geometry": {"type": kind, "coordinates": at}}
+        for kind, at, facts in shapes
+    ]
+    write_whole(path, json.dumps({"type": "FeatureCollection", "features": features}))
