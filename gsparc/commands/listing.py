@@ -30,10 +30,7 @@ class Command:
         paths = [word for word in words if self.bare and "=" not in word and not word.startswith("-")]
         # Quoted in Hydra's grammar, as paths may hold spaces, commas and brackets.
         quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
-        return [
-            *(word for word in words if word not in paths),
-            *([f"{self.bare}=[{quoted}]"] if paths else []),
-        ]
+        return [*(word for word in words if word not in paths), *[f"{self.bare}=[{quoted}]"] * bool(paths)]
 
     def run(self) -> None:
         """Run it with the command line in `sys.argv`; ends the process when it fails."""

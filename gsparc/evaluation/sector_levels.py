@@ -17,7 +17,7 @@ from gsparc.models.powers.together.terms import rows_of_stations
 from gsparc.processes.sectors import NO_AZIMUTH
 
 MOST, ACROSS = 12, 4  # sectors drawn, contradicted azimuths and then most rows first; beside each other
-LEAST = 10  # rows that were heard of a sector
+LEAST = 10  # rows that were heard of a sector, whose azimuth is not contradicted
 
 
 def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Path) -> None:
@@ -34,7 +34,8 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
     count[azimuth == NO_AZIMUTH] = 0
     given = azimuth if stations.sector is None else stations.sector[:, 0] % 360
     turned = ~np.isclose(azimuth, given)  # as levels contradict what was given
-    chosen = [int(t) for t in np.lexsort((-count, ~turned)) if count[t] >= LEAST][:MOST]
+    enough = count >= np.where(turned, 1, LEAST)
+    chosen = [int(t) for t in np.lexsort((-count, ~turned)) if enough[t]][:MOST]
     if not chosen:
         return
     down = -(-len(chosen) // ACROSS)

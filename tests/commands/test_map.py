@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 from threading import Timer
 
@@ -17,6 +18,7 @@ from towns import town_file, town_model, trained
 
 import gsparc
 from gsparc.apps.maps import predict_map
+from gsparc.apps.maps.placing import place_station
 from gsparc.commands.listing import COMMANDS
 
 
@@ -120,6 +122,21 @@ def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
     assert table[["low", "high", "gain_low", "gain_high"]].isna().all(axis=None)
     facts = json.loads((tmp_path / "to" / "summary.json").read_text())
     assert facts["place/low"] is None and facts["place/gain"] == pytest.approx(table["gain"].max())
+
+
+def test_a_best_place_was_not_said_to_be_like_others(tmp_path, monkeypatch):
+    path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
+    gain, ends = np.array([0.1, 0.09, 0.05, 0.01]), [[0.04, 0.2], [0.03, 0.2], [0.02, 0.1], [0.0, 0.02]]
+
+    def with_intervals(*of, **how):
+        found = place_station(*of, **how)
+        return replace(found, gain=gain, between=np.column_stack([np.full((4, 2), 0.5), ends]))
+
+    monkeypatch.setattr("gsparc.apps.maps.placing.place_station", with_intervals)
+    done = run("place", f"ckpt={path}", "count=4", "promised=false", "left_out=0", folder=tmp_path / "to")
+    assert any(line.endswith(", gaining 10.0 points") for line in done.out), done
+    told = "of the gain 4.0 to 20.0 points, not told apart from 2 of 3 others"
+    assert any(told in line for line in done.out)
 
 
 def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):

@@ -103,6 +103,19 @@ def test_sites_without_azimuths_have_no_pattern(tmp_path):
 RARE = pytest.mark.rare
 
 
+def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
+    one = network(1, wrong=2, moments=220, asked=120)
+    method, report = fitted(one, 6, tmp_path)
+    named = [note.split("azimuth of ")[1].split(":")[0] for note in report.notes if "is contradicted" in note]
+    figures = []
+    monkeypatch.setattr("gsparc.evaluation.sector_levels.save", lambda figure, path: figures.append(figure))
+    draw_sector_levels(method, one.data(6), Fold(np.arange(3960), NONE, NONE), tmp_path / "sectors.png")
+    titles = [axis.get_title() for axis in figures[0].axes]
+    assert figures[0].get_suptitle() == "12 of 30 sectors, contradicted azimuths first"
+    assert "(given " in titles[0]
+    assert {title.split(",")[0] for title in titles if "(given " in title} == {*named}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=RARE), 1, pytest.param(2, marks=RARE)])
 @pytest.mark.parametrize("count", [pytest.param(3, marks=RARE), 6, pytest.param(10, marks=RARE)])
