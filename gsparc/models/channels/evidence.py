@@ -18,7 +18,7 @@ from torch import Tensor
 from gsparc.models.channels.columns import Group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Isotropic, Noise
-from gsparc.models.channels.terms.compressed import Basis, Cache, Piece, get_or_make
+from gsparc.models.channels.terms.compressed import Basis, Cache, Dense, get_or_make
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
@@ -47,13 +47,13 @@ class BasisGroup:
 
     group: Group
     basis: Tensor
-    pieces: tuple[Piece, ...]
+    pieces: tuple[Dense, ...]
     design: Tensor
     target: Tensor
     rest: float
 
     @staticmethod
-    def from_group(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> BasisGroup:
+    def from_group(group: Group, basis: Tensor, pieces: tuple[Dense, ...], design: Tensor) -> BasisGroup:
         """Return it with the group's targets in the basis."""
         target = basis.T.to(torch.complex128) @ group.target
         rest = max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
@@ -134,7 +134,7 @@ def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
-    powers = power[:-1].split([piece.count_powers for piece in part.pieces])
+    powers = power[:-1].split([len(piece.matrices) for piece in part.pieces])
     for piece, level in zip(part.pieces, powers, strict=True):
         covariance = piece.add_to(covariance, level)
     covariance.diagonal().add_(noise)

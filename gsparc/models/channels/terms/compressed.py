@@ -10,18 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.kernels import squared_exponential
-from gsparc.processes.kernel import distances
-
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
-LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left out
-LOW = 0.3  # of the rows, columns of a factor beyond which its product takes less time
 
 Cache = dict[Hashable, Any]
 T = TypeVar("T")
@@ -41,11 +36,6 @@ class Dense:
 
     matrices: Tensor
 
-    @property
-    def count_powers(self) -> int:
-        """m."""
-        return len(self.matrices)
-
     def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
         """Return a covariance (r, r), which may be overwritten, with these of powers (m,)."""
         flat = self.matrices.view(len(power), -1)
@@ -59,29 +49,6 @@ class Dense:
         """Return them in another basis, of which the old one is (s, r) float64 coordinates."""
         real, imag = self.matrices.real, self.matrices.imag
         return Dense(torch.complex(coordinates @ real @ coordinates.T, coordinates @ imag @ coordinates.T))
-
-
-@dataclass(frozen=True)
-class Factored:
-    """A covariance F F^H of few columns F (r, q) complex128; methods as of `Dense`."""
-
-    factor: Tensor
-    count_powers: ClassVar[int] = 1
-
-    def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
-        """See `Dense`."""
-        return covariance.addmm_(self.factor * power, self.factor.mH)
-
-    def traces_of_products(self, weight: Tensor) -> Tensor:
-        """See `Dense`."""
-        return (self.factor.conj() * (weight @ self.factor)).real.sum()[None]
-
-    def change_basis(self, coordinates: Tensor) -> Factored:
-        """See `Dense`."""
-        return Factored(coordinates.to(torch.complex128) @ self.factor)
-
-
-Piece = Dense | Factored
 
 
 @dataclass(frozen=True)
@@ -111,7 +78,7 @@ class Basis:
         columns = torch.eye(len(places), dtype=torch.float64) if whole else vectors[:, mask]
         return Basis(key, places, columns, shared)
 
-    def dense_piece(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Piece, ...]:
+    def dense_piece(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Dense, ...]:
         """Return a piece of covariances (n, n), which equal places and keys share."""
         return (get_or_make(self.shared, (*self.key, key), lambda: self._compress(matrices())),)
 
@@ -126,17 +93,3 @@ class Basis:
             return (self.columns.T @ matrix @ self.columns).to(torch.complex128)
         # The basis is real: two real products take half the time of a complex one.
         return torch.complex(*(self.columns.T @ part @ self.columns for part in (matrix.real, matrix.imag)))
-
-    def wave_pieces(self, length: float, waves: Tensor) -> tuple[Piece, ...]:
-        """Return pieces of waves (W, n) whose gains vary over `length` [m]."""
-        roots = get_or_make(self.shared, (self.key[0], length), lambda: self._correlation_root(length))
-        wide = self.columns.T.to(torch.complex128)
-        factors = [wide @ (wave[:, None] * roots) for wave in waves]
-        few = roots.shape[1] <= LOW * len(wide)
-        return tuple(Factored(each) if few else Dense((each @ each.mH)[None]) for each in factors)
-
-    def _correlation_root(self, length: float) -> Tensor:
-        """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
-        size, vectors = torch.linalg.eigh(squared_exponential(distances(self.places, self.places), length))
-        mask = size > LOW_RANK * size[-1]
-        return vectors[:, mask] * size[mask].sqrt()

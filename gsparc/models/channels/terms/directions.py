@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import directional_correlation, matern_envelope
-from gsparc.models.channels.terms.compressed import Basis, Piece
+from gsparc.models.channels.terms.compressed import Basis, Dense
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
 from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import ENTRIES
@@ -88,7 +88,7 @@ class Directions(ChannelTerm):
         """Return the sum of powers (n,), see `ChannelTerm`."""
         return self.direction_powers([a.slot])[0].sum().expand(len(a.places))
 
-    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Dense, ...]:
         """Return one of M covariances, see `ChannelTerm`."""
         places, wavenumber = at.places, at.slot.wavenumber
 
