@@ -30,25 +30,12 @@ def get_or_make(cache: Cache, key: Hashable, make: Callable[[], T]) -> T:
     return kept
 
 
-@dataclass(frozen=True)
-class Dense:
-    """Covariances (m, r, r) complex128."""
-
-    matrices: Tensor
-
-    def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
-        """Return a covariance (r, r), which may be overwritten, with these of powers (m,)."""
-        flat = self.matrices.view(len(power), -1)
-        return covariance.add_((power.to(flat.dtype) @ flat).view(covariance.shape))
-
-    def traces_of_products(self, weight: Tensor) -> Tensor:
-        """Return traces (m,) of products with a Hermitian matrix (r, r)."""
-        return (self.matrices.reshape(len(self.matrices), -1) @ weight.T.reshape(-1)).real
-
-    def change_basis(self, coordinates: Tensor) -> Dense:
-        """Return them in another basis, of which the old one is (s, r) float64 coordinates."""
-        real, imag = self.matrices.real, self.matrices.imag
-        return Dense(torch.complex(coordinates @ real @ coordinates.T, coordinates @ imag @ coordinates.T))
+def change_basis(matrix: Tensor, columns: Tensor) -> Tensor:
+    """Return matrices (..., n, n) between real columns (n, r), as (..., r, r) complex128."""
+    if not matrix.is_complex():
+        return (columns.T @ matrix @ columns).to(torch.complex128)
+    # Two real products take half the time of a complex one.
+    return torch.complex(*(columns.T @ part @ columns for part in (matrix.real, matrix.imag)))
 
 
 @dataclass(frozen=True)
@@ -78,18 +65,13 @@ class Basis:
         columns = torch.eye(len(places), dtype=torch.float64) if whole else vectors[:, mask]
         return Basis(key, places, columns, shared)
 
-    def dense_piece(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Dense, ...]:
-        """Return a piece of covariances (n, n), which equal places and keys share."""
-        return (get_or_make(self.shared, (*self.key, key), lambda: self._compress(matrices())),)
-
-    def _compress(self, matrices: list[Tensor]) -> Dense:
-        return Dense(torch.stack([self.compress(matrix) for matrix in matrices]))
+    def compress_once(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> Tensor:
+        """Return covariances (n, n) in the basis (m, r, r), which equal places and keys share."""
+        return get_or_make(
+            self.shared, (*self.key, key), lambda: torch.stack([self.compress(one) for one in matrices()])
+        )
 
     def compress(self, matrix: Tensor) -> Tensor:
         """Return a matrix (n, n) of rows as (r, r) complex128."""
-        if self.columns.shape[1] == len(self.columns):
-            return matrix.to(torch.complex128)
-        if not matrix.is_complex():
-            return (self.columns.T @ matrix @ self.columns).to(torch.complex128)
-        # The basis is real: two real products take half the time of a complex one.
-        return torch.complex(*(self.columns.T @ part @ self.columns for part in (matrix.real, matrix.imag)))
+        whole = self.columns.shape[1] == len(self.columns)
+        return matrix.to(torch.complex128) if whole else change_basis(matrix, self.columns)
