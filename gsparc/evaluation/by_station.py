@@ -30,10 +30,9 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
 
     Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
     """
-    by = errors_by_station(scores, station)
-    # NaN where no row has an error.
-    mean = (by["rows"] * (by.rmse**2 - by.bias**2)).sum() / max(by["rows"].sum(), 1)
-    return float(mean**0.5) if by["rows"].any() else None
+    error = pd.Series(scores.samples["error_db"])
+    left = error - error.groupby(station[scores.row]).transform("mean")
+    return float((left**2).mean() ** 0.5) if left.notna().any() else None
 
 
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
@@ -45,9 +44,11 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     if data.station is None:
         return {}
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
+    # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
+    most = np.where(data.censored_side(row) < 0, data.target[row, 0] * data.site.target_scale, np.nan)
     every = pd.DataFrame({
         "fold": scores.fold, "place": place[row], "station": data.station[row],
-        "predicted": scores.samples["prediction"], "measured": scores.samples["target"],
+        "predicted": scores.samples["prediction"], "measured": np.fmax(scores.samples["target"], most),
     })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.
     links = every.groupby(["fold", "place", "station"]).max()
