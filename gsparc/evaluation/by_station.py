@@ -17,14 +17,6 @@ WORST = 3  # stations shown; the file has all
 ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
 
 
-def errors_by_station(scores: Scores, station: np.ndarray, name: str = ERRORS[0]) -> pd.DataFrame:
-    """Return `rows`, `bias` and `rmse` [dB] of the errors `name` of each `station` (n,) of all rows."""
-    errors = pd.DataFrame({"error": scores.samples[name], "square": scores.samples[name] ** 2})
-    by = errors.groupby(station[scores.row])
-    means = by.mean()
-    return pd.DataFrame({"rows": by["error"].count(), "bias": means.error, "rmse": means.square**0.5})
-
-
 def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
     """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
 
@@ -69,11 +61,13 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
     columns: dict[str, Any] = {}
     for stem, one in methods.items():
         for name in [name for name in ERRORS if name in one.samples]:
-            by, figure = errors_by_station(one, data.station, name), name.replace("error", "rmse")
+            error = pd.DataFrame({"mean": one.samples[name], "square": one.samples[name] ** 2})
+            by, figure = error.groupby(data.station[one.row]), name.replace("error", "rmse")
+            means, rows = by.mean(), by["mean"].count()
             for head, names in data.site.stations.named.items():
-                columns.setdefault(head, np.array(names)[by.index])
-            columns |= {name.replace("error_db", "rows"): by["rows"], stem + figure: by.rmse}
-            columns |= {f"{stem}bias_db": by.bias} if name == ERRORS[0] else {}
+                columns.setdefault(head, np.array(names)[rows.index])
+            columns |= {name.replace("error_db", "rows"): rows, stem + figure: means.square**0.5}
+            columns |= {f"{stem}bias_db": means["mean"]} if name == ERRORS[0] else {}
     return {name: np.asarray(values) for name, values in columns.items()}
 
 

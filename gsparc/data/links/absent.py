@@ -74,8 +74,8 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
         how = f"not heard, below the weakest of each station ({limits})"
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
-        weakest, floor = levels[heard].min(), np.broadcast_to(np.nan if floor is None else floor, count)
-        floor = np.where(np.isnan(floor), weakest, floor)
+        stated = np.full(count, np.nan if floor is None else floor)
+        floor = np.nan_to_num(stated, nan=levels[heard].min())
         may = np.isnan(lists.level)
         how = "one that a full list leaves out is below its weakest"
         how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"

@@ -149,8 +149,7 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     for mark in marks if given is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
         said = f"{share}, apart from all others: taken as not heard, below {floor}"
-        say = "dataset.not_heard=[] keeps them as levels, sensitivity_db (of a table dataset.columns."
-        say += "sensitivity_db=LEVEL) sets that"
+        say = "dataset.not_heard=[] keeps them, sensitivity_db (dataset.columns.sensitivity_db) sets that"
         check.notes.append(Caution(f"{said}; {say}"))
     return silent
 
