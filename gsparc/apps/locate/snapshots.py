@@ -67,8 +67,8 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     quiet = torch.zeros(values.shape, dtype=torch.bool)
     quiet[which, station] = (side > 0)[:, None]
     own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
-    names = [data.row_names[i].partition(", station")[0] for i in rows[first]] if data.row_names else None
-    return Snapshots(site.kind, *own, data.moving[rows][first], None if names is None else np.array(names))
+    names = np.array([name.partition(", station")[0] for name in data.row_names])
+    return Snapshots(site.kind, *own, data.moving[rows][first], names[rows][first] if len(names) else None)
 
 
 def snapshots_of_values(
