@@ -85,6 +85,11 @@ class Locator:
         """Computed once: most of the time of the first snapshot."""
         return self.field.moments_at(torch.from_numpy(self.cells.centre))
 
+    @cached_property
+    def _further(self) -> Locator:
+        """Of the larger box; one, as what it says of its coarse grid takes as long."""
+        return replace(self, cells=self.wider)
+
     def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
         """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
         current = Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
@@ -106,7 +111,7 @@ class Locator:
     def locate(self, heard: Snapshots) -> Iterator[Located]:
         """Yield where each of n snapshots was heard."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
-        further, box = replace(self, cells=self.wider), self.cells.box()
+        box = self.cells.box()
 
         def one(number: int) -> Located:
             started, one, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
@@ -117,7 +122,7 @@ class Locator:
             # What may be as likely beyond the edge touches it; 1 % for rounding.
             if unlike or beyond_box(likely.centre, box, 0.51 * likely.edge).any():
                 doubt = DOUBTS["unlike"] * unlike
-                wide = further.search_cells(one, self.trust)
+                wide = self._further.search_cells(one, self.trust)
                 if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
                     search, doubt = wide, DOUBTS["beyond"]
             posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
