@@ -158,13 +158,13 @@ def learn_trust(
         pairs += [(without, heard.subset(np.array([row]))) for row in sample]
     places = np.concatenate([heard.place for _, heard in pairs])
 
-    def looks(trust: Trust) -> list[Search]:
-        what = "snapshots that were left out"
+    def looks(trust: Trust, number: int) -> list[Search]:
+        what = f"snapshots that were left out, pass {number} of 2"
         return run_all(lambda pair: pair[0].search_cells(pair[1], trust), pairs, what)
 
-    trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
+    trust = calibrate_trust(looks(locator.trust, 1), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.
-    return calibrate_level(trust, looks(trust), places, locator.share), len(places)
+    return calibrate_level(trust, looks(trust, 2), places, locator.share), len(places)
 
 
 def trust_state(trust: Trust, unknown: Nuisances, share: float, **learned: Any) -> dict[str, Any]:
@@ -175,14 +175,14 @@ def trust_state(trust: Trust, unknown: Nuisances, share: float, **learned: Any) 
 def restore_trust(extra: Mapping[str, Any], unknown: Nuisances, share: float) -> Trust:
     """Return the trust that `trust_state` held.
 
-    Where nothing was, areas are as wide as the model's own variances say, which is logged.
+    Where nothing was, a tenth of the values counts as independent (see `Trust`), which is logged.
 
     Raises:
         ValueError: it was learned for other settings.
     """
     stored = extra.get(KEY)
     if stored is None:
-        log.warning("locate: never calibrated (run gsparc locate): areas follow the model's own variances")
+        log.warning("locate: not calibrated: areas may be several times too large; gsparc locate calibrates")
         return Trust(level=share)
     before, promised = Nuisances(**stored["unknown"]), stored["share"]
     if (before, promised) != (unknown, share):
