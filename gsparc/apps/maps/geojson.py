@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,7 +88,7 @@ def read_shapes(
     return shapely.union_all(shapely.make_valid(polygons)), list(lines)
 
 
-def write_shapes(path: Path, shapes: Iterable[tuple[str, Any, Any]]) -> None:
+def write_shapes(path: Path, shapes: list[tuple[str, Any, Any]]) -> None:
     """Write shapes, each its type, coordinates and properties."""
     features = [
         {"type": "Feature", "properties": facts, "geometry": {"type": kind, "coordinates": at}}
