@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, show_names
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
 from gsparc.evaluation.scores import FEW, Scores
 from gsparc.evaluation.table import Column, Table
@@ -87,8 +87,12 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
     every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
+    if len(rows) < 2:
+        return []
     better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
     note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
+    if rows.get("rows_with_silent", rows["rows"]).gt(rows["rows"]).any():
+        note += f"{'; ' * bool(note)}its bias_db: of heard rows, below 0 where unheard ones are learned from"
     title = "rmse_db of the worst stations; by_station.csv has all"
-    worst = Table.from_rows(title, shown, rows[:WORST].to_dict("records"), note=note)
-    return [worst] if len(rows) > 1 else []
+    named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
+    return [Table.from_rows(title, shown, named[:WORST].to_dict("records"), note=note)]

@@ -70,6 +70,16 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     assert rows[-1][heads.index("best_server")] == f"{found.facts['test/best_server']:.1%}"
 
 
+def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meaning():
+    """`150` of `W03-2 (150)`, and -3.5 dB that is the choice of heard rows."""
+    rows = {"rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [-3.5, -1.0]}
+    columns = {"station": ["150", "212"], "cell": ["W03-2", "212"], **rows}
+    (listed,) = worst_stations(columns, "gp")
+    assert [row[0] for row in listed.texts()[1]] == ["W03-2 (150)", "212"] and not listed.note
+    (silent,) = worst_stations({**columns, "rows_with_silent": [12, 40]}, "gp")
+    assert silent.note.startswith("its bias_db: of heard rows, below 0 where unheard")
+
+
 def test_a_constant_of_each_station_is_what_is_left_out(drive):
     """The figure is that of errors less the mean of their station."""
     error = np.random.default_rng(0).normal(size=len(drive)) + 7.0 * drive.station
