@@ -53,7 +53,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         "place/candidates": len(found.places), "place/threshold_db": level,
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
-    told = "with a station at " + at + ", {nearest_m:.4g} m from the next: {coverage:.1%}, gaining {gain:.1%}"
+    next_one = ", {nearest_m:.4g} m from the next" * (best["nearest_m"] is not None)  # at a known place
+    told = "with a station at " + at + next_one + ": {coverage:.1%}, gaining {gain:.1%}"
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
         interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain {gain_low:.1%} to {gain_high:.1%}"

@@ -117,6 +117,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     check = Checker(raw, str(source))
     check.check_names()
     measured = check.measurement()
+    stated = {name: "stated" for name in raw.arrays if name == "sensitivity_db"}  # lists add one of their own
     about = _attributes(check, Path(source).stem, measured)
     links = None if measured is None else expand_links(check, measured, part)
     # Without a measurement no array has a length to be checked against: nothing more can be said.
@@ -178,7 +179,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         subcarriers_hz=frequency if kind == "csi" else None, stations=links.stations,
         georeference=links.georeference, **about,
     )  # fmt: skip
-    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES}
+    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
         station=links.station, place=links.place, censored=links.censored, run=links.run,

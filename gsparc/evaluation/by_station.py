@@ -17,23 +17,14 @@ WORST = 3  # stations shown; the file has all
 ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
 
 
-def errors_by_station(scores: Scores, station: np.ndarray, name: str = ERRORS[0]) -> pd.DataFrame:
-    """Return `rows`, `bias` and `rmse` [dB] of the errors `name` of each `station` (n,) of all rows."""
-    errors = pd.DataFrame({"error": scores.samples[name], "square": scores.samples[name] ** 2})
-    by = errors.groupby(station[scores.row])
-    means = by.mean()
-    return pd.DataFrame({"rows": by["error"].count(), "bias": means.error, "rmse": means.square**0.5})
-
-
 def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
     """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
 
     Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
     """
-    by = errors_by_station(scores, station)
-    # NaN where no row has an error.
-    mean = (by["rows"] * (by.rmse**2 - by.bias**2)).sum() / max(by["rows"].sum(), 1)
-    return float(mean**0.5) if by["rows"].any() else None
+    error = pd.Series(scores.samples["error_db"])
+    left = error - error.groupby(station[scores.row]).transform("mean")
+    return float((left**2).mean() ** 0.5) if left.notna().any() else None
 
 
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
@@ -45,9 +36,11 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     if data.station is None:
         return {}
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
+    # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
+    most = np.where(data.censored_side(row) < 0, data.target[row, 0] * data.site.target_scale, np.nan)
     every = pd.DataFrame({
         "fold": scores.fold, "place": place[row], "station": data.station[row],
-        "predicted": scores.samples["prediction"], "measured": scores.samples["target"],
+        "predicted": scores.samples["prediction"], "measured": np.fmax(scores.samples["target"], most),
     })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.
     links = every.groupby(["fold", "place", "station"]).max()
@@ -68,11 +61,13 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
     columns: dict[str, Any] = {}
     for stem, one in methods.items():
         for name in [name for name in ERRORS if name in one.samples]:
-            by, figure = errors_by_station(one, data.station, name), name.replace("error", "rmse")
+            error = pd.DataFrame({"mean": one.samples[name], "square": one.samples[name] ** 2})
+            by, figure = error.groupby(data.station[one.row]), name.replace("error", "rmse")
+            means, rows = by.mean(), by["mean"].count()
             for head, names in data.site.stations.named.items():
-                columns.setdefault(head, np.array(names)[by.index])
-            columns |= {name.replace("error_db", "rows"): by["rows"], stem + figure: by.rmse}
-            columns |= {f"{stem}bias_db": by.bias} if name == ERRORS[0] else {}
+                columns.setdefault(head, np.array(names)[rows.index])
+            columns |= {name.replace("error_db", "rows"): rows, stem + figure: means.square**0.5}
+            columns |= {f"{stem}bias_db": means["mean"]} if name == ERRORS[0] else {}
     return {name: np.asarray(values) for name, values in columns.items()}
 
 

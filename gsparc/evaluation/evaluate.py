@@ -62,6 +62,8 @@ class Evaluation:
         for name, columns in (("per_sample.csv", self.columns), ("by_station.csv", self.stations)):
             if columns:
                 write_samples(folder / name, columns | shared)
+            else:
+                (folder / name).unlink(missing_ok=True)  # of an earlier run, of other data
 
 
 def evaluate(

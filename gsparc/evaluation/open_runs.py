@@ -372,9 +372,7 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
         have = ["one static end" if of is None else f"{len(of)} stations" for of in (ours, theirs)]
         raise ValueError(f"{data.site.name} has {have[0]}, the model {have[1]}; {ANOTHER}")
     # A list of cells has names of its own beside those that a drive gives them.
-    called, known = (
-        [{*pair} for pair in zip(of.name, of.label or of.name, strict=True)] for of in (ours, theirs)
-    )
+    called, known = ([*map(set, zip(of.name, of.label or of.name, strict=True))] for of in (ours, theirs))
     gap = np.linalg.norm(ours.position[:, None] + shift - theirs.position, axis=2)
     number = np.full(len(ours), -1)
     for t, names in enumerate(called):
@@ -400,9 +398,7 @@ def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.
     lost, kept = ([ours.name[t] for t in np.flatnonzero(flags)] for flags in (unknown, ~unknown))
     fault = f"stations {list_first(lost)} of {source} are none of the model's, {list_first(theirs.name)}"
     if not {*all_names(ours)} & {*all_names(theirs)}:
-        way = (
-            "dataset.columns.station=COLUMN takes another column's names, dataset.stations_file=FILE a list's"
-        )
+        way = "dataset.columns.station=COLUMN takes another column, dataset.stations_file=FILE a list"
         return f"{fault}: no name in common; {way} that has both"
     return f"{fault}, by name and place; leave them out: dataset.stations=[{list_first(kept, 9)}]"
 

@@ -72,8 +72,11 @@ class ChannelResponse(nn.Module):
         """Return channels (B, A, K) complex of visible gains (B, N) complex."""
         delays = self.delays.double() / self.subcarriers  # in periods of the mean tone spacing
         phase = -2 * math.pi * torch.outer(delays, self.numbers).to(weighted.real.dtype)
-        comb = torch.polar(torch.ones_like(phase), phase)
-        return torch.einsum("bn,na,nk->bak", weighted, torch.view_as_complex(self.steering), comb)
+        parts = {"bn": weighted, "na": torch.view_as_complex(self.steering)}
+        parts["nk"] = torch.polar(torch.ones_like(phase), phase)
+        # The longest last: PyTorch multiplies from left to right, and stores the product of the first two.
+        order = sorted(parts, key=lambda name: parts[name].numel())
+        return torch.einsum(",".join(order) + "->bak", *(parts[name] for name in order))
 
 
 class ArrayResponse(nn.Module):

@@ -73,26 +73,20 @@ class RunFactors(Stored):
         return replace(data, target=target, noise_variance=noise, run=None)
 
 
-def fit_run_factors(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Return what rows are multiplied by to belong to the largest run, (runs,) complex128, by likelihood.
+def factor_matrix(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
+    """Return M (runs, runs) complex128 of the module's text.
 
     Args:
         inverse: (n, n) inverse of the rows' covariance.
         target: (n, D) complex.
         run: (n,) int, numbers 0 to runs - 1, each of which occurs.
     """
-    count = np.bincount(run)
-    return best_run_factors(factor_matrix(inverse, target, run), target.shape[1] * count)
-
-
-def factor_matrix(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> np.ndarray:
-    """Return M (runs, runs) complex128 of the module's text, of arguments as in `fit_run_factors`."""
     member = np.eye(int(run.max()) + 1)[run]
     return member.T @ (inverse * (target.conj() @ target.T)) @ member
 
 
 def best_run_factors(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return factors (runs,) from M (runs, runs), of one process or summed over many, and runs' sizes.
+    """Return what runs are to be multiplied by (runs,), from M (runs, runs) of one process or of many summed.
 
     Args:
         size: (runs,) complex numbers measured in each, above 0; the largest has factor 1.

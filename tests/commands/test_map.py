@@ -107,6 +107,17 @@ def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
     assert facts["place/low"] is None and facts["place/gain"] == pytest.approx(table["gain"].max())
 
 
+def test_a_station_among_others_of_no_known_place_was_no_number_of_metres_away(tmp_path):
+    """`place` ended in `TypeError: unsupported format string`."""
+    values = dict(np.load(town_file(tmp_path / "town.npz")))
+    values["station_position"] = np.full_like(values["station_position"], np.nan)
+    np.savez(tmp_path / "town.npz", **values)
+    path = trained(tmp_path / "town.npz", "gsparc", "stations=together", "split=none")
+    how = ("count=4", "threshold_db=-75", "promised=false", "station_height_m=8")
+    done = run("place", f"ckpt={path}", *how, folder=tmp_path / "to")
+    assert done.status == 0 and not any("from the next" in line for line in done.out), done
+
+
 def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
     began = []
 

@@ -24,6 +24,11 @@ def drive():
     rng = np.random.default_rng(1)
     place, station = np.repeat(np.arange(PLACES), 3), np.tile(np.arange(3), PLACES)
     level = -60 - 0.1 * place - 10.0 * station + rng.normal(size=3 * PLACES) * np.where(station == 1, 8, 0.5)
+    return listed(place, station, level)
+
+
+def listed(place, station, level):
+    """Levels of three stations beside a line."""
     arrays = {
         "rx_position": np.c_[place, np.zeros((len(place), 2))].astype(float), "station": station,
         "station_position": np.array([[0.0, 9, 5], [30, 9, 5], [59, 9, 5]]), "rssi_db": level,
@@ -121,6 +126,33 @@ def test_a_silent_station_that_is_predicted_strongest_is_wrong(drive):
     assert best_server(scored(quiet, truth), quiet) == {"best_server": 1.0}
     loud = np.where(silent & (quiet.place < PLACES // 2), 2 * truth.max(), truth)
     assert best_server(scored(quiet, loud), quiet) == {"best_server": 0.5}
+
+
+def test_a_saturated_station_was_never_the_strongest():
+    """It reports its most, -20 dB, at every second place: right predictions were right at half of them."""
+    place, station = np.repeat(np.arange(PLACES), 3), np.tile(np.arange(3), PLACES)
+    level = np.where(station == 0, np.where(place % 2, -80 - 0.1 * place, -20), -60 - 0.1 * place - station)
+    data = listed(place, station, level)
+    assert (data.censored == -1).sum() == PLACES // 2
+    truth = data.target[:, 0].astype(float)
+    scores = scored(data, truth)
+    scores.samples["target"] *= np.where(data.censored == 0, data.site.target_scale, np.nan)
+    assert best_server(scores, data) == {"best_server": 1.0}
+
+
+def test_errors_equal_at_each_station_ended_in_nan(drive):
+    """A root of rounding below 0 ended `split=stations` after training: a summary takes no NaN."""
+    for seed in range(9):
+        error = np.random.default_rng(seed).normal(0, 10, 3)[drive.station]
+        assert rmse_after_constants(scored(drive, error, error), drive.station) == pytest.approx(0, abs=1e-6)
+
+
+def test_stations_of_an_earlier_evaluation_stayed_in_the_folder(drive, tmp_path):
+    """Another of one station left `by_station.csv` of other data beside its own figures."""
+    found = evaluated(drive, [])
+    found.write(tmp_path)
+    replace(found, stations={}).write(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["per_sample.csv"]
 
 
 def test_a_lead_with_silent_rows_hid_a_loss_on_heard_ones():

@@ -153,7 +153,7 @@ def locate_by_model(
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
-    own = "by the model's own variances, which nothing tested (calibrate=0)"
+    own = "are not calibrated (calibrate=0): areas may be several times too large"
     own = "are promised" if config.calibrate or stored else own
     promise = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0

@@ -85,6 +85,11 @@ class Locator:
         """Computed once: most of the time of the first snapshot."""
         return self.field.moments_at(torch.from_numpy(self.cells.centre))
 
+    @cached_property
+    def _further(self) -> Locator:
+        """Of the larger box; one, as what it says of its coarse grid takes as long."""
+        return replace(self, cells=self.wider)
+
     def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
         """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
         current = Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
@@ -106,7 +111,7 @@ class Locator:
     def locate(self, heard: Snapshots) -> Iterator[Located]:
         """Yield where each of n snapshots was heard."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
-        further, box = replace(self, cells=self.wider), self.cells.box()
+        box = self.cells.box()
 
         def one(number: int) -> Located:
             started, one, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
@@ -117,7 +122,7 @@ class Locator:
             # What may be as likely beyond the edge touches it; 1 % for rounding.
             if unlike or beyond_box(likely.centre, box, 0.51 * likely.edge).any():
                 doubt = DOUBTS["unlike"] * unlike
-                wide = further.search_cells(one, self.trust)
+                wide = self._further.search_cells(one, self.trust)
                 if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
                     search, doubt = wide, DOUBTS["beyond"]
             posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
@@ -153,13 +158,13 @@ def learn_trust(
         pairs += [(without, heard.subset(np.array([row]))) for row in sample]
     places = np.concatenate([heard.place for _, heard in pairs])
 
-    def looks(trust: Trust) -> list[Search]:
-        what = "snapshots that were left out"
+    def looks(trust: Trust, number: int) -> list[Search]:
+        what = f"snapshots that were left out, pass {number} of 2"
         return run_all(lambda pair: pair[0].search_cells(pair[1], trust), pairs, what)
 
-    trust = calibrate_trust(looks(locator.trust), places, locator.share, locator.trust)
+    trust = calibrate_trust(looks(locator.trust, 1), places, locator.share, locator.trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.
-    return calibrate_level(trust, looks(trust), places, locator.share), len(places)
+    return calibrate_level(trust, looks(trust, 2), places, locator.share), len(places)
 
 
 def trust_state(trust: Trust, unknown: Nuisances, share: float, **learned: Any) -> dict[str, Any]:
@@ -170,14 +175,14 @@ def trust_state(trust: Trust, unknown: Nuisances, share: float, **learned: Any) 
 def restore_trust(extra: Mapping[str, Any], unknown: Nuisances, share: float) -> Trust:
     """Return the trust that `trust_state` held.
 
-    Where nothing was, areas are as wide as the model's own variances say, which is logged.
+    Where nothing was, a tenth of the values counts as independent (see `Trust`), which is logged.
 
     Raises:
         ValueError: it was learned for other settings.
     """
     stored = extra.get(KEY)
     if stored is None:
-        log.warning("locate: never calibrated (run gsparc locate): areas follow the model's own variances")
+        log.warning("locate: not calibrated: areas may be several times too large; gsparc locate calibrates")
         return Trust(level=share)
     before, promised = Nuisances(**stored["unknown"]), stored["share"]
     if (before, promised) != (unknown, share):

@@ -12,7 +12,7 @@ from gsparc.apps.locate.snapshots import flatten_targets
 from gsparc.data.query import Query
 from gsparc.prediction.predictor import Predictor
 
-CHUNK = 512  # places that are asked about at a time
+CHUNK = 1024  # values that are asked for at a time: all stations of some places, which share their work
 DB = 10 / np.log(10)
 
 
@@ -53,7 +53,7 @@ class SiteField:
         Raises:
             ValueError: the model states no variance.
         """
-        parts = [self._chunk(chunk) for chunk in places.split(CHUNK)]
+        parts = [self._chunk(chunk) for chunk in places.split(max(CHUNK // self.count, 1))]
         return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
 
     def _chunk(self, places: Tensor) -> Moments:
@@ -62,16 +62,14 @@ class SiteField:
         query = Query.from_places(site, places.float().repeat_interleave(self.count, 0), station)
         prediction = self.predictor.predict_query(query)
         if prediction.variance is None:
-            name = self.predictor.method.name
-            raise ValueError(f"locate: {name} states no variance, and has no likelihood of a place")
+            raise ValueError(f"locate: {self.predictor.method.name} states no variance of what is heard")
         mean, variance = flatten_targets(prediction.mean), prediction.variance.double()[:, None]
         if site.kind == "spectrum":
             return Moments(mean.double(), variance)
         if site.kind == "rssi":
             power = mean.double().clamp_min(1e-30)
             return self._joined(10 * power.log10(), DB**2 * variance / power.square())
-        mean = mean.to(torch.complex128)
-        return self._joined(mean, variance.expand(mean.shape))
+        return self._joined(mean.to(torch.complex128), variance.expand(mean.shape))
 
     def _joined(self, mean: Tensor, variance: Tensor) -> Moments:
         """Of rows by place and station (G T, p): (G, T p)."""

@@ -49,10 +49,9 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
 def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
     """Warn of latitudes and longitudes (n,) [deg] on Earth that may be swapped, or radians."""
     where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
-    if np.median(latitude) < -60:
-        return [f"the places lie in the Antarctic ({where}): latitude and longitude swapped?"]
-    if np.median(latitude) > 75:
-        return [f"the places lie in the Arctic ({where}): latitude and longitude swapped?"]
+    if not -60 <= np.median(latitude) <= 75:
+        pole = "Antarctic" if np.median(latitude) < 0 else "Arctic"
+        return [f"the places lie in the {pole} ({where}): latitude and longitude swapped?"]
     if np.abs(latitude).max() <= np.pi / 2 and np.abs(longitude).max() <= np.pi:
         sea = f"the places lie in the Gulf of Guinea ({where}), at sea"
         return [f"{sea}: radians? write degrees, or [rad] in the heads of a table"]
@@ -78,17 +77,22 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 
 def floor_warnings(levels: LinkLevels) -> list[str]:
     """Warn of stations whose levels pile up at a receiver's own noise, or lowest reading."""
-    heard = {_of([levels.names[t]], len(levels.names)): levels.level_db[used] for t, used in levels.heard()}
+    heard = [(t, levels.level_db[used]) for t, used in levels.heard() if t not in levels.limited]
     # Of a station that is seldom heard weak levels are missing, not piled up.
-    often = max(map(len, heard.values()), default=0) / 2
-    found = [(who, find_floor_pile(level)) for who, level in heard.items() if len(level) >= often]
-    every = [("", find_floor_pile(levels.level_db[np.isfinite(levels.level_db)]))]
-    piles = [(who, *pile) for who, pile in found if pile] or [(who, *pile) for who, pile in every if pile]
-    said = list_first([f"{share:.0%} of the levels{who} below {top:.4g} dB" for who, top, share in piles])
+    often = max((len(level) for _, level in heard), default=0) / 2
+    found = {t: find_floor_pile(level) for t, level in heard if len(level) >= often}
+    piles = [(_of([levels.names[t]], len(levels.names)), *pile) for t, pile in found.items() if pile]
+    if not piles and not levels.limited:
+        every = find_floor_pile(levels.level_db[np.isfinite(levels.level_db)])
+        piles = [("", *every)] if every else []
+    # Upwards, so that levels below what is said are those of the pile; single precision has errors of 1e-6.
+    said = [(who, float(np.ceil(round(100 * top, 3)) / 100), share) for who, top, share in piles]
+    shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in said])
     return [
-        f"not heard? {said}, a receiver's noise or lowest reading, are learned as signals; dataset.columns."
-        f"sensitivity_db={top:.4g} (or a column of stations, of each its own) takes levels below as not heard"
-        for top in sorted(top for _, top, _ in piles)[-1:]
+        f"not heard? {shares}, a receiver's noise or lowest reading, are learned as signals; sensitivity_db="
+        f"{top:g} in the file (of a table dataset.columns.sensitivity_db={top:g}, or a column of stations, "
+        "of each its own) takes levels below as not heard"
+        for top in sorted(top for _, top, _ in said)[-1:]
     ]
 
 
@@ -287,6 +291,7 @@ class LinkLevels:
         file_row: (n,) its number from 0.
         names: (T,) of the stations.
         station_position: (T, 3), in the world [m]; None where it is not known.
+        limited: stations with rows below a level of hearing that the file states.
     """
 
     position: np.ndarray
@@ -296,6 +301,7 @@ class LinkLevels:
     file_row: np.ndarray
     names: list[str]
     station_position: np.ndarray | None
+    limited: frozenset[int] = frozenset()
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each station, and its rows (k,) with a value."""
@@ -321,7 +327,9 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
     link, called = which.reshape(-1) * count + station, data.row_names
-    rows = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
+    side = data.censored_side(np.arange(len(data)))
+    rows = np.flatnonzero(side <= 0)
+    limited = frozenset(station[side > 0].tolist() if "sensitivity_db" in data.provenance else ())
     absent = np.zeros(0, np.int64)
     # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
     # with a station for each place has no empty cells.
@@ -343,4 +351,5 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     known = None if known is None else np.atleast_2d(known) + site.origin
     names = [UNNAMED] if stations is None else list(stations.name)
     number = of_row if file_row is None else file_row[of_row]
-    return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, number, names, known)
+    place = data.moving[of_row] + site.origin
+    return LinkLevels(place, of_link, levels, of_file, number, names, known, limited)

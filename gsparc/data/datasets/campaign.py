@@ -72,10 +72,9 @@ class Campaign(DataModule):
             careful = isinstance(note, Caution)
             if careful or note not in self.told:
                 log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
-        for warning in _implausible(reading.data, reading.file_row):
+        hints = [Severe(f"units? {hint}") for hint in unit_warnings(reading.data)]
+        for warning in [*_implausible(reading.data, reading.file_row), *hints]:
             log.warning("%s: %s", self.file, warning)
-        for hint in unit_warnings(reading.data):
-            log.warning("%s: %s", self.file, Severe(f"units? {hint}"))
         return reading.data
 
 

@@ -74,10 +74,11 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
         how = f"not heard, below the weakest of each station ({limits})"
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
-        floor = np.broadcast_to(levels[heard].min() if floor is None else floor, count)
+        stated = np.full(count, np.nan if floor is None else floor)
+        floor = np.nan_to_num(stated, nan=levels[heard].min())
         may = np.isnan(lists.level)
         how = "one that a full list leaves out is below its weakest"
-        how += f", in lists shorter than {lists.length}: below {np.nanmin(floor):.4g} dB"
+        how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"
     if not wanted:
         flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
         unknown = f"{missing} with dataset.absent=unknown: {flattered}; leave absent out"

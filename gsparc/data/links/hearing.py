@@ -66,9 +66,11 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
     censored = saturated = np.zeros(len(values), bool)
     if measured == "rssi_db" and values.ndim == 1:
         unheard = _without_marks(check, values, floor) & marked
-        heard = values[~unheard & np.isfinite(values)]
+        heard = values[~unheard & np.isfinite(values)].astype(float)
         unknown |= unheard
         if floor is not None:
+            # Of what is marked as not heard the weakest bounds it where no level is stated.
+            floor = np.where(unheard & np.isnan(floor), heard.min(initial=np.inf), floor)
             unknown |= _below_floor(check, values, floor, ~unknown & marked, unknown & marked)
             censored = unknown & marked & ~np.isnan(floor)
         elif unheard.any() and len(heard):
@@ -147,7 +149,7 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     for mark in marks if given is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
         said = f"{share}, apart from all others: taken as not heard, below {floor}"
-        say = "dataset.not_heard=[] keeps them as levels, dataset.columns.sensitivity_db=LEVEL sets that"
+        say = "dataset.not_heard=[] keeps them, sensitivity_db (dataset.columns.sensitivity_db) sets that"
         check.notes.append(Caution(f"{said}; {say}"))
     return silent
 

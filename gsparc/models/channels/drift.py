@@ -12,7 +12,6 @@ from gsparc.models.channels.columns import Group, thin_groups
 from gsparc.models.channels.evidence import BasisGroup, fit_terms, solve_group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Drift, Noise
-from gsparc.models.channels.terms.compressed import Dense
 
 STRETCH = 400  # rows looked at
 COLUMNS = 3  # groups looked at
@@ -45,7 +44,7 @@ def fit_drift(
     drift, noise, parts = Drift(frame, start[:2]), Noise(frame, start[2:]), []
     for group, signal in zip(groups, signals, strict=True):
         eye = torch.eye(len(group), dtype=torch.float64)
-        held = Dense(signal[None]), Dense(drift.correlations(group, group).to(torch.complex128))
+        held = signal[None], drift.correlations(group, group).to(torch.complex128)
         # No parameter of these terms changes the signal.
         parts.append(BasisGroup.from_group(group, eye, held, torch.eye(1 + len(SHARES)).double()[:, 1:]))
     white = torch.tensor([1.0, 0.0, 0.0, level], dtype=torch.float64)

@@ -18,7 +18,7 @@ from torch import Tensor
 from gsparc.models.channels.columns import Group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Isotropic, Noise
-from gsparc.models.channels.terms.compressed import Basis, Cache, Piece, get_or_make
+from gsparc.models.channels.terms.compressed import Basis, Cache, change_basis, get_or_make
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
@@ -39,7 +39,7 @@ class BasisGroup:
     Attributes:
         group: whose, with targets of unit mean square.
         basis: (n, r) float64 of orthonormal columns.
-        pieces: of the signal, in the order of powers; after them comes the noise's.
+        pieces: (p, r, r) complex128 of each term of the signal, in the order of powers; the noise has none.
         design: (P, Q), logarithms of own powers are its products with all parameters of signal and noise.
         target: (r, D) complex128.
         rest: sum of squares outside the basis.
@@ -47,13 +47,13 @@ class BasisGroup:
 
     group: Group
     basis: Tensor
-    pieces: tuple[Piece, ...]
+    pieces: tuple[Tensor, ...]
     design: Tensor
     target: Tensor
     rest: float
 
     @staticmethod
-    def from_group(group: Group, basis: Tensor, pieces: tuple[Piece, ...], design: Tensor) -> BasisGroup:
+    def from_group(group: Group, basis: Tensor, pieces: tuple[Tensor, ...], design: Tensor) -> BasisGroup:
         """Return it with the group's targets in the basis."""
         target = basis.T.to(torch.complex128) @ group.target
         rest = max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
@@ -115,7 +115,7 @@ def compress_groups(
         key = group.displacement_key, group.slot.wavenumber, prior.frame.envelope, noise
         alike = partial(prior[Isotropic].correlation, group, group)
         basis = get_or_make(cache, key, partial(Basis.from_matrix, key, group.places, alike, noise, cache))
-        pieces = tuple(one for term in prior.signals for one in term.unit_covariances_in_basis(group, basis))
+        pieces = tuple(term.unit_covariances_in_basis(group, basis) for term in prior.signals)
         design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
         parts.append(BasisGroup.from_group(group, basis.columns, pieces, design))
     return tuple(parts)
@@ -126,7 +126,7 @@ def drop_rows(part: BasisGroup, mask: Tensor) -> BasisGroup:
     rest = torch.nonzero(~mask).flatten()
     # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
     basis, mixed = torch.linalg.qr(part.basis[rest])
-    pieces = tuple(piece.change_basis(mixed) for piece in part.pieces)
+    pieces = tuple(change_basis(piece, mixed.T) for piece in part.pieces)
     return BasisGroup.from_group(part.group.select_rows(rest), basis, pieces, part.design)
 
 
@@ -134,9 +134,9 @@ def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     """Factor a group's covariance with its own powers (P,)."""
     size, noise = len(part.target), float(power[-1])
     covariance = torch.zeros(size, size, dtype=torch.complex128)
-    powers = power[:-1].split([piece.count_powers for piece in part.pieces])
+    powers = power[:-1].to(torch.complex128).split([len(piece) for piece in part.pieces])
     for piece, level in zip(part.pieces, powers, strict=True):
-        covariance = piece.add_to(covariance, level)
+        covariance += torch.tensordot(level, piece, 1)
     covariance.diagonal().add_(noise)
     given = Conditioned.from_gram(covariance, part.target)
     count, outputs = part.group.target.shape
@@ -155,7 +155,9 @@ def power_gradient(part: BasisGroup, power: Tensor, at: SolvedGroup) -> Tensor:
     noise = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[-1]
     # Slope of `rest / (scale noise)`, the quadratic form outside the basis.
     noise = noise - part.rest / (at.scale * power[-1] ** 2)
-    return torch.cat([*(piece.traces_of_products(weight) for piece in part.pieces), noise[None]]) * power
+    # Traces of products of Hermitian matrices.
+    slopes = [(piece.flatten(1) @ weight.mT.flatten()).real for piece in part.pieces]
+    return torch.cat([*slopes, noise[None]]) * power
 
 
 def negative_log_evidence(parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> float:

@@ -1,7 +1,7 @@
 """Complex factors of antennas: cables and converters give each of an array a gain and a phase of its own.
 
 They are the same at all places, so that aligned rows `u_e y` follow the process of calibrated antennas; the
-factors of largest likelihood are found as those of runs are (`fit_run_factors`), first against the direct
+factors of largest likelihood are found as those of runs are (`best_run_factors`), first against the direct
 path alone, then against all sources found. They are used where they gain more than their number costs:
 G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
 """
@@ -18,7 +18,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import Scene
-from gsparc.models.run_factors import fit_run_factors
+from gsparc.models.run_factors import best_run_factors, factor_matrix
 
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 
@@ -42,7 +42,8 @@ def find_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     conditioned = Posterior(rows, scene).conditioned
     known, run = np.unique(rows.element.numpy(), return_inverse=True)
     inverse = conditioned.factor.inverse.to(torch.complex128).numpy()
-    estimate = fit_run_factors(inverse, rows.target.to(torch.complex128).numpy(), run)
+    quadratic = factor_matrix(inverse, rows.target.to(torch.complex128).numpy(), run)
+    estimate = best_run_factors(quadratic, rows.target.shape[1] * np.bincount(run))
     each = np.ones(len(rows.array), np.complex128)
     each[known] = estimate / estimate[0]
     factors = torch.from_numpy(each.astype(np.complex64))

@@ -33,7 +33,6 @@ from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.weights import explained_variance, in_error_unit
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
-from gsparc.models.splat.method import QUERY_CHUNK
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
@@ -42,6 +41,7 @@ from gsparc.training.cost import Cost
 from gsparc.training.time_budget import worst_clock
 
 log = logging.getLogger(__name__)
+QUERY_CHUNK = 1024  # memory; stations at one place share most of their work, see `ChannelField`
 # Of fields, in words.
 PARTS = {"power": "a trend of levels", "residual": "a process of what is left"}
 
@@ -229,9 +229,8 @@ class Mixture(LearnsTogether, ClosedForm):
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
         # Members are in closed form, and state both.
-        mean, variance = mixture_moments(
-            [(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs]
-        )
+        told = [(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs]
+        mean, variance = mixture_moments(told)
         unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
         parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))

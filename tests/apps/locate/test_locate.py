@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 import towns
 from campaigns import powers, spectra
 
@@ -13,9 +14,11 @@ from gsparc.apps.locate import locate
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import trust_state
 from gsparc.apps.locate.search import Nuisances
+from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import group_snapshots
 from gsparc.data.own import from_arrays
 from gsparc.models import checkpoint
+from gsparc.prediction.predictor import Predictor
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +43,7 @@ def test_areas_are_those_that_were_calibrated(trained, caplog):
     spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
     with caplog.at_level(logging.WARNING):
         before = locate(predictor, spectrum)[0]
-    assert "never calibrated" in caplog.text
+    assert "not calibrated" in caplog.text
     checkpoint.update_extra(trained, trust_state(Trust(spread=0.2), Nuisances(), 0.9))
     after = locate(gsparc.load(trained), spectrum)[0]
     assert after.area > 2 * before.area
@@ -55,6 +58,28 @@ def test_a_snapshot_unlike_all_that_were_left_out_had_an_area_as_any_other(train
     like = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
     unlike = np.roll(np.asarray(like), like.shape[-1] // 2, -1)[..., ::-1, :].copy()
     assert [bool(one.doubt) for one in locate(predictor, np.concatenate([like, unlike]))] == [False, True]
+
+
+def test_the_larger_box_was_asked_about_again_by_each_call(trained, tmp_path, monkeypatch):
+    path = shutil.copy(trained, tmp_path / "model.ckpt")
+    checkpoint.update_extra(path, trust_state(Trust(worst=0.0), Nuisances(), 0.9))
+    predictor, asked, moments = gsparc.load(path), [], SiteField.moments_at
+    spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
+    counted = lambda field, places: asked.append(len(places)) or moments(field, places)  # noqa: E731
+    monkeypatch.setattr(SiteField, "moments_at", counted)
+    for _ in range(2):
+        locate(predictor, spectrum)
+    assert sum(count > 1_000 for count in asked) == 2, "the coarse grids of both boxes, once each"
+
+
+def test_stations_at_one_place_were_asked_in_different_parts(tmp_path, monkeypatch):
+    """What 42 antennas share of a place was computed for each part: 2 times as long."""
+    predictor, rows, answer = gsparc.load(towns.town_model()), [], Predictor.predict_query
+    counted = lambda self, query: rows.append(len(query)) or answer(self, query)  # noqa: E731
+    monkeypatch.setattr(Predictor, "predict_query", counted)
+    monkeypatch.setattr("gsparc.apps.locate.site_field.CHUNK", 9)
+    SiteField(predictor).moments_at(torch.from_numpy(np.tile(predictor.site.moving_box[:1, :3], (7, 1))))
+    assert rows == [8, 6], "of two stations"
 
 
 def test_missing_and_silent_stations_are_no_values(tmp_path):

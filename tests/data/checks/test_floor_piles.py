@@ -49,7 +49,43 @@ def test_a_lowest_reading_of_few_rows_is_found():
     arrays = {"rx_position": place, "station_position": posts, "station": np.arange(600) % 30}
     data = from_arrays(arrays | {"rssi_db": levels}, {"absent": "unknown"})
     (line,) = floor_warnings(link_levels(data))
-    assert line.startswith(f"not heard? 10% of the levels below {after:.4g} dB, a receiver's noise or lowest")
+    assert line.startswith(f"not heard? 10% of the levels below {said(after)} dB, a receiver's noise or")
+
+
+def said(level: float) -> str:
+    """As warnings write a level: hundredths, upwards."""
+    return f"{np.ceil(100 * level) / 100:g}"
+
+
+def told(levels: np.ndarray, **more: object) -> list[str]:
+    """What is said of levels (n, T) of stations."""
+    place, posts = np.random.default_rng(0).uniform(0, 99, (len(levels), 3)), 50 * np.eye(levels.shape[1], 3)
+    arrays = {"rx_position": place, "station_position": posts, "rssi_db": levels}
+    return floor_warnings(link_levels(from_arrays(arrays | more)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_advice_on_a_floor_did_nothing_and_was_given_again(seed):
+    """Rounded to a tenth, `sensitivity_db=-121.2` lay below the lowest reading of -121.24 dB."""
+    levels = np.maximum(drive(seed), np.quantile(drive(seed), 0.5))[:, None]
+    (line,) = told(levels)
+    level = float(line.partition("; sensitivity_db=")[2].split()[0])
+    assert level > levels.min() and told(levels, sensitivity_db=np.array(level)) == []
+
+
+def test_a_stated_floor_was_called_too_low():
+    """Who followed the advice was told of the next station and of a higher level; one not stated is named."""
+    levels = np.stack([noisy(drive(seed), 0.8, seed) for seed in range(2)], 1)
+    low = np.quantile(levels, 0.1, axis=0)
+    assert len(told(levels)) == 1 and told(levels, sensitivity_db=np.array(low.max())) == []
+    (line,) = told(levels, sensitivity_db=np.array([np.nan, low[1]]))
+    assert "levels of station 0 below" in line
+
+
+def test_the_advice_on_a_floor_was_refused_for_files_of_arrays():
+    """`dataset.columns` goes with tables alone; marks named it, too."""
+    (line,) = told(noisy(drive(0), 0.8, 0)[:, None])
+    assert "; sensitivity_db=-110.49 in the file (of a table dataset.columns.sensitivity_db=-110.49" in line
 
 
 def lists(seed: int) -> np.ndarray:
@@ -89,6 +125,6 @@ def test_a_citys_noise_was_learned_as_signal_without_a_word():
 
     (line,) = said("powder-rss-462mhz")
     for part in ("not heard? 60% of the levels of station bookstore-nuc2-b210 below -90.63 dB, 86% of",
-                 "68% of the levels of station ebc-nuc1-b210", "sensitivity_db=-88.89 (or"):  # fmt: skip
+                 "68% of the levels of station ebc-nuc1-b210", "sensitivity_db=-88.89, or"):  # fmt: skip
         assert part in line
     assert line.count("% of the levels") == 4 and said("ble-hall-1") == said("ble-hall-2") == []

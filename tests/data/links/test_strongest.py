@@ -132,6 +132,18 @@ def test_noise_in_lists_of_the_strongest_was_refused():
     assert levels.min() > floor - 1e-3
 
 
+@pytest.mark.parametrize("absent", ["auto", "silent"])
+def test_silence_of_a_station_without_a_stated_level_was_lost(absent, recwarn):
+    """Of an empty column the note said "below nan dB"; what `silent` says of such stations was missing."""
+    arrays, counts = network(0, moments=100).arrays(6), []
+    for sensitivity in (None, np.full(30, np.nan)):
+        more = {} if sensitivity is None else {"sensitivity_db": sensitivity}
+        reading = interpret(Raw(arrays | more, {"absent": absent}), "drive")
+        counts.append((reading.data.censored > 0).sum())
+        assert not any("nan" in note or "missing" in note for note in reading.notes)
+    assert counts[0] == counts[1] and not recwarn.list
+
+
 @pytest.mark.parametrize("share", [0.005, 0.1, 0.5])
 def test_lost_levels_are_below_no_floor(share):
     """At random, and of cells that were off."""

@@ -12,7 +12,7 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import complex_gp
 from gsparc.models.channels.complex_gp import ComplexGP
-from gsparc.models.run_factors import fit_run_factors
+from gsparc.models.run_factors import best_run_factors, factor_matrix
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
@@ -155,7 +155,8 @@ def test_factors_of_many_runs():
     root = np.linalg.cholesky(gram)
     channel = root @ (rng.standard_normal((400, 3)) + 1j * rng.standard_normal((400, 3)))
     factors = np.exp(rng.normal(size=40) * 0.3 + 2j * np.pi * rng.random(40))
-    found = fit_run_factors(np.linalg.inv(gram), factors[run][:, None] * channel, run)
+    quadratic = factor_matrix(np.linalg.inv(gram), factors[run][:, None] * channel, run)
+    found = best_run_factors(quadratic, 3 * np.bincount(run))
     wanted = factors[0] / factors
     assert np.allclose(found / wanted, (found / wanted).mean(), rtol=0.02)
 

@@ -10,18 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from gsparc.models.channels.kernels import squared_exponential
-from gsparc.processes.kernel import distances
-
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
-LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left out
-LOW = 0.3  # of the rows, columns of a factor beyond which its product takes less time
 
 Cache = dict[Hashable, Any]
 T = TypeVar("T")
@@ -35,53 +30,12 @@ def get_or_make(cache: Cache, key: Hashable, make: Callable[[], T]) -> T:
     return kept
 
 
-@dataclass(frozen=True)
-class Dense:
-    """Covariances (m, r, r) complex128."""
-
-    matrices: Tensor
-
-    @property
-    def count_powers(self) -> int:
-        """m."""
-        return len(self.matrices)
-
-    def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
-        """Return a covariance (r, r), which may be overwritten, with these of powers (m,)."""
-        flat = self.matrices.view(len(power), -1)
-        return covariance.add_((power.to(flat.dtype) @ flat).view(covariance.shape))
-
-    def traces_of_products(self, weight: Tensor) -> Tensor:
-        """Return traces (m,) of products with a Hermitian matrix (r, r)."""
-        return (self.matrices.reshape(len(self.matrices), -1) @ weight.T.reshape(-1)).real
-
-    def change_basis(self, coordinates: Tensor) -> Dense:
-        """Return them in another basis, of which the old one is (s, r) float64 coordinates."""
-        real, imag = self.matrices.real, self.matrices.imag
-        return Dense(torch.complex(coordinates @ real @ coordinates.T, coordinates @ imag @ coordinates.T))
-
-
-@dataclass(frozen=True)
-class Factored:
-    """A covariance F F^H of few columns F (r, q) complex128; methods as of `Dense`."""
-
-    factor: Tensor
-    count_powers: ClassVar[int] = 1
-
-    def add_to(self, covariance: Tensor, power: Tensor) -> Tensor:
-        """See `Dense`."""
-        return covariance.addmm_(self.factor * power, self.factor.mH)
-
-    def traces_of_products(self, weight: Tensor) -> Tensor:
-        """See `Dense`."""
-        return (self.factor.conj() * (weight @ self.factor)).real.sum()[None]
-
-    def change_basis(self, coordinates: Tensor) -> Factored:
-        """See `Dense`."""
-        return Factored(coordinates.to(torch.complex128) @ self.factor)
-
-
-Piece = Dense | Factored
+def change_basis(matrix: Tensor, columns: Tensor) -> Tensor:
+    """Return matrices (..., n, n) between real columns (n, r), as (..., r, r) complex128."""
+    if not matrix.is_complex():
+        return (columns.T @ matrix @ columns).to(torch.complex128)
+    # Two real products take half the time of a complex one.
+    return torch.complex(*(columns.T @ part @ columns for part in (matrix.real, matrix.imag)))
 
 
 @dataclass(frozen=True)
@@ -111,32 +65,13 @@ class Basis:
         columns = torch.eye(len(places), dtype=torch.float64) if whole else vectors[:, mask]
         return Basis(key, places, columns, shared)
 
-    def dense_piece(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> tuple[Piece, ...]:
-        """Return a piece of covariances (n, n), which equal places and keys share."""
-        return (get_or_make(self.shared, (*self.key, key), lambda: self._compress(matrices())),)
-
-    def _compress(self, matrices: list[Tensor]) -> Dense:
-        return Dense(torch.stack([self.compress(matrix) for matrix in matrices]))
+    def compress_once(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> Tensor:
+        """Return covariances (n, n) in the basis (m, r, r), which equal places and keys share."""
+        return get_or_make(
+            self.shared, (*self.key, key), lambda: torch.stack([self.compress(one) for one in matrices()])
+        )
 
     def compress(self, matrix: Tensor) -> Tensor:
         """Return a matrix (n, n) of rows as (r, r) complex128."""
-        if self.columns.shape[1] == len(self.columns):
-            return matrix.to(torch.complex128)
-        if not matrix.is_complex():
-            return (self.columns.T @ matrix @ self.columns).to(torch.complex128)
-        # The basis is real: two real products take half the time of a complex one.
-        return torch.complex(*(self.columns.T @ part @ self.columns for part in (matrix.real, matrix.imag)))
-
-    def wave_pieces(self, length: float, waves: Tensor) -> tuple[Piece, ...]:
-        """Return pieces of waves (W, n) whose gains vary over `length` [m]."""
-        roots = get_or_make(self.shared, (self.key[0], length), lambda: self._correlation_root(length))
-        wide = self.columns.T.to(torch.complex128)
-        factors = [wide @ (wave[:, None] * roots) for wave in waves]
-        few = roots.shape[1] <= LOW * len(wide)
-        return tuple(Factored(each) if few else Dense((each @ each.mH)[None]) for each in factors)
-
-    def _correlation_root(self, length: float) -> Tensor:
-        """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
-        size, vectors = torch.linalg.eigh(squared_exponential(distances(self.places, self.places), length))
-        mask = size > LOW_RANK * size[-1]
-        return vectors[:, mask] * size[mask].sqrt()
+        whole = self.columns.shape[1] == len(self.columns)
+        return matrix.to(torch.complex128) if whole else change_basis(matrix, self.columns)

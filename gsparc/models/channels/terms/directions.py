@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import directional_correlation, matern_envelope
-from gsparc.models.channels.terms.compressed import Basis, Piece
+from gsparc.models.channels.terms.compressed import Basis
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
 from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import ENTRIES
@@ -88,8 +88,8 @@ class Directions(ChannelTerm):
         """Return the sum of powers (n,), see `ChannelTerm`."""
         return self.direction_powers([a.slot])[0].sum().expand(len(a.places))
 
-    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
-        """Return one of M covariances, see `ChannelTerm`."""
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> Tensor:
+        """Return those of M directions, see `ChannelTerm`."""
         places, wavenumber = at.places, at.slot.wavenumber
 
         def correlation_matrices() -> list[Tensor]:
@@ -97,7 +97,7 @@ class Directions(ChannelTerm):
             ones = self.angles.split(1)
             return [self.correlations(one, wavenumber, places, places)[0] * bound for one in ones]
 
-        return basis.dense_piece((self.concentration, self.angles.numpy().tobytes()), correlation_matrices)
+        return basis.compress_once((self.concentration, self.angles.numpy().tobytes()), correlation_matrices)
 
     def design(self, slot: Slot) -> Tensor:
         """Return the knots' weights beside the powers', see `ChannelTerm`."""

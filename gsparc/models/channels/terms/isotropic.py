@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.models.channels.columns import SlotPlaces
 from gsparc.models.channels.kernels import isotropic_correlation
-from gsparc.models.channels.terms.compressed import Basis, Piece
+from gsparc.models.channels.terms.compressed import Basis
 from gsparc.models.channels.terms.term import ChannelTerm
 
 
@@ -33,6 +33,6 @@ class Isotropic(ChannelTerm):
         """Return the same for each, see `ChannelTerm`."""
         return repeat(self.covariance(a[0], b[0]), len(a))
 
-    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> Tensor:
         """Return the one, see `ChannelTerm`."""
-        return basis.dense_piece("isotropic", lambda: [self.correlation(at, at)])
+        return basis.compress_once("isotropic", lambda: [self.correlation(at, at)])

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import SlotPlaces
 from gsparc.models.channels.kernels import squared_exponential
-from gsparc.models.channels.terms.compressed import Basis, Piece
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.kernel import distances
 
@@ -24,7 +22,3 @@ class Leakage(ChannelTerm):
     def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return `R p` (n, m) float64, see `Term`."""
         return self.power * squared_exponential(distances(a.places, b.places), self.frame.reach)
-
-    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
-        """Return the one, see `ChannelTerm`."""
-        return basis.wave_pieces(self.frame.reach, torch.ones(1, len(at.places), dtype=torch.complex128))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import spherical_wave, squared_exponential
-from gsparc.models.channels.terms.compressed import Basis, Piece
+from gsparc.models.channels.terms.compressed import Basis
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.kernel import distances
 
@@ -55,7 +55,9 @@ class Spherical(ChannelTerm):
         """Return that of all waves (n,), see `ChannelTerm`."""
         return self.power.view(2, -1).sum(0) @ self.waves(a).abs().square()
 
-    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> Tensor:
         """Return those of fixed gains, then of those that vary, see `ChannelTerm`."""
-        waves, frame = self.waves(at), self.frame
-        return basis.wave_pieces(frame.reach, waves) + basis.wave_pieces(frame.gain, waves)
+        waves, away, frame = self.waves(at), distances(at.places, at.places), self.frame
+        each = [wave[:, None] * wave.conj() for wave in waves]
+        gains = [squared_exponential(away, length) for length in (frame.reach, frame.gain)]
+        return torch.stack([basis.compress(one * gain) for gain in gains for one in each])

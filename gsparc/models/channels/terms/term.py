@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Slot, SlotPlaces
-from gsparc.models.channels.terms.compressed import Basis, Dense, Piece
+from gsparc.models.channels.terms.compressed import Basis
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Term
 
@@ -65,11 +65,11 @@ class ChannelTerm(Term[SlotPlaces]):
         """Return the variance (n,) of values at `a`."""
         return self.power.sum().expand(len(a.places))
 
-    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> tuple[Piece, ...]:
-        """Return covariances of unit power in a basis, as many in all as there are powers; here one."""
+    def unit_covariances_in_basis(self, at: SlotPlaces, basis: Basis) -> Tensor:
+        """Return covariances (p, r, r) complex128 of unit powers in a basis; here of one."""
         # A logarithm of 0 is unit power.
         unit = self.with_values(self.power[:0].new_zeros(1))
-        return (Dense(basis.compress(unit.covariance(at, at))[None]),)
+        return basis.compress(unit.covariance(at, at))[None]
 
     def design(self, slot: Slot) -> Tensor:
         """Return how logarithms of an end's own powers depend on `parameters` (p, q), linearly."""
