@@ -76,7 +76,8 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
 
     Baselines beside it tell whether a station is hard, its note at how many the method is better.
     """
-    names = [name for name in columns if name.endswith("/rmse_db") and "/zero/" not in name]
+    # Among the baselines may be the method itself.
+    names = [one for one in columns if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)]
     heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
     shown = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
     shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
