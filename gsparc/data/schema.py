@@ -31,6 +31,12 @@ LIGHT = 299_792_458.0  # [m/s]
 TrainTest = tuple[np.ndarray, np.ndarray]  # rows (n,) to train and to test on
 
 
+def show_names(names: Sequence[str], labels: Sequence[str] | None) -> tuple[str, ...]:
+    """Return names (T,) of stations as people read them, `W03-2 (150)` of one that a list of cells labels."""
+    pairs = zip(names if labels is None else labels, names, strict=True)
+    return tuple(name if own == name else f"{own} ({name})" for own, name in pairs)
+
+
 @dataclass(frozen=True)
 class Stations:
     """Static ends of which there are several; one place at two carriers is two stations.
@@ -59,8 +65,7 @@ class Stations:
     @property
     def shown(self) -> tuple[str, ...]:
         """(T,) label and name, or the name where that is all, for people."""
-        pairs = zip(self.label or self.name, self.name, strict=True)
-        return tuple(own if own == name else f"{own} ({name})" for own, name in pairs)
+        return show_names(self.name, self.label)
 
     @property
     def named(self) -> dict[str, Sequence[str]]:

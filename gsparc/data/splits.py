@@ -60,7 +60,8 @@ class Split:
     @property
     def title(self) -> str:
         """Return its name, and that no seed draws the test rows where the release names them."""
-        return self.name + " (the release's test rows)" * self.of_release
+        every = " (all rows of the file are asked)" * (self.name == "whole")
+        return self.name + every + " (the release's test rows)" * self.of_release
 
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""

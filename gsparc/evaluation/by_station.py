@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, show_names
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
 from gsparc.evaluation.scores import FEW, Scores
 from gsparc.evaluation.table import Column, Table
@@ -76,14 +76,19 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
 
     Baselines beside it tell whether a station is hard, its note at how many the method is better.
     """
-    names = [name for name in columns if name.endswith("/rmse_db") and "/zero/" not in name]
+    # Among the baselines may be the method itself.
+    names = [one for one in columns if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)]
     heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
     shown = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
     shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
     every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
+    if len(rows) < 2:
+        return []
     better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
     note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
+    if rows.get("rows_with_silent", rows["rows"]).gt(rows["rows"]).any():
+        note += f"{'; ' * bool(note)}its bias_db: of heard rows, below 0 where unheard ones are learned from"
     title = "rmse_db of the worst stations; by_station.csv has all"
-    worst = Table.from_rows(title, shown, rows[:WORST].to_dict("records"), note=note)
-    return [worst] if len(rows) > 1 else []
+    named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
+    return [Table.from_rows(title, shown, named[:WORST].to_dict("records"), note=note)]

@@ -275,8 +275,8 @@ def _foreign(
             gaps, _ = cKDTree(own.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
     what += f" ({before.name})" * same
-    how = "were" if same else "are at places that were"
-    return f"{what}: {learned} of these {len(tested)} test rows{listed} {how} TRAINED on", learned, trained
+    how = ("were " if same else "are at places that were ") + ("TRAINED on" if learned else "trained on")
+    return f"{what}: {learned or 'none'} of these {len(tested)} test rows{listed} {how}", learned, trained
 
 
 def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[Measurements, Split] | None:

@@ -150,7 +150,10 @@ class PerStation(Method):
                 folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
             )
             if len(numbers) > 1:
-                log.info("station %d of %d: %s", turn + 1, len(numbers), self._station_name(number))
+                # Others take a second each: `run_all` says how far they are.
+                level = logging.INFO if self.factory.resumable else logging.DEBUG
+                turned = turn + 1, len(numbers), self._station_name(number)
+                log.log(level, "%s: station %d of %d (%s)", self.name, *turned)
             rows, part = self._rows_and_measurements(data, number)
             # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
@@ -202,7 +205,7 @@ class PerStation(Method):
         if together and not (joint or self.factory.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         learnable, only_tested = stations_of_fold(self.factory, data, fold)
-        names = list_first([stations.name[t] for t in np.flatnonzero(only_tested)])
+        names = list_first([stations.shown[t] for t in np.flatnonzero(only_tested)])
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(learnable)]
         if not together and only_tested.any():
             if not self.factory.both_ends and not joint:
@@ -220,7 +223,7 @@ class PerStation(Method):
     def _station_name(self, number: int) -> str:
         assert self.site is not None and self.site.stations is not None
         if number != UNHEARD:
-            return self.site.stations.name[number]
+            return self.site.stations.shown[number]
         return "stations never heard"
 
     def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
@@ -270,9 +273,7 @@ class PerStation(Method):
         """
         copy = self._copies.get(number, self._copies.get(UNHEARD))
         if copy is None:
-            assert self.site is not None and self.site.stations is not None
-            name = self.site.stations.name[number]
-            raise ValueError(f"{self.name}: station {name} had too few training rows")
+            raise ValueError(f"{self.name}: station {self._station_name(number)} had too few training rows")
         return OneStationView(copy, number) if self._shared else copy
 
     def all_stations(self) -> AllStationsView | None:

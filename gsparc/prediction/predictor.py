@@ -95,8 +95,17 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         free = self.site.freedom
         return "all" if free == "none" else f"up to {describe_freedom(free)} of each row"
 
+    @property
+    def stations(self) -> list[str]:
+        """Names (T,) of stations, in the order of the columns of `rssi`; empty where there are none.
+
+        >>> gsparc.load("city.ckpt").stations
+        ['roof-2', 'roof-3']
+        """
+        return [] if self.site.stations is None else list(self.site.stations.shown)
+
     def select_station(self, station: str | int) -> Predictor:
-        """Return the same model asked about one station alone, by name or number.
+        """Return the same model asked about one station alone, by a name of `stations` or number.
 
         >>> gsparc.load("city.ckpt").select_station("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
         (1,)
@@ -109,7 +118,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             raise ValueError(f"select_station: {self.site.name} has one static end, and no stations")
         number = find_station(station, stations)
         if number is None:
-            raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.name)}")
+            raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.shown)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
         both = self.method, self._whole
         method, whole = (m.station_method(number) if isinstance(m, PerStation) else m for m in both)
@@ -309,8 +318,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
     def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
         """Return powers (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
 
-        Of several stations, if neither end says which, of all (B, T), as they were measured: NaN of those
-        that had too few training rows. A level is -inf where no power is predicted.
+        Of several stations, if neither end says which, of all (B, T), as they were measured: columns in
+        the order of `Predictor.stations`, NaN of those that had too few training rows. A level is -inf where
+        no power is predicted.
 
         >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5], unit="mW").shape
         (1,)

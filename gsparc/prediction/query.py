@@ -76,7 +76,7 @@ class Queries:
             if place is not None:
                 return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
-                raise ValueError(f"use select_station(name): one of {', '.join(self.site.stations.name)}")
+                raise ValueError(f"use select_station(name): one of {', '.join(self.site.stations.shown)}")
             if self.site.kind in ("rssi", "csi"):  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")

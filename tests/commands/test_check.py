@@ -132,12 +132,16 @@ def test_the_second_file_of_a_stem_was_drawn_over_the_first(tmp_path, arrays, mo
     assert drawn == ["powers-2.png", "powers.png"]
 
 
-def test_levels_in_db_were_said_to_be_divided(tmp_path, arrays):
+def test_a_planner_was_told_scales_wavelengths_and_phases_of_powers(tmp_path, arrays):
+    """`scale -88 dB is taken off`, and effects that need the phase; levels were once said to be divided."""
     rng = np.random.default_rng(0)
     powers = {name: arrays[name] for name in ("rx_position", "tx_position")}
-    write_own(tmp_path / "a.npz", {**powers, "rssi_db": rng.uniform(-90, -53, 10)})
-    said = _said(tmp_path / "a.npz")[1]
-    assert "dB is taken off, then stored" in said and "divided by" not in said
+    for number, more in enumerate(({}, {"carrier_hz": np.array(8e8)})):
+        write_own(tmp_path / f"{number}.npz", {**powers, **more, "rssi_db": rng.uniform(-90, -53, 10)})
+        said = _said(tmp_path / f"{number}.npz")[1]
+        for words in ("then stored", " wavelengths", "phase"):
+            assert words not in said
+        assert ("carrier" in said) == bool(more)
 
 
 def test_advice_of_a_refusal_was_refused(tmp_path, capsys):

@@ -93,6 +93,11 @@ def test_a_column_of_times_was_listed_as_not_used_without_a_word(write):
     assert "rows count in the order of the file" in said and "dataset.columns.run=COLUMN" in said
 
 
+def test_columns_of_levels_in_db_did_not_say_how_dbm_are_asked_for(write):
+    notes = parse_table(write("x,y,AP1,AP2\n1,2,-80,-70\n4,5,-81,-71\n")).notes
+    assert any("taken as rssi_db [dB] of the stations" in n and n.endswith("unit=dBm of map") for n in notes)
+
+
 def test_levels_without_a_unit_were_said_to_be_in_dbm(write):
     """A map of the same levels said dB."""
     table = parse_table(write("x,y,z,RSSI\n1,2,3,-80\n4,5,6,-81\n"))

@@ -75,6 +75,25 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     assert rows[-1][heads.index("best_server")] == f"{found.facts['test/best_server']:.1%}"
 
 
+def test_a_method_was_better_than_itself_at_none_of_the_stations():
+    """`gp is better than gp at 0`, beside a second column of the same figures."""
+    rows = {"station": ["a", "b"], "rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [1.0, 1.0]}
+    baselines = {f"baseline/{name}/rmse_db": [5.0, 6.0] for name in ("zero", "gp", "idw")}
+    (worst,) = worst_stations({**rows, **baselines}, "gp")
+    assert worst.note == "gp is better than idw at 1 of 2 stations"
+    assert worst.texts()[0] == ["station", "rows", "gp", "its bias_db", "idw"]
+
+
+def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meaning():
+    """`150` of `W03-2 (150)`, and -3.5 dB that is the choice of heard rows."""
+    rows = {"rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [-3.5, -1.0]}
+    columns = {"station": ["150", "212"], "cell": ["W03-2", "212"], **rows}
+    (listed,) = worst_stations(columns, "gp")
+    assert [row[0] for row in listed.texts()[1]] == ["W03-2 (150)", "212"] and not listed.note
+    (silent,) = worst_stations({**columns, "rows_with_silent": [12, 40]}, "gp")
+    assert silent.note.startswith("its bias_db: of heard rows, below 0 where unheard")
+
+
 def test_a_constant_of_each_station_is_what_is_left_out(drive):
     """The figure is that of errors less the mean of their station."""
     error = np.random.default_rng(0).normal(size=len(drive)) + 7.0 * drive.station

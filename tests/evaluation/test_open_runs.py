@@ -143,6 +143,21 @@ def test_test_rows_of_a_drive_counted_unlisted_cells_as_lines(tmp_path, monkeypa
     assert "80 of these 80 test rows (50 listed, 30 unlisted) are at places" in said
 
 
+def test_rows_that_none_was_trained_on_read_as_an_alarm(tmp_path, monkeypatch):
+    """`0 of these 80 test rows are at places that were TRAINED on`, of `split whole`."""
+    gsparc.fit(rx=WALK, rssi=np.linspace(-90, -50, 80), model="mean", save=tmp_path / "model.ckpt")
+    np.savez(tmp_path / "drive.npz", rx_position=WALK + 500.0, rssi_db=np.linspace(-90, -50, 80))
+    own = {"name": "own", "file": str(tmp_path / "drive.npz")}
+    learned = from_arrays({"rx_position": WALK, "rssi_db": np.linspace(-90, -50, 80)})
+    all_rows = Split("all", (Fold(np.arange(80), np.arange(0), np.arange(0)),), "")
+    monkeypatch.setattr(
+        open_runs, "_trained", lambda stored, data: (align_to_site(learned, data.site), all_rows)
+    )
+    run = open_runs.open_files([tmp_path / "model.ckpt"], own, None, others_whole=True)
+    assert run.foreign.endswith("none of these 80 test rows are at places that were trained on")
+    assert run.split.title == "whole (all rows of the file are asked)"
+
+
 def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations():
     """A cache told data apart by their content, not by the numbers that a model has for their stations."""
     other = town((2, 0, 1))

@@ -110,7 +110,16 @@ def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(
     lines = [one.getMessage().partition(", about")[0] for one in caplog.records]
     said = [line for line in lines if "station" in line]
     left = [f"{i} of 3 stations of {Resumable.name}" for i in (1, 2)]
-    assert said == ["station 1 of 3: 0", left[0], "station 2 of 3: 1", left[1], "station 3 of 3: 2"]
+    own = [f"{Resumable.name}: station {i} of 3 ({i - 1})" for i in (1, 2, 3)]
+    assert said == [own[0], left[0], own[1], left[1], own[2]]
+
+
+def test_a_third_of_the_log_was_numbers_of_stations_fitted_in_a_second(town, tmp_path, caplog, monkeypatch):
+    """`station 17 of 21: 212`, of no method, 147 of 440 lines."""
+    monkeypatch.setattr(Resumable, "resumable", False)
+    caplog.set_level("INFO", "gsparc")
+    fitted(town, tmp_path)
+    assert not [one for one in caplog.messages if "station 1 of 3" in one]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """gsparc.load: world coordinates in, the same kind of array out."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -181,6 +182,20 @@ def test_two_stations_at_one_place_have_models_of_their_own(abroad):
     place = abroad.metres(47.004, 11.002)
     low, high = (float(abroad.select_station(number).rssi(rx=place)[0]) for number in (0, 1))
     assert 25 < low - high < 35
+
+
+def test_a_cell_as_tables_print_it_was_no_station(abroad):
+    """`W03-2 (150)`: its name and its label were taken, both together refused."""
+    stations = dataclasses.replace(abroad.site.stations, label=("W03-1", "W03-2"))
+    shown = [f"{label} ({name})" for label, name in zip(stations.label, stations.name, strict=True)]
+    site = dataclasses.replace(abroad.site, stations=stations)
+    city, place = gsparc.Predictor(abroad.method, site), abroad.metres(47.004, 11.002)
+    assert city.stations == shown
+    for names in (shown, stations.label, stations.name):
+        columns = [float(city.select_station(name).rssi(rx=place)[0]) for name in names]
+        assert np.allclose(columns, np.ravel(city.rssi(rx=place)), atol=1e-4)
+    with pytest.raises(ValueError, match=re.escape(f"there are {', '.join(shown)}")):
+        city.select_station("W03-3")
 
 
 def test_all_at_once_is_what_is_asked_one_by_one(abroad):

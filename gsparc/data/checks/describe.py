@@ -19,20 +19,19 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     phases = estimate_coherence(data)
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
     weak, strong = (int((data.censored_side(np.arange(len(data))) == side).sum()) for side in (1, -1))
-    paths, scale, unit = data.directions, site.target_scale, site.power_unit()
-    levels = site.kind == "rssi" and unit.decibels
-    scaled = f"{unit.raised_db:.4g} dB is taken off" if levels else f"measurements are divided by {scale:.4g}"
+    # Wavelengths and stored scales tell who reads powers nothing.
+    paths, scale, powers = data.directions, site.target_scale, site.kind == "rssi"
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
-        ("neighbours", spacing_words(distinct_places(data), site.wavelength)),
+        ("neighbours", spacing_words(distinct_places(data), None if powers else site.wavelength)),
         ("carrier", _carrier(site)),
         ("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz" if len(tones) > 1 else ""),
         ("grid", "" if site.grid is None else _grid(site.grid)),
         ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
-        ("scale", "" if scale == 1 else f"{scaled}, then stored"),
+        ("scale", "" if powers or scale == 1 else f"measurements are divided by {scale:.4g}, then stored"),
         ("censored", f"of {len(data)} powers {weak} lie under a level (unheard, unlisted), {strong} above one"
          if data.censored is not None else ""),
         ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with an unknown complex factor"),
@@ -49,7 +48,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
 
 
 def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
-    """Return five (topic, sentence) pairs about a dataset and how a run divides it."""
+    """Return (topic, sentence) pairs about a dataset and how a run divides it."""
     count = len(split.folds)
     whole = [sum(len(getattr(fold, part)) for fold in split.folds) for part in ("train", "val", "test")]
     train, val, test = (round(rows / count) for rows in whole)
@@ -57,16 +56,19 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     rows = f"{folds}{train} training, {val} validation and {test} test rows"
     if split.name == "none":
         rows = f"all {train + val} rows are learned from ({val} decide where a method has choices)"
-    return [
+    lines = [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),
         ("moves", _moving(data)),
         ("carrier", _carrier(data.site)),
         ("split", f"{split.title}: {rows}"),
     ]
+    return [(topic, sentence) for topic, sentence in lines if sentence]
 
 
 def _carrier(site: Site) -> str:
+    if site.carrier_hz is None and site.kind == "rssi":  # of which the phase is unknown in any case
+        return ""
     if site.carrier_hz is None:
         return "unknown; give frequency_hz, and effects that need the phase become available"
     return f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"

@@ -361,6 +361,7 @@ def _note(columns: tuple[Column, ...]) -> str:
         labels = [column.label for column in columns]
         of = "frequencies" if first.role in (*CHANNELS, *POLAR) else "stations"
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
+        what += "; if they are dBm: unit=dBm of map" if unit == " [dB]" else ""
     turned = first.unit is not None and first.unit.changes
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
 
