@@ -31,6 +31,7 @@ from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation import summary
+from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.evaluate import Evaluation, evaluate
@@ -45,7 +46,6 @@ from gsparc.evaluation.experiment.done import (
 from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import main_figure, score_of
-from gsparc.evaluation.open_runs import align_to_site
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.sector_levels import draw_sector_levels

@@ -17,8 +17,8 @@ from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
+from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.answers import predict_file
-from gsparc.evaluation.open_runs import align_to_site
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class

@@ -9,7 +9,7 @@ import pytest
 from gsparc.data.checks.coherence import set_freedom
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
-from gsparc.evaluation.open_runs import align_to_site
+from gsparc.evaluation.align_site import align_to_site
 from gsparc.models import aligned_rows, fitting
 from gsparc.models.aligned_rows import align_phases, align_rows
 from gsparc.models.gsparc import Gsparc

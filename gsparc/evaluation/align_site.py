@@ -1,0 +1,128 @@
+"""Other measurements of a model's site, in its coordinates, units and numbers of stations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.errors import list_first
+from gsparc.data.links.stations import all_names
+from gsparc.data.schema import Measurements, Site, Stations
+from gsparc.data.units import WATTS
+from gsparc.prediction.query import SAME_PLACE_M
+
+ANOTHER = "give data with as many, or another ckpt"
+
+
+def align_to_site(data: Measurements, site: Site) -> Measurements:
+    """Return `data` in the local coordinates and target units (watts, milliwatts) of a model's training.
+
+    Raises:
+        ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
+    """
+    own = data.site
+    for what in ("kind", "static_end", "grid"):
+        here, there = getattr(own, what), getattr(site, what)
+        if here != there:
+            raise ValueError(f"the model was trained with {what} {there}, {own.name} has {here}")
+    data = _about(data, site)
+    if site.freedom != "none":  # few rows of another file may not tell
+        data = replace(data, site=replace(data.site, freedom=site.freedom))
+    own = data.site
+    shift = own.origin - site.origin
+    if own.static_position is not None and site.static_position is not None:
+        gap = float(np.linalg.norm(own.static_position + shift - site.static_position))
+        if gap > SAME_PLACE_M:
+            raise ValueError(f"the static {own.static_end} of {own.name} is {gap:.3g} m from the model's")
+    data = _renumbered(data, site, shift)
+    own = data.site
+    units, rescale = (own.level_unit, site.level_unit), own.target_scale / site.target_scale
+    if set(units) <= set(WATTS):  # what is called dB may be either
+        rescale *= WATTS[units[0]] / WATTS[units[1]]
+    known = own.level_unit == site.level_unit and own.target_scale == site.target_scale
+    if known and not shift.any() and rescale == 1:
+        return data
+    there = replace(
+        own, origin=site.origin, box=own.box + shift, static_position=site.static_position,
+        target_scale=site.target_scale, level_unit=site.level_unit, unit=site.unit,
+    )  # fmt: skip
+    return replace(
+        data, site=there, tx=data.tx + shift, rx_position=data.rx_position + shift,
+        target=_times(data.target, rescale), uplink=_times(data.uplink, rescale),
+        # Variances are of the square of the unit.
+        noise_variance=_times(data.noise_variance, rescale**2),
+    )  # fmt: skip
+
+
+def _about(data: Measurements, site: Site) -> Measurements:
+    """`data` in metres about the place on Earth that those of `site` are about, where both say which."""
+    own, there = data.site.georeference, site.georeference
+    if own is None or there is None or own == there:
+        return data
+
+    def moved(local: np.ndarray) -> np.ndarray:
+        world = local + data.site.origin
+        # Stations may be at unknown places, NaN, which no projection takes.
+        known = np.isfinite(world).all(axis=1)
+        # Through degrees: metres about two origins differ by scale and rotation, not by a shift alone.
+        world[known, :2] = there.from_degrees(*own.to_degrees(world[known, :2]))
+        return world - data.site.origin
+
+    still, stations = data.site.static_position, data.site.stations
+    facts = replace(
+        data.site, georeference=there, box=moved(data.site.box),
+        static_position=None if still is None else moved(still[None])[0],
+        stations=None if stations is None else replace(stations, position=moved(stations.position)),
+    )  # fmt: skip
+    return replace(data, site=facts, tx=moved(data.tx), rx_position=moved(data.rx_position))
+
+
+def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measurements:
+    """`data` with the numbers that a model of `site` has for its stations; `shift` (3,) [m] leads there.
+
+    Another file, or part of one, may list them in another order. They are known by their places, and where
+    several stand at one, by their names.
+    """
+    ours, theirs = data.site.stations, site.stations
+    if ours is None or theirs is None:
+        if ours is theirs or (data.site.static_position is not None and site.static_position is not None):
+            return data  # one place, a table of one or not
+        have = ["one static end" if of is None else f"{len(of)} stations" for of in (ours, theirs)]
+        raise ValueError(f"{data.site.name} has {have[0]}, the model {have[1]}; {ANOTHER}")
+    # A list of cells has names of its own beside those that a drive gives them.
+    called, known = ([*map(set, zip(of.name, of.label or of.name, strict=True))] for of in (ours, theirs))
+    gap = np.linalg.norm(ours.position[:, None] + shift - theirs.position, axis=2)
+    number = np.full(len(ours), -1)
+    for t, names in enumerate(called):
+        # Sectors of one mast share a place: there the name decides, as it does where nobody knows the place.
+        alike = [i for i, own in enumerate(known) if names & own and not gap[t, i] > SAME_PLACE_M]
+        near = np.flatnonzero(gap[t] <= SAME_PLACE_M).tolist()
+        if alike or len(near) == 1:
+            number[t] = (alike or near)[0]
+    if (number < 0).any():
+        raise ValueError(_explain_unknown(data.site.name, ours, theirs, number < 0))
+    assert data.station is not None
+    facts = replace(data.site, stations=theirs, static_position=site.static_position)
+    end = "tx" if facts.static_end == "tx" else "rx_position"
+    there = (theirs.position - shift)[number[data.station]]
+    # Of a place that one of both does not know, all is as the model learned it.
+    both = np.isfinite(there + getattr(data, end))
+    still = np.where(both, getattr(data, end), there)
+    return replace(data, station=number[data.station], site=facts, **{end: still})
+
+
+def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.ndarray) -> str:
+    """Which stations of a file a model does not know, and what to do."""
+    lost, kept = ([ours.name[t] for t in np.flatnonzero(flags)] for flags in (unknown, ~unknown))
+    fault = f"stations {list_first(lost)} of {source} are none of the model's, {list_first(theirs.name)}"
+    if not {*all_names(ours)} & {*all_names(theirs)}:
+        way = "dataset.columns.station=COLUMN takes another column, dataset.stations_file=FILE a list"
+        return f"{fault}: no name in common; {way} that has both"
+    return f"{fault}, by name and place; leave them out: dataset.stations=[{list_first(kept, 9)}]"
+
+
+def _times(values: Any, factor: float) -> Any:
+    """An array in another unit, of the same type."""
+    return values if values is None or factor == 1 else (values * factor).astype(values.dtype)
