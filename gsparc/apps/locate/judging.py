@@ -153,8 +153,7 @@ def locate_by_model(
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
-    own = "are not calibrated (calibrate=0): areas may be several times too large"
-    own = "are promised" if config.calibrate or stored else own
+    own = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
     promise = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
     promise += f", {beyond} true places lie beyond these" * bool(beyond)
