@@ -81,9 +81,9 @@ def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:
 def _pair_correlation(
     predictor: Predictor, places: np.ndarray, number: np.ndarray, block_m: float
 ) -> np.ndarray:
-    """Covariance (n, n) of errors of stations (n,) at places (n, 3), in deviations of single measurements."""
+    """Correlations (n, n) of errors of stations (n,) at places (n, 3); variances alone hold the noise."""
     if (joint := predictor.predict_joint(places[None], number)) is None:
-        # Processes of single stations hold no more of truth: 72 % of simulated shares, as these, or 75 %.
+        # Of 32 simulated shares 24 lay in these intervals, 23 in those by each station's own process.
         return np.where(number[:, None] == number, shadowing(places, block_m), 0.0)
     variance = joint.covariance[0].diagonal()
     return (joint.covariance[0] - np.diag(joint.noise)) / np.sqrt(np.outer(variance, variance))
