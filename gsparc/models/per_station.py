@@ -211,9 +211,12 @@ class PerStation(Method):
             if not self.factory.both_ends and not joint:
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
-        if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
+        lost = np.isnan(stations.position).any(1)
+        if joint:  # it seeks those that have rows
+            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.station[fold.train])
+        if UNHEARD in numbers and lost.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
-            if together:
+            if together and not joint:
                 raise ValueError(f"{needs}; say stations=each")
             raise ValueError(
                 f"{needs} for those without training rows ({names}); give them, or split otherwise"
