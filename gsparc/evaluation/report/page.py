@@ -18,6 +18,7 @@ from PIL import Image
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
+from gsparc.evaluation.metric_formats import LISTED, judged_by
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
@@ -92,10 +93,12 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         groups = tables.group_by_setting(scored).values()
         group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
-        leads = {name: lead for name, lead in tables.leads_of_baselines(group).items() if lead}
-        if leads:
-            name = max(leads, key=lambda one: leads[one].ahead_db)
-            remarks += summary.judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
+        for ahead, figure in judged_by(group[0].facts).items():
+            leads = {name: lead for name, lead in tables.leads_of_baselines(group, figure).items() if lead}
+            if leads:
+                name = max(leads, key=lambda one: leads[one].ahead_db)
+                of = group[0].setting, figure, leads[name], ahead == LISTED
+                remarks += summary.judge_baseline(name, *of)
     elif scored:  # a baseline must beat the best run of the page
         remarks += summary.better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
