@@ -144,7 +144,7 @@ def _there(stations: Stations | None, name: str, source: str) -> Stations:
 def _number(stations: Stations, wanted: str | int, option: str, source: str) -> int:
     found = find_station(wanted, stations)
     if found is None:
-        hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.name, 9)}"
+        hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.shown, 9)}"
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
     return found
 

@@ -300,7 +300,7 @@ class PerStation(Method):
         shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
         if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
             here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
-            names = " and ".join(self.site.stations.name[t] for t in here)
+            names = " and ".join(self.site.stations.shown[t] for t in here)
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
             row = int(apart.argmax())

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.geojson import write_shapes
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import finite_array
@@ -316,8 +317,10 @@ def write_classes(
     path: str | Path, raster: FieldMap, origin: Georeference | None, number: np.ndarray,
     names: Sequence[str], colours: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), names as tags."""
+    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), and areas by name as GeoJSON."""
     import rasterio
+    from rasterio.features import shapes
+    from rasterio.warp import transform_geom
 
     values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
     profile = _profile(raster, origin, count=1, dtype="uint16", nodata=NO_CLASS)
@@ -325,7 +328,12 @@ def write_classes(
         # Before the values, which fix what colours mean.
         file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
         file.write(values, 1)
-        file.update_tags(1, **{str(i): one for i, one in enumerate(names)})
+    named = []
+    for area, one in shapes(values, values != NO_CLASS, transform=profile["transform"]):
+        area = area if origin is None else transform_geom(profile["crs"], "EPSG:4326", area)
+        facts = {"number": int(one), "station": names[int(one)]}
+        named.append((area["type"], area["coordinates"], facts))
+    write_shapes(Path(path).with_suffix(".geojson"), named)
 
 
 def _profile(raster: FieldMap, origin: Georeference | None, **bands: Any) -> dict[str, Any]:
