@@ -317,7 +317,7 @@ def write_classes(
     path: str | Path, raster: FieldMap, origin: Georeference | None, number: np.ndarray,
     names: Sequence[str], colours: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), and areas by name as GeoJSON."""
+    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), and named areas as GeoJSON."""
     import rasterio
     from rasterio.features import shapes
     from rasterio.warp import transform_geom

@@ -189,8 +189,7 @@ def choose_stations(
         try:
             predictor.select_station(name)
             if promise is not None and not (promise.station == stations.name.index(name)).any():
-                shown = stations.shown[stations.name.index(name)]
-                raise DataError(f"station {shown} was never heard, so that nothing can be promised of its map")
+                raise DataError(f"station {name} was never heard, so that nothing can be promised of its map")
         except ValueError as error:
             if wanted is not None:
                 raise DataError(str(error)) from None

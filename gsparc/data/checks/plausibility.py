@@ -209,8 +209,8 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
             for step in own
         )
         first = ",".join(str(levels.file_row[step.first]) for step in own)
-        setting = f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another station"
-        setting = "" if names[t] == UNNAMED else f" {setting} from there on"
+        setting = f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another"
+        setting = "" if names[t] == UNNAMED else f" {setting} station from there on"
         warnings.append(f"{who} {said}, which the places do not explain: another gain or antenna?{setting}")
     return warnings
 
