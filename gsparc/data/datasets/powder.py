@@ -52,7 +52,7 @@ def read_powder(
         path: *.npz or *.csv.
         station_table: coordinates of the stations of a CSV; None takes `location_coordinates.json` beside it.
         tx_height, station_height: above ground [m], the same for all; the ground is taken as flat.
-        sensitivity_db: of some stations, by name: weaker levels are noise, and the station heard nothing [dB].
+        sensitivity_db: of some stations, by name: weaker levels are noise, nothing was heard [dB].
 
     Returns:
         `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg], `tx_height`,
@@ -72,8 +72,8 @@ def read_powder(
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
     if sensitivity_db:
         names = raw.arrays["station_name"].tolist()
-        if wrong := [name for name in sensitivity_db if name not in names]:
-            raise DataError(f"dataset.sensitivity_db: no station {wrong[0]}{suggest_or_list(wrong[0], names)}")
+        for name in sensitivity_db.keys() - {*names}:
+            raise DataError(f"dataset.sensitivity_db: no station {name}{suggest_or_list(name, names)}")
         heights["sensitivity_db"] = np.array([sensitivity_db.get(name, np.nan) for name in names], float)
     about = {"name": "powder", **raw.attributes, "layout": "powder"}
     return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)
