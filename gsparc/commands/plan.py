@@ -58,5 +58,5 @@ def task(config: DictConfig) -> dict[str, Any]:
         every = "all stations alike (a map shows the strongest)"
         before += f" of {every if stations is None else ', '.join(map(str, stations))}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
-    before += f", a way of {plan.length_m:.0f} m, {kind}; stops alone are counted, rows logged on the way come on top; plan "
+    before += f", a way of {plan.length_m:.0f} m, {kind}; rows logged on the way not counted; plan "
     return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)
