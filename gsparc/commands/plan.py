@@ -42,8 +42,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         columns["way_m"] = plan.metres.round(1)
         way = pd.DataFrame(coordinates(np.pad(plan.path, ((0, 0), (0, 1))), predictor))
         at = ["longitude", "latitude"] if "longitude" in way else ["x", "y"]
-        stops = [("Point", [row[k] for k in at], row) for row in pd.DataFrame(columns).to_dict("records")]
-        write_shapes(run_dir / "plan.geojson", [("LineString", way[at].to_numpy().tolist(), {}), *stops])
+        line = {"type": "LineString", "coordinates": way[at].to_numpy().tolist()}
+        stops = pd.DataFrame(columns).to_dict("records")
+        points = [({"type": "Point", "coordinates": [row[k] for k in at]}, row) for row in stops]
+        write_shapes(run_dir / "plan.geojson", [(line, {}), *points])
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     draw_measurement_plan(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {

@@ -216,11 +216,8 @@ class PerStation(Method):
             lost &= only_tested & ~np.isin(np.arange(len(stations)), data.station[fold.train])
         if UNHEARD in numbers and lost.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
-            if together and not joint:
-                raise ValueError(f"{needs}; say stations=each")
-            raise ValueError(
-                f"{needs} for those without training rows ({names}); give them, or split otherwise"
-            )
+            others = f" for those without training rows ({names}); give them, or split otherwise"
+            raise ValueError(needs + ("; say stations=each" if together and not joint else others))
         return numbers
 
     def _station_name(self, number: int) -> str:

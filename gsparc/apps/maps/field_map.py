@@ -265,8 +265,7 @@ def read_loads(
         DataError: another number of them, an unknown name, or no share.
     """
     if isinstance(load, Mapping):
-        wrong = next((name for name in load if name not in {*stations, *labels}), None)
-        if wrong is not None:
+        for wrong in sorted(load.keys() - {*stations, *labels}):
             raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
         load = [load.get(a, load.get(b, 1.0)) for a, b in zip(stations, labels or stations, strict=True)]
     values = finite_array(load)
@@ -292,7 +291,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
-    `outage`, `best_server` (number of the station; the band's tags name each), `server_chance`, and then the
+    `outage`, `best_server` (number of the station, as in `write_classes`), `server_chance`, and then the
     power of each of several stations. Tags give unit, threshold and height.
     """
     import rasterio
@@ -309,8 +308,6 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
             file.set_band_description(number, name)
             unit = raster.unit if name.startswith(("power", "lower", "upper")) else "dB"
             file.set_band_unit(number, unit if "_db" in name else "")
-            if name == "best_server":
-                file.update_tags(number, **{str(i): one for i, one in enumerate(raster.stations)})
 
 
 def write_classes(
@@ -331,8 +328,7 @@ def write_classes(
     named = []
     for area, one in shapes(values, values != NO_CLASS, transform=profile["transform"]):
         area = area if origin is None else transform_geom(profile["crs"], "EPSG:4326", area)
-        facts = {"number": int(one), "station": names[int(one)]}
-        named.append((area["type"], area["coordinates"], facts))
+        named.append((area, {"number": int(one), "station": names[int(one)]}))
     write_shapes(Path(path).with_suffix(".geojson"), named)
 
 
