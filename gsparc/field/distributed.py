@@ -81,7 +81,7 @@ def sum_gradients(parameters: Iterable[Tensor]) -> None:
     own = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
     # Sent along: a parameter without a gradient in this process may have one in another.
     has = own[0].new_tensor([p.grad is not None for p in every])
-    flat = _all_reduce(torch.cat([has, *(gradient.flatten() for gradient in own)]), ReduceOp.SUM)
+    flat = process_sum(torch.cat([has, *(gradient.flatten() for gradient in own)]))
     sums = flat[len(every) :].split([gradient.numel() for gradient in own])
     for parameter, somewhere, result in zip(every, flat[: len(every)].tolist(), sums, strict=True):
         parameter.grad = result.view_as(parameter).to(parameter.dtype) if somewhere else None
@@ -90,6 +90,11 @@ def sum_gradients(parameters: Iterable[Tensor]) -> None:
 def process_count() -> int:
     """Return how many processes train."""
     return distributed.get_world_size() if distributed.is_initialized() else 1
+
+
+def process_sum(values: Tensor) -> Tensor:
+    """Sum over processes, in place; the values themselves where there is one."""
+    return _all_reduce(values, ReduceOp.SUM)
 
 
 def process_max(values: Tensor) -> Tensor:

@@ -193,7 +193,7 @@ class PerStation(Method):
             ValueError: see `fit`.
         """
         stations = data.site.stations
-        assert stations is not None
+        assert stations is not None and data.station is not None
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.

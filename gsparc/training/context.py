@@ -134,9 +134,7 @@ class FitContext:
         row = curve.curve_row(seconds, what, error, step, **figures)
         # All rows again: a file that appears by renaming cannot be appended to.
         curve.write_curve(self.run_dir, [*curve.read_curve(self.run_dir), row])
-        known = {f"curve/{name}": float(row[name]) for name in ("seconds", "error") if row[name] != ""}
-        for logger in self.loggers:  # dashboards draw it over the steps
-            logger.log_metrics(known, step=int(row["step"] or 0))
+        curve.log_row(self.loggers, row)
 
     def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
         """Return what a fit counts, and the seconds that may end it, some spent before."""
