@@ -172,8 +172,9 @@ def _of_runs(arrays: Arrays, runs: Sequence[str | int], source: str) -> np.ndarr
         raise DataError(f"dataset.runs: {source} names no runs; expected an array run")
     of_row = arrays["run"].astype(str)
     known, wanted = np.unique(of_row).tolist(), [str(run) for run in runs]
-    for name in sorted({*wanted} - {*known}):
-        raise DataError(f"dataset.runs={name}: no such run in {source}{suggest_or_list(name, known)}")
+    if unknown := sorted({*wanted} - {*known}):
+        hint = suggest_or_list(unknown[0], known)
+        raise DataError(f"dataset.runs={unknown[0]}: no such run in {source}{hint}")
     return np.isin(of_row, wanted)
 
 

@@ -265,8 +265,8 @@ def read_loads(
         DataError: another number of them, an unknown name, or no share.
     """
     if isinstance(load, Mapping):
-        for wrong in sorted(load.keys() - {*stations, *labels}):
-            raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
+        if wrong := sorted(load.keys() - {*stations, *labels}):
+            raise DataError(f"load: no station {wrong[0]!r}; there are {', '.join(stations)}")
         load = [load.get(a, load.get(b, 1.0)) for a, b in zip(stations, labels or stations, strict=True)]
     values = finite_array(load)
     if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():

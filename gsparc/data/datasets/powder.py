@@ -72,8 +72,8 @@ def read_powder(
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
     if sensitivity_db:
         names = raw.arrays["station_name"].tolist()
-        for name in sorted(sensitivity_db.keys() - {*names}):
-            raise DataError(f"dataset.sensitivity_db: no station {name}{suggest_or_list(name, names)}")
+        if wrong := sorted(sensitivity_db.keys() - {*names}):
+            raise DataError(f"dataset.sensitivity_db: no {wrong[0]}{suggest_or_list(wrong[0], names)}")
         heights["sensitivity_db"] = np.array([sensitivity_db.get(name, np.nan) for name in names], float)
     about = {"name": "powder", **raw.attributes, "layout": "powder"}
     return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)

@@ -97,7 +97,8 @@ def warnings(runs: Sequence[Run]) -> list[str]:
         group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
         for ahead, figure in judged_by(group[0].facts).items():
             leads = {name: lead for name, lead in tables.leads_of_baselines(group, figure).items() if lead}
-            for name in sorted(leads, key=lambda one: leads[one].ahead_db)[-1:]:
+            if leads:
+                name = max(leads, key=lambda one: leads[one].ahead_db)
                 of = group[0].setting, figure, leads[name], ahead == LISTED
                 remarks += summary.judge_baseline(name, *of)
     elif scored:  # a baseline must beat the best run of the page
