@@ -97,6 +97,7 @@ class Kriging(Interpolator):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"
+    no_gradient = "its systems are solved outside of autograd"
     stored = ("positions", "values", "variogram", "channels")
     system: tuple[np.ndarray, np.ndarray] | None = None
     tree: cKDTree | None = None
@@ -173,10 +174,6 @@ class Kriging(Interpolator):
     def _queries_per_block(self) -> int:
         """Queries answered at a time, of more."""
         return max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "its systems are solved outside of autograd"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         if self.tree is not None and len(queries) > (block := self._queries_per_block()):
