@@ -119,11 +119,34 @@ def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
         74_500,
     ]
     assert np.median(np.linalg.norm(off, axis=1)) < 30
-    rows = (folder / "phone.csv").read_text().splitlines()
-    long = ["scan,cell,rssi", *(f"{row.split(',')[0]},roof-1,{row.split(',')[1]}" for row in rows[1:])]
-    (tmp_path / "long.csv").write_text("\n".join(long) + "\n")
-    with pytest.raises(DataError, match="expected one row a moment with a column of levels per station"):
-        located(tmp_path / "long", f"ckpt={ckpt}", f"data='{tmp_path}/long.csv'", "calibrate=0")
+
+
+def test_a_long_log_was_refused_though_it_has_times(roofs, tmp_path, caplog):
+    """`which are of one moment? expected one row a moment`, though rows of one scan have one time."""
+    ckpt, folder, _ = roofs
+    head, *rows = [row.split(",") for row in (folder / "phone.csv").read_text().splitlines()]
+    links = [
+        (int(row[0]), name, level) for row in rows for name, level in zip(head[1:], row[1:], strict=True)
+    ]
+
+    def log(name, columns, line):
+        (tmp_path / f"{name}.csv").write_text("\n".join([columns, *(line(*link) for link in links)]) + "\n")
+        return f"ckpt={ckpt}", f"data='{tmp_path}/{name}.csv'", "calibrate=0"
+
+    timed = log("timed", "date,time,cell,rssi", lambda i, a, b: f"2026-11-27,10:00:{i:02d},{a},{b}")
+    wide = located(tmp_path / "wide", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")[1]
+    with caplog.at_level("INFO"):
+        found = located(tmp_path / "run", *timed)[1]
+    assert "20 snapshots in 59 levels" in caplog.text
+    assert [[row[axis] for axis in "xy"] for row in found] == [[row[axis] for axis in "xy"] for row in wide]
+    for name, columns, line, said in (
+        ("scan", "scan,cell,rssi", lambda i, a, b: f"{i},{a},{b}", "expected a column of times, or one row"),
+        ("day", "date,cell,rssi", lambda i, a, b: f"2026-11-27,{a},{b}", "'date' is one in 20 rows of a"),
+        ("each", "time,cell,rssi", lambda i, a, b: f"{i}.{a[-1]},{a},{b}", "'time' differs in all rows"),
+        ("gap", "time,cell,rssi", lambda i, a, b: f"{i or ''},{a},{b}", "'time' is empty in line 2"),
+    ):
+        with pytest.raises(DataError, match=said):
+            located(tmp_path / name, *log(name, columns, line))
 
 
 def test_a_final_model_spoke_of_test_rows_alone(roofs, tmp_path):
