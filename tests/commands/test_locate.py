@@ -10,6 +10,7 @@ import towns
 from campaigns import compose, powers, spectra
 from PIL import Image
 
+from gsparc.apps.locate import locator
 from gsparc.commands.locate import locate
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_as_found
@@ -170,6 +171,41 @@ def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, caplog):
     with caplog.at_level("INFO"):
         located(tmp_path / "other", *given, "calibrate=2", "share=0.8")
     assert "calibration 1 of 2" in caplog.text
+
+
+def test_200_snapshots_were_left_out_where_fewer_tell_the_areas(roofs, tmp_path, monkeypatch, caplog):
+    """Each was sought twice, from the coarse grid on, before the first answer."""
+    monkeypatch.setattr(locator, "COUNTS", (20, 40, 80))
+    monkeypatch.setattr(locator, "KNOWN", 10.0)
+    ckpt, before = shutil.copy(roofs[0], tmp_path / "model.ckpt"), []
+    search = locator.Locator.search_cells
+    counted = lambda *given: before.append(given[3:]) or search(*given)  # noqa: E731
+    monkeypatch.setattr(locator.Locator, "search_cells", counted)
+    with caplog.at_level("INFO"):
+        facts, _ = located(tmp_path / "run", f"ckpt={ckpt}", "eval_on=train", "rows=1", "calibrate=2")
+    assert facts["locate/calibrated_on"] == 20 and "calibrated on 20 snapshots left out" in caplog.text
+    assert [bool(one and one[0]) for one in before[:40]] == [False] * 20 + [True] * 20
+
+
+def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monkeypatch, caplog):
+    """A plan that changed under its name was not noticed, and `calibrate=0` took whatever was stored."""
+    monkeypatch.setattr(locator, "COUNTS", (6,))
+    ckpt, paper = shutil.copy(roofs[0], tmp_path / "model.ckpt"), np.full((40, 40, 3), 255, np.uint8)
+    low, high = (site := checkpoint.read(ckpt).site).moving_box[:, :2] + site.origin[:2]
+    points = f"plan_points=[[0,40,{low[0]},{low[1]}],[40,40,{high[0]},{low[1]}]]"
+    given = f"ckpt={ckpt}", "eval_on=train", "rows=1", f"plan='{tmp_path}/plan.png'", points
+    said = []
+    for number, wall in enumerate((0, 0, 20)):
+        paper[:, :wall] = 0
+        Image.fromarray(paper).save(tmp_path / "plan.png")
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            located(tmp_path / str(number), *given, "calibrate=2")
+        said += [[word in caplog.text for word in ("calibrated before", "with other cells or rows: calib")]]
+    assert said == [[False, False], [True, False], [False, True]]
+    located(tmp_path / "stored", *given, "calibrate=0")
+    with pytest.raises(ValueError, match="was calibrated with other plan, plan_points, cells or rows"):
+        located(tmp_path / "box", *given[:3], "calibrate=0")
 
 
 def test_ctrl_c_lost_all_that_was_located(tmp_path):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,12 +11,12 @@ from scipy.optimize import minimize
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.search import Search
 
-log = logging.getLogger(__name__)
-
 # Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
-LOOKS, SAID = 160, 40  # trials, and those after which it is said
+LOOKS = 160  # trials
+# Steps in logarithms, and of the mean log density, whose standard error is some .1, that end the search.
+STEP, GAIN = 0.02, 0.002
 
 
 def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: float, start: Trust) -> Trust:
@@ -38,32 +36,39 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
     edge = float(np.max([one.cells.edge.max() for one in snapshots]))
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
 
-    trials = itertools.count(1)
-
     # In logarithms: all are positive and known up to factors.
     def decode_trust(point: np.ndarray) -> Trust:
         inflation, temperature, tail, spread = np.exp(np.clip(point, *spans)).tolist()
         return Trust(inflation, temperature, tail, edge * spread)
 
     def surprise(point: np.ndarray) -> float:
-        if (number := next(trials)) % SAID == 0:
-            log.info("how far it is trusted: %d of at most %d trials", number, LOOKS)
         trust, pairs = decode_trust(point), zip(snapshots, places, strict=True)
         return -float(np.mean([one.posterior(trust).log_density_at(place) for one, place in pairs]))
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
     simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
-    how = {"maxfev": LOOKS, "initial_simplex": simplex}
+    how = {"maxfev": LOOKS, "initial_simplex": simplex, "xatol": STEP, "fatol": GAIN}
     optimum = minimize(surprise, first, method="Nelder-Mead", options=how)
-    return calibrate_level(decode_trust(optimum.x), snapshots, places, share)
+    return calibrate_level(decode_trust(optimum.x), snapshots, places, share)[0]
 
 
-def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
-    """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit."""
-    levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
+def calibrate_level(
+    trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float
+) -> tuple[Trust, float]:
+    """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit.
+
+    And by how much a radius of these areas is wider, as a share of it, where the level is a standard error
+    higher.
+    """
+    known = [one.posterior(trust) for one in snapshots]
+    levels = np.sort([one.mass_above(place) for one, place in zip(known, places, strict=True)])
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))
+    # The number of masses below the share's quantile is binomial.
+    higher = rank + int(np.ceil(np.sqrt(len(levels) * share * (1 - share))))
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
-    level = float(np.sort(levels)[rank - 1]) if rank <= len(levels) else 1.0
-    return replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))
+    level, above = (float(levels[one - 1]) if one <= len(levels) else 1.0 for one in (rank, higher))
+    ratio = np.median([one.area(above) / one.area(level) for one in known])
+    trust = replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))
+    return trust, float(ratio ** (1 / max((snapshots[0].cells.edge.max(0) > 0).sum(), 1)) - 1)

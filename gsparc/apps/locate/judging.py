@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -122,17 +123,19 @@ def locate_by_model(
     data, fold = run.data, run.split.folds[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
-    how = {name: to_dict(config)[name] for name in TRUST_IS_OF}
-    stored = run.stored[0].extra.get(locating.KEY, {})
-    anew = config.calibrate and (config.renew or stored.get("how") != how)
-    # What was learned earlier for other settings is refused: its areas would hold another share.
-    start = Trust() if anew else locating.restore_trust(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
     origin = data.site.origin
     light = None if open_at is None else lambda places: open_at(places[:, :2] + origin[:2])
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
+    stored = run.stored[0].extra.get(locating.KEY, {})
+    laid = [part.tobytes() for part in (box.centre, box.edge, wider.centre, wider.edge, learned)]
+    how = {name: to_dict(config)[name] for name in TRUST_IS_OF}
+    # Not of names alone: a plan's image, and rows, change under the same name.
+    how["cells or rows"] = sha256(b"".join(laid) + data.site.sha256.encode()).hexdigest()
+    anew = _is_outdated(config, stored, how)
+    start = Trust() if anew else locating.restore_trust(run.stored[0].extra, unknown, share)
     locator = Locator(SiteField(run.predictor), box, wider, unknown, start, share)
     count = stored.get("count", 0)
     if anew:
@@ -166,6 +169,19 @@ def locate_by_model(
     return report(run_dir, config.against, *result)
 
 
+def _is_outdated(config: DictConfig, stored: Mapping[str, Any], how: Mapping[str, Any]) -> bool:
+    """Tell whether to calibrate: it was not, or not as `how` says, which is said."""
+    other = [key for key, value in how.items() if stored.get("how", {}).get(key) != value]
+    if not config.calibrate:
+        other = [key for key in other if key != "calibrate"]
+    said = f"the model was calibrated with other {', '.join(other)}"
+    if stored and other and not config.calibrate:
+        raise ValueError(f"{said}: calibrate=3 does it for these")
+    if stored and other:
+        log.info("%s: calibrated anew", said)
+    return bool(config.calibrate and (config.renew or other))
+
+
 def _trust(
     config: DictConfig, run: Opened, locator: Locator, cells: Callable[[np.ndarray], Cells], run_dir: Path
 ) -> tuple[Trust, int]:
@@ -175,9 +191,7 @@ def _trust(
         learned = run.retraining(**brief)
     except DataError as error:
         raise DataError(f"{error}; calibrate=0 goes without calibration") from None
-    result = locating.learn_trust(learned, locator, int(config.calibrate), cells)
-    log.info("calibrated on %d snapshots left out: areas of %.1f %%", result[1], 100 * result[0].level)
-    return result
+    return locating.learn_trust(learned, locator, int(config.calibrate), cells)
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:

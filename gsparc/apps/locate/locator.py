@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,8 @@ from gsparc.prediction.refit import Learned
 log = logging.getLogger(__name__)
 
 MOST = 3_000  # cells of the coarse grid
-HELD_OUT = 200  # snapshots that trust is learned from, drawn evenly
+COUNTS = (50, 100, 200)  # snapshots that trust is learned from: more where radii of areas are not known ...
+KNOWN = 0.1  # ... to this share of them
 HALVED = 16  # cells that are halved at a time
 KEPT = 0.9  # of the mass: cells beyond it stay as they are
 LEVELS = 8  # halvings of a cell
@@ -90,9 +92,12 @@ class Locator:
         """Of the larger box; one, as what it says of its coarse grid takes as long."""
         return replace(self, cells=self.wider)
 
-    def search_cells(self, heard: Snapshots, trust: Trust) -> Search:
-        """One snapshot's misfit at cells that are halved as long as few of them hold the mass."""
-        current = Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
+    def search_cells(self, heard: Snapshots, trust: Trust, before: Search | None = None) -> Search:
+        """One snapshot's misfit at cells that are halved as long as few of them hold the mass.
+
+        `before`: the same under another trust, whose cells are halved further.
+        """
+        current = before or Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
         for _ in range(LEVELS):
             cells = current.cells
             likely = densest_cells(current.log_density(trust), cells.volume, KEPT)
@@ -125,9 +130,8 @@ class Locator:
                 wide = self._further.search_cells(one, self.trust)
                 if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
                     search, doubt = wide, DOUBTS["beyond"]
-            posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
-            area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
-            known = posterior.peak(), area, posterior.count_modes(mass), posterior
+            posterior, mass = search.posterior(self.trust), self.trust.level
+            known = posterior.peak(), posterior.area(mass), posterior.count_modes(mass), posterior
             seconds, true = time.perf_counter() - started, heard.place[number]
             inside = int(posterior.mass_above(true) <= mass) if np.isfinite(true).all() else None
             return Located(*known, seconds, doubt, inside)
@@ -154,17 +158,28 @@ def learn_trust(
         field, trained = SiteField(Predictor(method, data.site)), np.union1d(inner.train, inner.val)
         without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
         heard = group_snapshots(data, inner.test)
-        sample = np.sort(rng.permutation(len(heard))[: -(-HELD_OUT // folds)])
+        sample = rng.permutation(len(heard))[: -(-COUNTS[-1] // folds)]
         pairs += [(without, heard.subset(np.array([row]))) for row in sample]
+    pairs = [pairs[number] for number in rng.permutation(len(pairs))]
     places = np.concatenate([heard.place for _, heard in pairs])
+    searched, trust = list[Search](), locator.trust
 
-    def looks(trust: Trust, number: int) -> list[Search]:
-        what = f"snapshots that were left out, pass {number} of 2"
-        return run_all(lambda pair: pair[0].search_cells(pair[1], trust), pairs, what)
+    def search(count: int) -> list[Search]:
+        pieces = [*zip_longest(pairs[:count], searched)]
+        what = f"snapshots that were left out{', again' * (len(searched) == len(pieces))}"
+        return run_all(lambda piece: piece[0][0].search_cells(piece[0][1], trust, piece[1]), pieces, what)
 
-    trust = calibrate_trust(looks(locator.trust, 1), places, locator.share, locator.trust)
-    # Which cells are halved depends on the trust: the level is one of cells as they will be.
-    return calibrate_level(trust, looks(trust, 2), places, locator.share), len(places)
+    for count in COUNTS:
+        searched = search(count)
+        trust = calibrate_trust(searched, places[:count], locator.share, trust)
+        # Which cells are halved depends on the trust: the level is one of cells as they will be.
+        searched = search(count)
+        trust, radius = calibrate_level(trust, searched, places[:count], locator.share)
+        said = "calibrated on %d snapshots left out: areas of %.1f %%, their radius known to %.0f %%"
+        log.info(said, len(searched), 100 * trust.level, 100 * radius)
+        if radius < KNOWN or count >= len(pairs):
+            break
+    return trust, len(searched)
 
 
 def trust_state(trust: Trust, unknown: Nuisances, share: float, **learned: Any) -> dict[str, Any]:

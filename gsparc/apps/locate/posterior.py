@@ -72,6 +72,10 @@ class Posterior:
         # Half of those as likely, so that equal densities have a level in the middle of their mass.
         return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
 
+    def area(self, share: float) -> float:
+        """Return length, area or volume of the densest cells that hold a share of the mass [m, m^2, m^3]."""
+        return float(self.cells.volume[densest_cells(self.log_density, self.cells.volume, share)].sum())
+
     @cached_property
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
