@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, split_for
-from gsparc.data.moments import number_moments
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
 from gsparc.data.schema import Measurements
@@ -100,7 +99,7 @@ class Opened:
         """
         config = self.stored[0].configuration
         if "model" not in config:
-            raise DataError(f"{self.stored[0].path} does not say how it was trained")
+            raise DataError(f"{self.stored[0].path} does not say how it was trained: train it anew")
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
         factory = build(config["model"], trusted=False)
         context = FitContext(**effort_settings(config) | others)
@@ -166,11 +165,7 @@ def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measu
     before = stored.configuration.get("dataset") or {}
     apart = place_by_row(path, before.get("columns") or {}, site.moving_end)
     settings = {"file": str(path)} | ({"columns": apart} if apart else {})
-    data = align_to_site(module_of(stored, settings).measurements, site)
-    if apart:
-        count = len(np.unique(number_moments(data, np.arange(len(data)))))
-        log.info("%s: %d snapshots in %d levels, at unknown places", path, count, len(data))
-    return data, not apart
+    return align_to_site(module_of(stored, settings).measurements, site), not apart
 
 
 def module_of(stored: checkpoint.Stored, dataset: Mapping[str, Any] | None) -> DataModule:

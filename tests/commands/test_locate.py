@@ -138,13 +138,18 @@ def test_a_long_log_was_refused_though_it_has_times(roofs, tmp_path, caplog):
     wide = located(tmp_path / "wide", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")[1]
     with caplog.at_level("INFO"):
         found = located(tmp_path / "run", *timed)[1]
-    assert "20 snapshots in 59 levels" in caplog.text
+    assert "20 snapshots in 59 rows" in caplog.text
     assert [[row[axis] for axis in "xy"] for row in found] == [[row[axis] for axis in "xy"] for row in wide]
     for name, columns, line, said in (
         ("scan", "scan,cell,rssi", lambda i, a, b: f"{i},{a},{b}", "expected a column of times, or one row"),
-        ("day", "date,cell,rssi", lambda i, a, b: f"2026-11-27,{a},{b}", "'date' is one in 20 rows of a"),
-        ("each", "time,cell,rssi", lambda i, a, b: f"{i}.{a[-1]},{a},{b}", "'time' differs in all rows"),
-        ("gap", "time,cell,rssi", lambda i, a, b: f"{i or ''},{a},{b}", "'time' is empty in line 2"),
+        ("day", "date,cell,rssi", lambda i, a, b: f"2026-11-27,{a},{b}", "'date' has 1 values in 60 rows"),
+        ("each", "time,cell,rssi", lambda i, a, b: f"{i}.{a[-1]},{a},{b}", "'time' has 60 values in 60 rows"),
+        (
+            "gap",
+            "time,cell,rssi",
+            lambda i, a, b: f"{i or ''},{a},{b}",
+            "'time' has 20 values in 60 rows, 3 empty",
+        ),
     ):
         with pytest.raises(DataError, match=said):
             located(tmp_path / name, *log(name, columns, line))
@@ -158,8 +163,9 @@ def test_a_final_model_spoke_of_test_rows_alone(roofs, tmp_path):
         located(tmp_path / "run", f"ckpt={roofs[0]}")
 
 
-def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, caplog):
+def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, monkeypatch, caplog):
     """Areas were calibrated anew by every call, though the checkpoint held what was learned."""
+    monkeypatch.setattr(locator, "HELD_OUT", 6)
     ckpt = shutil.copy(roofs[0], tmp_path / "model.ckpt")
     given = f"ckpt={ckpt}", f"data='{roofs[1]}/phone.csv'", "rows=3"
     first, rows = located(tmp_path / "first", *given, "calibrate=2")
@@ -173,10 +179,12 @@ def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, caplog):
     assert "calibration 1 of 2" in caplog.text
 
 
-def test_200_snapshots_were_left_out_where_fewer_tell_the_areas(roofs, tmp_path, monkeypatch, caplog):
-    """Each was sought twice, from the coarse grid on, before the first answer."""
-    monkeypatch.setattr(locator, "COUNTS", (20, 40, 80))
-    monkeypatch.setattr(locator, "KNOWN", 10.0)
+def test_200_snapshots_left_out_were_each_sought_twice_from_the_coarse_grid_on(
+    roofs, tmp_path, monkeypatch, caplog
+):
+    """Minutes before the first answer of a model of many stations."""
+    monkeypatch.setattr(locator, "TRUSTED", 8)
+    monkeypatch.setattr(locator, "HELD_OUT", 20)
     ckpt, before = shutil.copy(roofs[0], tmp_path / "model.ckpt"), []
     search = locator.Locator.search_cells
     counted = lambda *given: before.append(given[3:]) or search(*given)  # noqa: E731
@@ -184,12 +192,22 @@ def test_200_snapshots_were_left_out_where_fewer_tell_the_areas(roofs, tmp_path,
     with caplog.at_level("INFO"):
         facts, _ = located(tmp_path / "run", f"ckpt={ckpt}", "eval_on=train", "rows=1", "calibrate=2")
     assert facts["locate/calibrated_on"] == 20 and "calibrated on 20 snapshots left out" in caplog.text
-    assert [bool(one and one[0]) for one in before[:40]] == [False] * 20 + [True] * 20
+    assert [bool(one and one[0]) for one in before[:48]] == [False] * 8 + [True] * 8 + [False] * 12 + [
+        True
+    ] * 20
+
+
+def test_the_log_showed_trust_as_an_object(roofs, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(locator, "HELD_OUT", 3)
+    given = f"ckpt={roofs[0]}", "store=false", "eval_on=train", "rows=1", "calibrate=2"
+    with caplog.at_level("INFO"):
+        located(tmp_path / "run", *given)
+    assert "3 snapshots left out: areas of 100.0 %" in caplog.text and "Trust(" not in caplog.text
 
 
 def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monkeypatch, caplog):
     """A plan that changed under its name was not noticed, and `calibrate=0` took whatever was stored."""
-    monkeypatch.setattr(locator, "COUNTS", (6,))
+    monkeypatch.setattr(locator, "HELD_OUT", 6)
     ckpt, paper = shutil.copy(roofs[0], tmp_path / "model.ckpt"), np.full((40, 40, 3), 255, np.uint8)
     low, high = (site := checkpoint.read(ckpt).site).moving_box[:, :2] + site.origin[:2]
     points = f"plan_points=[[0,40,{low[0]},{low[1]}],[40,40,{high[0]},{low[1]}]]"
@@ -201,10 +219,10 @@ def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monke
         caplog.clear()
         with caplog.at_level("INFO"):
             located(tmp_path / str(number), *given, "calibrate=2")
-        said += [[word in caplog.text for word in ("calibrated before", "with other cells or rows: calib")]]
+        said += [[word in caplog.text for word in ("calibrated before", "calibrated with cells=")]]
     assert said == [[False, False], [True, False], [False, True]]
     located(tmp_path / "stored", *given, "calibrate=0")
-    with pytest.raises(ValueError, match="was calibrated with other plan, plan_points, cells or rows"):
+    with pytest.raises(ValueError, match=r"was calibrated with plan=.*, plan_points=.*, cells=\w{8}: "):
         located(tmp_path / "box", *given[:3], "calibrate=0")
 
 

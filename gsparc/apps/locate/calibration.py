@@ -14,23 +14,15 @@ from gsparc.apps.locate.search import Search
 # Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
-LOOKS = 160  # trials
-# Steps in logarithms, and of the mean log density, whose standard error is some .1, that end the search.
-STEP, GAIN = 0.02, 0.002
+LOOKS = 100  # trials
 
 
-def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: float, start: Trust) -> Trust:
-    """Return the trust under which held-out places are most likely, with an area that holds a share.
-
-    All numbers but the level maximise the mean log density at the true places, a proper score; the level is
-    then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
-    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
-    the share of places that are exchangeable with these.
+def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, start: Trust) -> Trust:
+    """Return the trust under which held-out places are most likely: of the highest mean log density there.
 
     Args:
         snapshots: with their likelihoods over cells.
         places: (n, 3), where they were heard [m, local].
-        share: of places, to be held.
         start: of the search.
     """
     edge = float(np.max([one.cells.edge.max() for one in snapshots]))
@@ -48,27 +40,20 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
     simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
-    how = {"maxfev": LOOKS, "initial_simplex": simplex, "xatol": STEP, "fatol": GAIN}
-    optimum = minimize(surprise, first, method="Nelder-Mead", options=how)
-    return calibrate_level(decode_trust(optimum.x), snapshots, places, share)[0]
+    how = {"maxfev": LOOKS, "initial_simplex": simplex}
+    return decode_trust(minimize(surprise, first, method="Nelder-Mead", options=how).x)
 
 
-def calibrate_level(
-    trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float
-) -> tuple[Trust, float]:
+def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
     """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit.
 
-    And by how much a radius of these areas is wider, as a share of it, where the level is a standard error
-    higher.
+    The level is the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
+    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
+    the share of places that are exchangeable with these.
     """
-    known = [one.posterior(trust) for one in snapshots]
-    levels = np.sort([one.mass_above(place) for one, place in zip(known, places, strict=True)])
+    levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))
-    # The number of masses below the share's quantile is binomial.
-    higher = rank + int(np.ceil(np.sqrt(len(levels) * share * (1 - share))))
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
-    level, above = (float(levels[one - 1]) if one <= len(levels) else 1.0 for one in (rank, higher))
-    ratio = np.median([one.area(above) / one.area(level) for one in known])
-    trust = replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))
-    return trust, float(ratio ** (1 / max((snapshots[0].cells.edge.max(0) > 0).sum(), 1)) - 1)
+    level = float(np.sort(levels)[rank - 1]) if rank <= len(levels) else 1.0
+    return replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))

@@ -72,10 +72,6 @@ class Posterior:
         # Half of those as likely, so that equal densities have a level in the middle of their mass.
         return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
 
-    def area(self, share: float) -> float:
-        """Return length, area or volume of the densest cells that hold a share of the mass [m, m^2, m^3]."""
-        return float(self.cells.volume[densest_cells(self.log_density, self.cells.volume, share)].sum())
-
     @cached_property
     def _blurred(self) -> np.ndarray:
         """Whether a cell is one of those that hold nearly all of the mass (G,)."""
@@ -117,10 +113,8 @@ class Posterior:
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
         # Cells touch where centres are no farther apart than half the sum of edges, 1 % for rounding.
-        touch = (np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
-                 <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)  # fmt: skip
-        pairs = pairs[touch]
+        pairs = pairs[(np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
+                 <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)]  # fmt: skip
         graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some)))
         part = connected_components(graph, directed=False)[1]
-        mass = np.bincount(part, self.mass[some])
-        return max(int((mass >= MODE).sum()), 1)
+        return max(int((np.bincount(part, self.mass[some]) >= MODE).sum()), 1)

@@ -112,13 +112,12 @@ def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
         raise DataError(f"{asked} {wanted}")
     moment, named = sheet.joined(heads), list_first([*map(repr, heads)])
     links, moments = len({*zip(moment.tolist(), station.tolist(), strict=True)}), len(set(moment))
-    if (moment == "").any():
-        raise DataError(f"{asked} {named} is empty in {sheet.rows[int((moment == '').argmax())]}")
-    if moments == len(moment) and len(set(station)) > 1:
-        raise DataError(f"{asked} {named} differs in all rows; {wanted}")
-    # Clocks of whole seconds repeat now and then; those of days tell nothing.
-    if 2 * links < len(moment):
-        raise DataError(f"{asked} {named} is one in {len(moment) / links:.3g} rows of a station; {wanted}")
+    alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
+    # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
+    if empty or alone or 2 * links < len(moment):
+        raise DataError(
+            f"{asked} {named} has {moments} values in {len(moment)} rows, {empty} empty; {wanted}"
+        )
     return heads
 
 
