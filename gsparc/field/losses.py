@@ -44,10 +44,10 @@ def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
     # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
     shift = target.mean(dim=(-2, -1), keepdim=True)
     p, t = prediction - shift, target - shift
-    mean_p, mean_t = _blur(p), _blur(t)
+    mean_p, mean_t, square_p, square_t, cross = _blur(torch.cat((p, t, p * p, t * t, p * t))).chunk(5)
     # Only rounding makes a variance negative.
-    variances = (_blur(p * p) - mean_p**2).clamp_min(0) + (_blur(t * t) - mean_t**2).clamp_min(0)
-    covariance = 2 * (_blur(p * t) - mean_p * mean_t) + STABILITY[1]
+    variances = (square_p - mean_p**2).clamp_min(0) + (square_t - mean_t**2).clamp_min(0)
+    covariance = 2 * (cross - mean_p * mean_t) + STABILITY[1]
     light_p, light_t = mean_p + shift, mean_t + shift
     power = light_p**2 + light_t**2 + STABILITY[0]
     product = 2 * light_p * light_t + STABILITY[0]

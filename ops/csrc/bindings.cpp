@@ -34,9 +34,6 @@ NB_MODULE(_native, module) {
     module.attr("EQUAL_IDS") = kEqualIds;
     module.attr("TILE_WIDTH") = kTileWidth;
     module.attr("TILE_HEIGHT") = kTileHeight;
-    module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;
-    module.attr("SIMILARITY_HEIGHT") = kSimilarityHeight;
-    module.attr("RADIUS") = kRadius;
     define(module, "plan", plan);
     define(module, "entries", entries);
 #define X(name) define(module, #name, [](const Call& call) { return (call.twice ? kernels<double>().name : kernels<float>().name)(call); });

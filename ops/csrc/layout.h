@@ -42,9 +42,8 @@ constexpr int kStripRows = 4;
 // Taps of the similarity's window to either side of the middle one.
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;
 
-// Of the CUDA kernels: pixels of a tile, which a warp takes at a time; of a block of the similarity.
+// Of the CUDA kernels: pixels of a tile, which a warp takes at a time.
 constexpr int kTileWidth = 8, kTileHeight = 4;
-constexpr int kSimilarityWidth = 32, kSimilarityHeight = 8;
 
 // A footprint's rows [row0, row1) and columns column0 + [0, columns), modulo the width.
 struct Box {

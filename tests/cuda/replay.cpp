@@ -20,7 +20,6 @@ int64_t gsparc_composite_backward(const Call*);
 int64_t gsparc_weights(const Call*);
 int64_t gsparc_weights_backward(const Call*);
 int64_t gsparc_thaw(const Call*);
-int64_t gsparc_similarity(const Call*);
 const char* gsparc_error(int64_t);
 }
 
@@ -31,7 +30,6 @@ struct Kernel {
 const Kernel kernels[] = {
     {"plan", gsparc_plan}, {"bin", gsparc_bin}, {"composite", gsparc_composite}, {"composite_backward", gsparc_composite_backward},
     {"weights", gsparc_weights}, {"weights_backward", gsparc_weights_backward}, {"thaw", gsparc_thaw},
-    {"similarity", gsparc_similarity},
 };
 
 int main(int, char** arguments) {

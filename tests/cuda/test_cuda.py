@@ -2,10 +2,8 @@
 
 import pytest
 import torch
-from compute_kernels import KIND_SHAPES, assert_equals_reference
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render, truth
 
-from gsparc.field.losses import _Kernel
 from gsparc.ops import SphereGrid, calls, cuda, freeze, make_plan, operators, rasterize
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
@@ -68,19 +66,6 @@ def test_nothing_is_read_before_it_is_written(where, dtype):
         torch.use_deterministic_algorithms(False)
     for a, b in zip(want, got, strict=True):
         assert all(torch.equal(a[name], b[name]) for name in a)
-
-
-@pytest.mark.parametrize("kind,shape", [case for case in KIND_SHAPES if case[0] == "similarity"], ids=str)
-def test_compute_kernels_equal_their_definitions(where, kind, shape):
-    assert_equals_reference(kind, shape, torch.float32)
-
-
-def test_similarity_of_flat_images_stays_finite(where):
-    a, b = torch.full((1, 20, 20), 0.6), torch.full((1, 20, 20), 0.6 + 1e-7)
-    leaf = a.requires_grad_()
-    value = _Kernel.apply(leaf, b)
-    value.sum().backward()
-    assert abs(float(value.detach()) - 1) < 1e-5 and torch.isfinite(leaf.grad).all()
 
 
 def test_too_many_pairs_for_one_plan_are_refused(where, monkeypatch):
