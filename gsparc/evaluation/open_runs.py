@@ -99,7 +99,7 @@ class Opened:
         """
         config = self.stored[0].configuration
         if "model" not in config:
-            raise DataError(f"{self.stored[0].path} does not say how it was trained")
+            raise DataError(f"{self.stored[0].path} does not say how it was trained: train it anew")
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
         factory = build(config["model"], trusted=False)
         context = FitContext(**effort_settings(config) | others)
