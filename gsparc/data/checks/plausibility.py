@@ -103,6 +103,7 @@ def find_noise(
     heard = {int(t): level_db[station == t] for t in np.unique(station) if t not in limited}
     # Of a station that is seldom heard weak levels are missing, not piled up.
     often = max(map(len, heard.values()), default=0) / 2
+    piles: dict[int | None, tuple[float, float] | None]
     piles = {t: find_floor_pile(level) for t, level in heard.items() if len(level) >= often}
     if not limited and not any(piles.values()):
         piles = {None: find_floor_pile(level_db)}

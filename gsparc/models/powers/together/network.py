@@ -136,8 +136,8 @@ def learn_network(
         levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
     )  # fmt: skip
     # A receiver's noise is no level of a sector: no azimuth is doubted by it.
-    noise = find_noise(sector_of(loud.places), loud.decibels)
-    top = max((top for top, _ in noise.values()), default=-math.inf)
+    piles = find_noise(sector_of(loud.places), loud.decibels).values()
+    top = max((top for top, _ in piles), default=-math.inf)
     weak = few.decibels < top
     quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(weak, 1, few.side).astype(np.int8))
     with nullcontext() if budget is None else end_when(budget.is_spent):
@@ -224,8 +224,8 @@ def _correct_azimuths(
             found = float((table[t, 0] + said) % ROUND_DEG)
             notes.append(f"{names[t]} ({float(table[t, 0]):.0f} deg: levels fit {found:.0f})")
             table[t, 0] = found
-    said = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(notes)}"
-    return replace(trend, table=table), [Caution(said)] if notes else []
+    every = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(notes)}"
+    return replace(trend, table=table), [Caution(every)] if notes else []
 
 
 def _fit_by_evidence(
