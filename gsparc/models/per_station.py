@@ -100,7 +100,7 @@ class PerStation(Method):
 
     def __init__(self, factory: MethodFactory) -> None:
         self.factory, self.name, self.guesses = factory, factory.name, factory.guesses
-        self.takes_budget = factory.takes_budget
+        self.takes_budget, self.uses_censored = factory.takes_budget, factory.uses_censored
         self._copies: dict[int, Method] = {}
         self._shared = False  # whether one copy knows all stations
 
@@ -193,7 +193,7 @@ class PerStation(Method):
             ValueError: see `fit`.
         """
         stations = data.site.stations
-        assert stations is not None
+        assert stations is not None and data.station is not None
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
@@ -211,13 +211,13 @@ class PerStation(Method):
             if not self.factory.both_ends and not joint:
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
-        if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
+        lost = np.isnan(stations.position).any(1)
+        if joint:  # it seeks those that have rows
+            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.station[fold.train])
+        if UNHEARD in numbers and lost.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
-            if together:
-                raise ValueError(f"{needs}; say stations=each")
-            raise ValueError(
-                f"{needs} for those without training rows ({names}); give them, or split otherwise"
-            )
+            others = f" for those without training rows ({names}); give them, or split otherwise"
+            raise ValueError(needs + ("; say stations=each" if together and not joint else others))
         return numbers
 
     def _station_name(self, number: int) -> str:
@@ -256,7 +256,7 @@ class PerStation(Method):
         answers: list[tuple[Tensor, Prediction]] = []
         for number in stations.unique().tolist():
             chosen, copy = (stations == number).nonzero()[:, 0], self.station_method(number)
-            answers.append((chosen, copy.predict(_to_station_query(copy.site, query.rows(chosen)))))
+            answers.append((chosen, copy.predict(_to_station_query(copy.fitted_site, query.rows(chosen)))))
         # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
         return Prediction.joined(parts, torch.argsort(torch.cat(rows)))
@@ -297,7 +297,7 @@ class PerStation(Method):
         shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
         if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
             here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
-            names = " and ".join(self.site.stations.name[t] for t in here)
+            names = " and ".join(self.site.stations.shown[t] for t in here)
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
             row = int(apart.argmax())
@@ -386,9 +386,8 @@ def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
     return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
 
 
-def _to_station_query(site: Site | None, query: Query) -> Query:
+def _to_station_query(site: Site, query: Query) -> Query:
     """Rows of one station as its copy sees them: one pose where the receiver is the station, no number."""
-    assert site is not None
     if site.stations is not None:
         return query
     # One pose instead of B equal ones: what depends on the receiver alone is computed once.
