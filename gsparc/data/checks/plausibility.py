@@ -80,7 +80,7 @@ def floor_warnings(levels: LinkLevels) -> list[str]:
     piles, names = find_noise(levels.station, levels.level_db, levels.limited), levels.names
     # Upwards, so that levels below what is said are those of the pile; single precision has errors of 1e-6.
     said = [
-        ("" if t is None else _of([names[t]], len(names)), float(np.ceil(round(100 * top, 3)) / 100), share)
+        ("" if t < 0 else _of([names[t]], len(names)), float(np.ceil(round(100 * top, 3)) / 100), share)
         for t, (top, share) in piles.items()
     ]
     shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in said])
@@ -94,8 +94,8 @@ def floor_warnings(levels: LinkLevels) -> list[str]:
 
 def find_noise(
     station: np.ndarray, level_db: np.ndarray, limited: Container[int] = ()
-) -> dict[int | None, tuple[float, float]]:
-    """Return `find_floor_pile` of stations (n,) whose levels (n,) [dB] have one, else under None that of all.
+) -> dict[int, tuple[float, float]]:
+    """Return `find_floor_pile` of stations (n,) whose levels (n,) [dB] have one, else that of all under -1.
 
     NaN are no levels; stations `limited` have a level of hearing that is known.
     """
@@ -103,10 +103,8 @@ def find_noise(
     heard = {int(t): level_db[station == t] for t in np.unique(station) if t not in limited}
     # Of a station that is seldom heard weak levels are missing, not piled up.
     often = max(map(len, heard.values()), default=0) / 2
-    piles: dict[int | None, tuple[float, float] | None]
     piles = {t: find_floor_pile(level) for t, level in heard.items() if len(level) >= often}
-    if not limited and not any(piles.values()):
-        piles = {None: find_floor_pile(level_db)}
+    piles |= {} if limited or any(piles.values()) else {-1: find_floor_pile(level_db)}
     return {t: pile for t, pile in piles.items() if pile}
 
 
