@@ -70,8 +70,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     if found is not None:
         (floor, may), lists = found, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"
-        limits = f"{np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB"
-        how = f"not heard, below the weakest of each station ({limits})"
+        how = f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         stated = np.full(count, np.nan if floor is None else floor)

@@ -138,12 +138,11 @@ def learn_network(
     # A receiver's noise is no level of a sector: no azimuth is doubted by it.
     piles = find_noise(sector_of(loud.places), loud.decibels).values()
     top = max((top for top, _ in piles), default=-math.inf)
-    weak = few.decibels < top
-    quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(weak, 1, few.side).astype(np.int8))
+    quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side))
     with nullcontext() if budget is None else end_when(budget.is_spent):
         rough, gains, scale = _fit_rough(quiet, start)
         turned, notes = _correct_azimuths(quiet, rough, gains, scale, names)
-        if notes or weak.any():
+        if notes or piles:
             rough, gains, scale = _fit_rough(few, turned)
         trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
     shadowing = cast(SectorShadowing, kernel.terms[0])
