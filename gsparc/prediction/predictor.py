@@ -241,7 +241,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return lambda number: ask(**dict(zip(ends, world[number % len(world)], strict=True)))
 
     def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
-        """Return power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
+        """Return amplitudes by direction, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
 
         >>> predictor.spectrum(rx=[2.0, 1.0, 1.5])  # of a model of powers
         Traceback (most recent call last):

@@ -50,7 +50,7 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
         "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
         "time/locate_ms_p50": each_ms,
     }  # fmt: skip
-    return report(run_dir, config.against, METHOD, *both, columns_of_places(place, heard.position), facts)
+    return report(run_dir, config, METHOD, *both, columns_of_places(place, heard.position), facts)
 
 
 def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:

@@ -51,19 +51,20 @@ def columns_of_places(
 
 
 def report(
-    run_dir: Path, against: Sequence[str], method: str, heard: Snapshots, trained: Snapshots,
-    columns: dict[str, Any], facts: dict[str, Any], promise: str = "",
+    run_dir: Path, config: DictConfig, method: str, heard: Snapshots, trained: Snapshots,
+    columns: dict[str, Any], facts: dict[str, Any], promise: str = "", group: np.ndarray | None = None,
 ) -> Report:  # fmt: skip
     """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
 
     Args:
         run_dir: where the file goes.
-        against: names of plain methods beside it.
+        config: see conf/locate.yaml.
         method: name.
         heard, trained: what was located, and what was learned from.
         columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
         facts: for the summary, with the milliseconds of a snapshot.
         promise: what the areas promise, in words.
+        group: see `locate_by_neighbours`.
     """
     write_samples(run_dir / "locate.csv", columns)
     area, inside = columns.get("area_m2"), columns.get("inside")
@@ -73,17 +74,17 @@ def report(
     if "error_m" not in columns:
         return facts, [], doubts
     rows = []
-    for name in dict.fromkeys([method, *against]):
+    for name in dict.fromkeys([method, *config.against]):
         stem, error = "locate", columns["error_m"]
         if name != method:
             stem = f"baseline/{name}"
-            place, *seconds = locate_by_neighbours(name, trained, heard)
+            place, *seconds = locate_by_neighbours(name, trained, heard, group)
             facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = seconds
             error = np.linalg.norm(place - heard.place, axis=1)
         median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
         facts |= {f"{stem}/median_m": median, f"{stem}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
-    title = f"{facts['dataset/name']}, {len(heard)} snapshots"
+    title = f"{Path(config.data).stem if config.data else facts['dataset/name']}, {len(heard)} snapshots"
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
     if inside is not None:
@@ -159,16 +160,16 @@ def locate_by_model(
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
     own = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
-    promise = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
+    said = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
-    promise += f", {beyond} true places lie beyond these" * bool(beyond)
+    said += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
-    result = run.methods[0].name, heard, trained, columns(located), facts, promise
-    return report(run_dir, config.against, *result)
+    group = run.group_places(trained.place, int(config.calibrate) or 3, int(config.seed))
+    return report(run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, said, group)
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
@@ -212,16 +213,14 @@ def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np
         order = np.argsort(density)  # cells above one another: the likeliest is seen
         corners = cells.centre[order, :2] - cells.edge[order, :2] / 2
         boxes = [Rectangle(*box) for box in zip(corners, *cells.edge[order, :2].T, strict=True)]
-        patches = PatchCollection(boxes, cmap="Blues", linewidth=0)
         # 12 below the largest, a factor of 160,000: what is fainter is no different from white.
-        patches.set_array(np.maximum(density[order], density.max() - 12))
-        axis.add_collection(patches)
+        shade = np.maximum(density[order], density.max() - 12)
+        axis.add_collection(PatchCollection(boxes, cmap="Blues", linewidth=0, array=shade))
         axis.plot(*known[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
         axis.plot(*one.place[:2], "x", color="#D55E00", label="located")
         if true is not None:
             axis.plot(*true[number, :2], "o", markerfacecolor="none", color="black", label="heard at")
-        axis.set_aspect("equal")
-        axis.set(xlabel="x [m]", ylabel="y [m]")
+        axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         axis.set_title(f"snapshot {number}: {one.modes} mode{'s' if one.modes > 1 else ''}", fontsize=9)
     axes.flat[0].legend(fontsize=7)
     save(figure, path)
