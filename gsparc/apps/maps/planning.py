@@ -17,13 +17,14 @@ from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
-from gsparc.apps.maps.making import choose_stations, read_place
+from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import read_place
 
 # Covariances are over all places: 900 targets and 900 candidates are 26 MB in float64.
 TARGETS = 900  # places that the error is averaged over, about
@@ -102,8 +103,9 @@ def plan_measurements(
         area, height_m, plan: see `lay_grid`; with a promise and neither area nor plan, what it answers for.
         walkable: GeoJSON file of where somebody may measure: polygons, or lines such as streets, along which
             the walk then goes; None: the whole area.
-        stations, other_end: see `predict_map`; what is measured at a place is measured of all of them.
-        promise: evidence of held-out blocks, which scales the model's own variances.
+        stations, other_end: see `predict_map`; whose error is to fall.
+        promise: evidence of held-out blocks, which scales the model's own variances, and tells how many
+            stations a place lists, those that are predicted strongest there; None: a place measures all.
         least_gain_db: stop where a place takes less than this off the expected error.
         route: whether places are put in the order of a short walk, or drive; else the most telling first.
         start: (2,) where the walk starts [m]; None: anywhere.
@@ -146,9 +148,9 @@ def plan_measurements(
 
 def coarse_grid(
     predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None,
-    promise: Promise | None = None,
+    promise: Promise | None = None, count: int = TARGETS,
 ) -> Grid:  # fmt: skip
-    """Return about `TARGETS` cells; where nobody says which, those that a promise reaches."""
+    """Return about `count` cells; where nobody says which, those that a promise reaches."""
     fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
@@ -157,7 +159,7 @@ def coarse_grid(
         fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
     left, right, low, high = fine.extent
     share = fine.inside.mean()
-    step = float(np.sqrt((right - left) * (high - low) * share / TARGETS))
+    step = float(np.sqrt((right - left) * (high - low) * share / count))
     x, y = (np.arange(a + step / 2, b, step) for a, b in ((left, right), (low, high)))
     column, row = (((v - a) / fine.step).astype(int).clip(0, n - 1)
                    for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y))))  # fmt: skip
@@ -218,13 +220,12 @@ def choose_greedily(
             return chosen, expected, f"{why} after {len(chosen)} places"
         best = int(np.where(possible, gains, -np.inf).argmax())
         # Mean square errors subtract, roots do not.
-        left = error**2 - gains[best] / (len(unknown) * wanted.sum())
-        gain = error - float(np.sqrt(max(left, 0)))
-        if gain < least_gain_db:
+        left = float(np.sqrt(max(error**2 - gains[best] / (len(unknown) * wanted.sum()), 0)))
+        if (gain := error - left) < least_gain_db:
             return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
         for one in unknown:
             one.condition_on(first + best)
-        error = _expected(unknown, wanted)
+        error = left
         chosen.append(best)
         expected.append(error)
         tour.add(best)
