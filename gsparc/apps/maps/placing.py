@@ -253,7 +253,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         given = {head: words for head, role, words in asked.table if role in (None, "row_name")}
         return to_world(replace(asked, ends={end: replace(where, height=above)}), site)[end], given
     if sites is not None:
-        every, _ = walkable_places(sites, grid, predictor.site.georeference, "sites")
+        every, _ = walkable_places(sites, grid, "sites")
     else:
         every, count = grid.places(), 2 * count  # so many more lie in an area that the lattice missed
     few = every[evenly_spaced(len(every), count)]

@@ -22,7 +22,6 @@ from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
-from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_place
 
@@ -117,12 +116,11 @@ def plan_measurements(
     """
     metres = {"route_m": or_null(POSITIVE), "length_m": or_null(POSITIVE)}
     check_arguments(locals(), count=whole(1), least_gain_db=number(0), **metres)
-    origin = None if predictor is None else predictor.site.georeference
     grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets, streets = grid.places(), None
     places, first = targets, 0  # candidates are the places from `first` on
     if walkable is not None:
-        allowed, streets = walkable_places(walkable, grid, origin)
+        allowed, streets = walkable_places(walkable, grid)
         places, first = np.concatenate([targets, allowed]), len(targets)
     # Before anything is measured only the distance over which powers are alike is known.
     if predictor is None:
@@ -134,8 +132,9 @@ def plan_measurements(
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
-    before, before_db = mean_error(unknown), _expected(unknown, wanted)
-    chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour)
+    before = mean_error(unknown)
+    before_db = float(np.sqrt(np.mean(before[wanted] ** 2)))
+    chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour, before_db)
     order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64)
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
@@ -169,12 +168,10 @@ def coarse_grid(
     return replace(fine, x=x, y=y, step=step, inside=inside)
 
 
-def walkable_places(
-    path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable"
-) -> tuple[np.ndarray, Streets | None]:
+def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.ndarray, Streets | None]:
     """Return places (n, 3) in polygons or along lines of a file, and these lines; None: it holds none."""
     left, right, south, north = grid.extent
-    area, lines = read_shapes(path, key, origin, True, max(right - left, north - south))
+    area, lines = read_shapes(path, key, grid.origin, True, max(right - left, north - south))
     from shapely import contains_xy
 
     points, streets = [np.zeros((0, 2))], None
@@ -201,16 +198,15 @@ def walkable_places(
 
 def choose_greedily(
     unknown: list[ErrorCovariance], first: int, wanted: np.ndarray, count: int, least_gain_db: float,
-    tour: Tour,
+    tour: Tour, error: float,
 ) -> tuple[list[int], list[float], str]:  # fmt: skip
     """Chosen candidates, expected error after each, and why it stopped early.
 
-    Candidates are the places from `first` on, by whose numbers they are in `tour`.
+    Candidates are the places from `first` on, by whose numbers they are in `tour`; `error` is that before.
     """
     free = np.ones(len(wanted) - first, bool)
     chosen: list[int] = []
     expected: list[float] = []
-    error = _expected(unknown, wanted)
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
         gains = np.sum([one.variance_reductions(wanted)[first:] for one in unknown], axis=0)
@@ -236,7 +232,3 @@ def choose_greedily(
 def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:
     """Return the root of the mean variance over stations at each place (S,) [dB]."""
     return np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
-
-
-def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(mean_error(unknown)[wanted] ** 2)))
