@@ -38,7 +38,7 @@ def test_every_setting_has_a_comment(file: Path):
 
 
 def test_a_run_writes_no_name_that_no_table_explains(tmp_path: Path):
-    """`model/class` and `locate_ms` stood in no page; of all commands `test_a_command_of_a_page_ends_well`."""
+    """`model/class` and `locate_ms` stood in no page; others: `test_a_command_of_a_page_ends_well`."""
     given = ["dataset=own", f"dataset.file={powers(tmp_path / 'own.npz', 60)}", "model=gp", "threads=1"]
     train(compose(*given, "baselines=[nearest]", "logger=none"), tmp_path / "run")
     assert find_unexplained(tmp_path / "run") == []

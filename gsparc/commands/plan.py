@@ -42,8 +42,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         columns["way_m"] = plan.metres.round(1)
         way = pd.DataFrame(coordinates(np.pad(plan.path, ((0, 0), (0, 1))), predictor))
         at = ["longitude", "latitude"] if "longitude" in way else ["x", "y"]
-        stops = [("Point", [row[k] for k in at], row) for row in pd.DataFrame(columns).to_dict("records")]
-        write_shapes(run_dir / "plan.geojson", [("LineString", way[at].to_numpy().tolist(), {}), *stops])
+        line = {"type": "LineString", "coordinates": way[at].to_numpy().tolist()}
+        stops = pd.DataFrame(columns).to_dict("records")
+        points = [({"type": "Point", "coordinates": [row[k] for k in at]}, row) for row in stops]
+        write_shapes(run_dir / "plan.geojson", [(line, {}), *points])
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     draw_measurement_plan(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
@@ -58,5 +60,5 @@ def task(config: DictConfig) -> dict[str, Any]:
         every = "all stations alike (a map shows the strongest)"
         before += f" of {every if stations is None else ', '.join(map(str, stations))}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
-    before += f", a way of {plan.length_m:.0f} m, {kind}; rows logged on the way come on top; plan "
+    before += f", a way of {plan.length_m:.0f} m, {kind}; rows logged on the way not counted; plan "
     return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)

@@ -47,12 +47,6 @@ def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 
-def rows_of_device(rows: np.ndarray, rank: int, devices: int) -> np.ndarray:
-    """Return rows of a batch for device `rank`, every `devices`-th, at least one: all take the step."""
-    mine = rows[rank::devices]
-    return mine if len(mine) else rows[rank % len(rows) :][:1]
-
-
 class StepLoader:
     """Iterating yields the batches from step `first_step()` to the end of that step's epoch.
 
@@ -88,7 +82,8 @@ class StepLoader:
         start = self.first_step()
         for step in range(start, (start // len(self) + 1) * len(self)):
             rows = rows_of_step(self.seed, step, self.batch_size, self.pool)
-            mine = rows_of_device(rows, self.rank, self.devices)
+            mine = rows[self.rank :: self.devices]
+            mine = mine if len(mine) else rows[self.rank % len(rows) :][:1]  # all take the step
             # A device without a row of its own repeats one, so that it joins the step, with weight 0.
             part = len(mine) / len(rows) if self.rank < len(rows) else 0.0
             yield replace(self.data.batch(mine), share=part)

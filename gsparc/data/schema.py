@@ -109,7 +109,7 @@ class Links:
         if self.stations is None or self.station is None:
             # A row of a file of links is a place and a station; the place alone would name several rows.
             return rows
-        names = self.stations.name
+        names = self.stations.shown
         return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
 
 

@@ -144,7 +144,7 @@ def _there(stations: Stations | None, name: str, source: str) -> Stations:
 def _number(stations: Stations, wanted: str | int, option: str, source: str) -> int:
     found = find_station(wanted, stations)
     if found is None:
-        hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.name, 9)}"
+        hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.shown, 9)}"
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
     return found
 
@@ -172,9 +172,9 @@ def _of_runs(arrays: Arrays, runs: Sequence[str | int], source: str) -> np.ndarr
         raise DataError(f"dataset.runs: {source} names no runs; expected an array run")
     of_row = arrays["run"].astype(str)
     known, wanted = np.unique(of_row).tolist(), [str(run) for run in runs]
-    for name in wanted:
-        if name not in known:
-            raise DataError(f"dataset.runs={name}: no such run in {source}{suggest_or_list(name, known)}")
+    if unknown := sorted({*wanted} - {*known}):
+        hint = suggest_or_list(unknown[0], known)
+        raise DataError(f"dataset.runs={unknown[0]}: no such run in {source}{hint}")
     return np.isin(of_row, wanted)
 
 

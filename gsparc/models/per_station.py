@@ -193,7 +193,7 @@ class PerStation(Method):
             ValueError: see `fit`.
         """
         stations = data.site.stations
-        assert stations is not None
+        assert stations is not None and data.station is not None
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
@@ -211,13 +211,13 @@ class PerStation(Method):
             if not self.factory.both_ends and not joint:
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
-        if UNHEARD in numbers and not joint and np.isnan(stations.position).any():
+        lost = np.isnan(stations.position).any(1)
+        if joint:  # it seeks those that have rows
+            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.station[fold.train])
+        if UNHEARD in numbers and lost.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
-            if together:
-                raise ValueError(f"{needs}; say stations=each")
-            raise ValueError(
-                f"{needs} for those without training rows ({names}); give them, or split otherwise"
-            )
+            others = f" for those without training rows ({names}); give them, or split otherwise"
+            raise ValueError(needs + ("; say stations=each" if together and not joint else others))
         return numbers
 
     def _station_name(self, number: int) -> str:
@@ -297,7 +297,7 @@ class PerStation(Method):
         shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
         if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
             here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
-            names = " and ".join(self.site.stations.name[t] for t in here)
+            names = " and ".join(self.site.stations.shown[t] for t in here)
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
             row = int(apart.argmax())

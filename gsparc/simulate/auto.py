@@ -191,12 +191,6 @@ def choose_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Pa
     return replace(choice, table=table, samples=samples if enough else None)
 
 
-def keep_all_effects(choice: Choice, full: Effects) -> Choice:
-    """Return all effects where held-back receivers refute a choice; the verdict is on the latter."""
-    table = tuple(replace(row, kept=True) for row in choice.table)
-    return replace(choice, effects=full, refuted=str(choice.effects), table=table)
-
-
 def keep_all_rays(choice: Choice) -> Choice:
     """Return the choice, whose fewer rays the held-back receivers refute."""
     return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))

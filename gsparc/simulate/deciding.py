@@ -98,7 +98,8 @@ class Decider:
             choice, changed = self._verified(choice, choice.effects)
             if choice.refused:
                 log.info("auto: verification on held-back receivers failed; everything is simulated")
-                choice = auto.keep_all_effects(choice, self.full)
+                table = tuple(replace(row, kept=True) for row in choice.table)
+                choice = replace(choice, effects=self.full, refuted=str(choice.effects), table=table)
         # After the effects, as fewer rays are tried with those that were chosen.
         whole, thin = (
             auto.relative_cost(choice.effects, self.full, rays) for rays in (1.0, self.settings.rays)

@@ -63,10 +63,6 @@ class Spent:
     wall: float = 0.0
     processor: float = 0.0
 
-    def seconds_on(self, clock: Clock) -> float:
-        """Return seconds of the clock [s]."""
-        return self.wall if clock == "wall" else self.processor
-
     def __add__(self, other: Spent) -> Spent:
         return Spent(self.wall + other.wall, self.processor + other.processor)
 
@@ -119,7 +115,7 @@ class TimeBudget:
     @property
     def spent(self) -> float:
         """[s]"""
-        return self.by_clock.seconds_on(self.clock)
+        return self.by_clock.wall if self.clock == "wall" else self.by_clock.processor
 
     @property
     def left_s(self) -> float | None:

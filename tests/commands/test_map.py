@@ -78,7 +78,7 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     lines = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(lines) == 7 and lines[0].endswith(",way_m") and (tmp_path / "plan.png").exists()
-    assert "rows logged on the way come on top" in said
+    assert "; rows logged on the way not counted" in said
 
 
 def test_the_file_of_a_way_held_no_stops(model, tmp_path):

@@ -178,10 +178,11 @@ class Tiny:
             splats = words.get("save", "").endswith(".ply")  # of a field
             words["ckpt"] = self.model("tradeoff" if splats else name)
         if "init_from" in words:  # weights of the same data and settings
-            run = self.folder / "before"
-            if not run.exists():
-                train(compose(*self.line("train", ("dataset=rfid",), run)), run)
-            words["init_from"] = str(run / "model.ckpt")
+            before = self.folder / "before"
+            if not before.exists():
+                own = self.line("train", ("dataset=rfid",), before)
+                train(compose(*(word for word in own if not word.startswith("hydra."))), before)
+            words["init_from"] = str(before / "model.ckpt")
         if name == "export":
             words |= {"station": "west", "out": f"{run}-c"}
         if name == "predict":

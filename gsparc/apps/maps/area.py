@@ -100,9 +100,7 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
     """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
     box = None if site is None else site.moving_box
     width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
-    if isinstance(area, str | Path):
-        if Path(area).suffix.lower() not in (".geojson", ".json"):
-            raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
+    if isinstance(area, str | Path) and Path(area).suffix.lower() in (".geojson", ".json"):
         origin = None if site is None else site.georeference
         drawn, _ = read_shapes(area, "area", origin, site_m=width)
         from shapely import contains_xy

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.geojson import write_shapes
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import finite_array
@@ -264,9 +265,8 @@ def read_loads(
         DataError: another number of them, an unknown name, or no share.
     """
     if isinstance(load, Mapping):
-        wrong = next((name for name in load if name not in {*stations, *labels}), None)
-        if wrong is not None:
-            raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
+        if wrong := sorted(load.keys() - {*stations, *labels}):
+            raise DataError(f"load: no station {wrong[0]!r}; there are {', '.join(stations)}")
         load = [load.get(a, load.get(b, 1.0)) for a, b in zip(stations, labels or stations, strict=True)]
     values = finite_array(load)
     if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():
@@ -291,7 +291,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
-    `outage`, `best_server` (number of the station; the band's tags name each), `server_chance`, and then the
+    `outage`, `best_server` (number of the station, as in `write_classes`), `server_chance`, and then the
     power of each of several stations. Tags give unit, threshold and height.
     """
     import rasterio
@@ -308,16 +308,16 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
             file.set_band_description(number, name)
             unit = raster.unit if name.startswith(("power", "lower", "upper")) else "dB"
             file.set_band_unit(number, unit if "_db" in name else "")
-            if name == "best_server":
-                file.update_tags(number, **{str(i): one for i, one in enumerate(raster.stations)})
 
 
 def write_classes(
     path: str | Path, raster: FieldMap, origin: Georeference | None, number: np.ndarray,
     names: Sequence[str], colours: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), names as tags."""
+    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), and named areas as GeoJSON."""
     import rasterio
+    from rasterio.features import shapes
+    from rasterio.warp import transform_geom
 
     values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
     profile = _profile(raster, origin, count=1, dtype="uint16", nodata=NO_CLASS)
@@ -325,7 +325,11 @@ def write_classes(
         # Before the values, which fix what colours mean.
         file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
         file.write(values, 1)
-        file.update_tags(1, **{str(i): one for i, one in enumerate(names)})
+    named = []
+    for area, one in shapes(values, values != NO_CLASS, transform=profile["transform"]):
+        area = area if origin is None else transform_geom(profile["crs"], "EPSG:4326", area)
+        named.append((area, {"number": int(one), "station": names[int(one)]}))
+    write_shapes(Path(path).with_suffix(".geojson"), named)
 
 
 def _profile(raster: FieldMap, origin: Georeference | None, **bands: Any) -> dict[str, Any]:

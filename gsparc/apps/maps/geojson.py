@@ -88,10 +88,7 @@ def read_shapes(
     return shapely.union_all(shapely.make_valid(polygons)), list(lines)
 
 
-def write_shapes(path: Path, shapes: list[tuple[str, Any, Any]]) -> None:
-    """Write shapes, each its type, coordinates and properties."""
-    features = [
-        {"type": "Feature", "properties": facts, "geometry": {"type": kind, "coordinates": at}}
-        for kind, at, facts in shapes
-    ]
+def write_shapes(path: Path, shapes: list[tuple[dict[str, Any], Any]]) -> None:
+    """Write geometries, each with its properties."""
+    features = [{"type": "Feature", "properties": facts, "geometry": one} for one, facts in shapes]
     write_whole(path, json.dumps({"type": "FeatureCollection", "features": features}))

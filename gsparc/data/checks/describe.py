@@ -115,7 +115,7 @@ def _static(site: Site) -> str:
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
-    name = "" if stations is None else f" {stations.name[0]},"
+    name = "" if stations is None else f" {stations.shown[0]},"
     return f"the {end},{name} at ({', '.join(f'{x:.3f}' for x in place)}) m"
 
 

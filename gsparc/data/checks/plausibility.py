@@ -209,8 +209,8 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
             for step in own
         )
         first = ",".join(str(levels.file_row[step.first]) for step in own)
-        setting = f"'dataset.level_steps={{{names[t]}:[{first}]}}' (rows from 0) makes it another station"
-        setting = "" if names[t] == UNNAMED else f" {setting} from there on"
+        setting = f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another"
+        setting = "" if names[t] == UNNAMED else f" {setting} station from there on"
         warnings.append(f"{who} {said}, which the places do not explain: another gain or antenna?{setting}")
     return warnings
 
@@ -289,7 +289,8 @@ class LinkLevels:
         level_db: (n,) [dB], NaN where there is no value.
         rows: (n,) what messages call the row of the file.
         file_row: (n,) its number from 0.
-        names: (T,) of the stations.
+        names: (T,) of the stations, for people.
+        keys: (T,) as settings take them.
         station_position: (T, 3), in the world [m]; None where it is not known.
         limited: stations with rows below a level of hearing that the file states.
     """
@@ -300,6 +301,7 @@ class LinkLevels:
     rows: list[str]
     file_row: np.ndarray
     names: list[str]
+    keys: list[str]
     station_position: np.ndarray | None
     limited: frozenset[int] = frozenset()
 
@@ -349,7 +351,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     of_file = [called[i].partition(", station")[0] for i in of_row]
     known = site.static_position if stations is None else stations.position
     known = None if known is None else np.atleast_2d(known) + site.origin
-    names = [UNNAMED] if stations is None else list(stations.name)
+    names, keys = ([UNNAMED],) * 2 if stations is None else map(list, (stations.shown, stations.name))
     number = of_row if file_row is None else file_row[of_row]
     place = data.moving[of_row] + site.origin
-    return LinkLevels(place, of_link, levels, of_file, number, names, known, limited)
+    return LinkLevels(place, of_link, levels, of_file, number, names, keys, known, limited)

@@ -21,6 +21,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, Problems, shorten
 from gsparc.data.files import read_text
+from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import finite_array, number
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.raw import Raw
@@ -43,6 +44,7 @@ def read_powder(
     station_table: str | Path | None = None,
     tx_height: float = WALKER_M,
     station_height: float = STATION_M,
+    sensitivity_db: Mapping[str, float] | None = None,
 ) -> Raw:
     """Read an npz, or the release's CSV; NaN is no value.
 
@@ -50,6 +52,7 @@ def read_powder(
         path: *.npz or *.csv.
         station_table: coordinates of the stations of a CSV; None takes `location_coordinates.json` beside it.
         tx_height, station_height: above ground [m], the same for all; the ground is taken as flat.
+        sensitivity_db: of some stations, by name: weaker levels are noise, nothing was heard [dB].
 
     Returns:
         `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg], `tx_height`,
@@ -67,6 +70,11 @@ def read_powder(
     else:
         raw = _of_npz(path)
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
+    if sensitivity_db:
+        names = raw.arrays["station_name"].tolist()
+        if wrong := sorted(sensitivity_db.keys() - {*names}):
+            raise DataError(f"dataset.sensitivity_db: no {wrong[0]}{suggest_or_list(wrong[0], names)}")
+        heights["sensitivity_db"] = np.array([sensitivity_db.get(name, np.nan) for name in names], float)
     about = {"name": "powder", **raw.attributes, "layout": "powder"}
     return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)
 

@@ -78,11 +78,6 @@ class Condition:
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
 
-    def change_test(self, data: Measurements, split: Split, seed: int) -> Measurements:
-        """Return data whose test rows are asked about."""
-        rows = np.concatenate([fold.test for fold in split.folds])
-        return add_position_errors(data, rows, self.amount, seed)
-
 
 ROW = (
     "variant", "what", "amount", "effects", "rows", "figure", "value", "spread", "train_s", "train_cpu_s",
@@ -179,7 +174,8 @@ class Study:
                 checkpoint.save(learned.model(folder), made.methods[0], "", extra)
             outcome = fits[learned]
             if condition.what == "query":
-                outcome = outcome.score_on(condition.change_test(data, split, seed), split)
+                tested = np.concatenate([fold.test for fold in split.folds])
+                outcome = outcome.score_on(add_position_errors(data, tested, condition.amount, seed), split)
             # Where rows were silent they count, as in every other table.
             figure = deciding_figure(outcome.figures, data.site.scored)
             folds = [condition.change_training(data, fold, seed)[1] for fold in split.folds]

@@ -18,6 +18,7 @@ from PIL import Image
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
+from gsparc.evaluation.metric_formats import LISTED, judged_by
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
@@ -26,6 +27,7 @@ from gsparc.evaluation.table import Table
 # A page holds its pictures in base64, a third larger than their files.
 PICTURE_PX = 1000  # width at which pictures are kept
 MOST_PICTURES = 6
+IDS = r'(id="|url\(#|href="#)'  # of an SVG, and what refers to them
 
 
 @dataclass
@@ -69,7 +71,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     study.tables += [table for table in (kind(runs) for kind in kinds) if table.rows]
     study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
     study.plots = [
-        (str(figure.get_label()), _unique_ids(plots.to_svg(figure), number))
+        # Ids of several drawings on one page must differ: matplotlib repeats them.
+        (str(figure.get_label()), re.sub(IDS, rf"\g<1>p{number}-", plots.to_svg(figure)))
         for number, figure in enumerate(study.figures)
     ]
     firsts = [group[0] for group in tables.group_by_setting(runs).values()]
@@ -92,19 +95,16 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         groups = tables.group_by_setting(scored).values()
         group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
-        leads = {name: lead for name, lead in tables.leads_of_baselines(group).items() if lead}
-        if leads:
-            name = max(leads, key=lambda one: leads[one].ahead_db)
-            remarks += summary.judge_baseline(name, group[0].setting, group[0].row["figure"], leads[name])
+        for ahead, figure in judged_by(group[0].facts).items():
+            leads = {name: lead for name, lead in tables.leads_of_baselines(group, figure).items() if lead}
+            if leads:
+                name = max(leads, key=lambda one: leads[one].ahead_db)
+                of = group[0].setting, figure, leads[name], ahead == LISTED
+                remarks += summary.judge_baseline(name, *of)
     elif scored:  # a baseline must beat the best run of the page
         remarks += summary.better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
     return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
-
-
-def _unique_ids(svg: str, number: int) -> str:
-    """Ids of several drawings on one page must differ: matplotlib repeats them."""
-    return re.sub(r'(id="|url\(#|href="#)', rf"\g<1>p{number}-", svg)
 
 
 def _png(path: Path) -> str:

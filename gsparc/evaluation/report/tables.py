@@ -86,10 +86,13 @@ def has_draws(runs: Sequence[Run]) -> bool:
     return any(len({run.row["draw"] for run in group}) > 1 for group in group_by_setting(runs).values())
 
 
-def leads_of_baselines(group: Sequence[Run]) -> dict[str, Lead | None]:
-    """Return what each baseline has more than a setting, see `lead_over_runs`."""
-    rows = group_in_order((base for run in group for base in run.baselines), lambda base: base["method"])
-    return {name: lead_over_runs(own, [run.row for run in group]) for name, own in rows.items()}
+def leads_of_baselines(group: Sequence[Run], figure: str) -> dict[str, Lead | None]:
+    """Return what each baseline has more of a figure than a setting, see `lead_over_runs`."""
+    rows = (row for run in group for row in (run.row, *run.baselines))
+    every = [row | {"figure": figure, "value": row.get(figure)} for row in rows]
+    own, beside = ([row for row in every if row["baseline"] is other] for other in (False, True))
+    methods = group_in_order(beside, lambda base: base["method"])
+    return {name: lead_over_runs(theirs, own) for name, theirs in methods.items()}
 
 
 def accuracy_column(figure: str, note: str = "") -> Column:
@@ -155,7 +158,7 @@ def table_of_leads(runs: Sequence[Run]) -> Table:
     """Return what each setting has more than the first one and than each baseline, pair by pair."""
     groups, rows = group_by_setting(runs), []
     first, *others = groups
-    leads = {setting: leads_of_baselines(group) for setting, group in groups.items()}
+    leads = {setting: leads_of_baselines(group, group[0].row["figure"]) for setting, group in groups.items()}
     for setting in others:
         one, other = ([run.row for run in groups[name]] for name in (first, setting))
         leads[setting] = {first: lead_over_runs(one, other), **leads[setting]}

@@ -170,16 +170,13 @@ class Kriging(Interpolator):
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
-    def _queries_per_block(self) -> int:
-        """Queries answered at a time, of more."""
-        return max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))
-
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`."""
         return "its systems are solved outside of autograd"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        if self.tree is not None and len(queries) > (block := self._queries_per_block()):
+        block = max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))  # answered at a time
+        if self.tree is not None and len(queries) > block:
             parts = [self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)]
             return Prediction.joined(parts)
         place, weights, left = self._weights(queries)

@@ -66,7 +66,7 @@ class BasisGroup:
 
     def powers(self, prior: ChannelPrior) -> Tensor:
         """Return powers (P,) as this end has them."""
-        return (self.design @ learned_parameters(prior)).exp()
+        return (self.design @ torch.cat([term.parameters() for term in learned_terms(prior)])).exp()
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,6 @@ class SolvedGroup:
 def learned_terms(prior: ChannelPrior) -> tuple[ChannelTerm, ...]:
     """Return terms whose powers evidence knows: signal and white noise."""
     return *prior.signals, prior[Noise]
-
-
-def learned_parameters(prior: ChannelPrior) -> Tensor:
-    """Return those of `learned_terms` terms (Q,)."""
-    return torch.cat([term.parameters() for term in learned_terms(prior)])
 
 
 def normalise_power(group: Group) -> Group:

@@ -322,7 +322,8 @@ class _Search:
         heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return mirrored
-        return self._refit(mirrored.prior.with_terms(images.select_planes(heard)))
+        kept = replace(images, power=images.power[heard.repeat(2)], planes=images.planes[heard])
+        return self._refit(mirrored.prior.with_terms(kept))
 
     def _add_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""

@@ -154,9 +154,3 @@ def occludes_antennas_alike(rows: Rows) -> bool:
 def reached_noise_floor(left_out: Sequence[float], noise_floor: float, count: int = 2) -> bool:
     """Whether `count` searches have reached the noise floor."""
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= count
-
-
-def member_weights(members: list[Member]) -> Tensor:
-    """Return weights of the searches in the average, (M,) float32 of sum 1."""
-    error = torch.tensor([member.left_out for member in members])
-    return torch.softmax(-SHARPNESS * error.log(), 0)

@@ -140,9 +140,10 @@ class ImageSourceGP(SourcesInFrame):
         self.query = EnsembleMeans(self.members)
 
     def _set_members(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
-        """Say what these members say, with their weights."""
+        """Say what these members say, with their weights (M,) float32 of sum 1."""
         self._set_posteriors(rows, [member.scene for member in members])
-        self.weights = ensemble.member_weights(members)
+        error = torch.tensor([member.left_out for member in members])
+        self.weights = torch.softmax(-ensemble.SHARPNESS * error.log(), 0)
         return self
 
     def _describe_search(self, members: list[Member], budget: TimeBudget) -> list[str]:

@@ -142,7 +142,9 @@ class NeWRF(TrainedPeer):
         if not len(centres):
             raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
         found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
-        return {**found, "votes": count_votes(seen, len(centres))}
+        # How many rays of each receiver point at each virtual transmitter.
+        votes = np.stack([np.bincount(one[one >= 0], minlength=len(centres)) for one in seen])
+        return {**found, "votes": torch.from_numpy(votes).float()}
 
 
 def locate_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -196,9 +198,3 @@ def _cluster_centres(points: np.ndarray) -> np.ndarray:
             free[clusters[-1]] = False
     least = min(LEAST, max(map(len, clusters)))
     return np.stack([np.median(points[rows], axis=0) for rows in clusters if len(rows) >= least])
-
-
-def count_votes(seen: list[np.ndarray], count: int) -> Tensor:
-    """Return how many rays of each receiver point at each virtual transmitter: (n, V) float32."""
-    table = np.stack([np.bincount(rows[rows >= 0], minlength=count) for rows in seen])
-    return torch.from_numpy(table.astype(np.float32))

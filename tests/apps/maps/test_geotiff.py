@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,8 +37,6 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
         assert file.descriptions[0] == "power_db" and file.count == 11
         units = dict(zip(file.descriptions, file.units, strict=True))
         assert units["upper_db"] == found.unit and units["sinr_db"] == "dB" and not units["outage"]
-        named = file.tags(1 + file.descriptions.index("best_server"))
-        assert [named[str(i)] for i in range(len(found.stations))] == list(found.stations)
         power = file.read(1)
         outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
     assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
@@ -62,30 +59,26 @@ def test_a_file_for_other_programs_said_neither_unit_nor_colours(tmp_path):
         assert file.crs.to_wkt().startswith('PROJCS["equidistant_about_47.2_11.3"')  # was "unknown"
     with rasterio.open(tmp_path / "best.tif") as file:
         assert file.dtypes == ("uint16",) and file.colormap(1)[1][:3] == tuple((255 * colours[1]).astype(int))
-        assert file.tags(1)["0"] == found.stations[0]
         np.testing.assert_array_equal(np.flipud(file.read(1)), np.nan_to_num(number, nan=NO_CLASS))
 
 
-def test_polygons_of_best_servers_by_the_line_of_the_page(tmp_path):
-    """`rio shapes`, as docs/maps.md has it: in degrees, each with the number of best_server.csv."""
+def test_polygons_of_best_servers_had_no_names(tmp_path):
+    """`rio shapes` left numbers of best_server.csv, to be joined by hand."""
     pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
-    from click.testing import CliRunner
-    from rasterio.rio.main import main_group
     from shapely import contains_xy
     from shapely.geometry import shape
 
     found = predict_map(gsparc.load(town_model()), step_m=4.0)
     number = found.layer("best_server")
     write_classes(tmp_path / "best_server.tif", found, ORIGIN, number, found.stations, np.zeros((2, 3)))
-    page = Path("docs/maps.md").read_text().splitlines()
-    said = next(line for line in page if line.startswith("rio shapes")).partition(" >")[0]
-    words = said.replace("best_server.tif", str(tmp_path / "best_server.tif")).split()[1:]
-    told = json.loads(CliRunner().invoke(main_group, words).stdout)["features"]
-    areas = [(shape(one["geometry"]), one["properties"]["val"]) for one in told]
+    told = json.loads((tmp_path / "best_server.geojson").read_text())["features"]
+    areas = [(shape(one["geometry"]), tuple(one["properties"].values())) for one in told]
     cell = np.flatnonzero(np.isfinite(number))
     north, east = ORIGIN.to_degrees(found.grid.places(cell)[:, :2])
     for k in range(2):
-        inside = np.any([contains_xy(area, east, north) for area, one in areas if one == k], axis=0)
+        inside = np.any(
+            [contains_xy(area, east, north) for area, one in areas if one == (k, found.stations[k])], axis=0
+        )
         np.testing.assert_array_equal(inside, number.reshape(-1)[cell] == k)
 
 

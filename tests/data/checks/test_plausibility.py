@@ -32,7 +32,7 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     rows, count = level_db.shape
     return LinkLevels(
         np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
-        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count), names,
+        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count), names, names,
         station_position,
     )  # fmt: skip
 
@@ -238,3 +238,18 @@ def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
     )
     assert f"A from row {first}" in parted.data.site.stations.name
     assert plausibility.gap_warnings(link_levels(parted.data)) == []
+
+
+def test_warnings_and_rows_had_other_names_of_a_cell_than_the_rest():
+    """`station 150: row 7` of `W03-2 (150)`; the setting that a warning gives takes the short one."""
+    place, level, station = walk(4, 200)
+    place, level = np.concatenate([place, place + 0.5]), np.concatenate([level, level + 20])
+    links = {
+        "rx_position": np.c_[place, np.ones(400)],
+        "station_position": np.array([[*station, 9], [0, 0, 9]]),
+    }
+    labels = {"station_name": np.array(["150", "212"]), "station_label": np.array(["W03-2", "W03-3"])}
+    data = from_arrays({**links, **labels, "rssi_db": np.c_[level, level[::-1].copy()]})
+    warnings = warnings_of(link_levels(data))
+    assert any(w.startswith("station W03-2 (150) rises") and "level_steps={150:[" in w for w in warnings)
+    assert data.row_names[:2] == ["row 0, station W03-2 (150)", "row 0, station W03-3 (212)"]

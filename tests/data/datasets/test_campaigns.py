@@ -146,6 +146,20 @@ def test_powder_stations_without_a_place_are_left_out(tmp_path):
     assert "madsen-nuc2-b210" in raw.notes[0]
 
 
+def test_noise_of_powder_receivers_could_not_be_told_from_levels(tmp_path, refused):
+    """`check` named four stations and `sensitivity_db`, which the release's files cannot hold."""
+    own = {"name": "powder", "file": str(write_walk(tmp_path))}
+    level = np.sort(powder_arrays()["rssi_db"][:, 0])
+    floors = {STATIONS[0]: float(level[5] + level[4]) / 2}
+    before, after = load(own), load({**own, "sensitivity_db": floors})
+    side = after.censored_side(np.arange(len(after)))
+    assert before.censored is None and set(after.station[side > 0]) == {0}
+    assert ((side == 0) & (after.station == 0)).sum() == np.isfinite(level[5:]).sum()
+    refused(
+        "sensitivity_db: no station ebc", lambda _: load({**own, "sensitivity_db": {"ebc": -90}}), tmp_path
+    )
+
+
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
 WALKS = {  # what is replaced in the walk (None: all of it), the table of stations, and what is said
     "empty": (None, TABLE, "single_tx.csv: empty; expected a line of heads"),

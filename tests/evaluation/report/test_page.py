@@ -11,7 +11,7 @@ from gsparc.commands.report import task
 from gsparc.evaluation.drawing import style_of
 from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import make_sections, render_html, warnings
-from gsparc.evaluation.report.runs import find_runs
+from gsparc.evaluation.report.runs import Run, find_runs
 
 arguments = COMMANDS["report"].arguments
 
@@ -108,3 +108,17 @@ def test_no_baseline_is_the_better_choice_than_a_run_that_beats_it(run_dir, tmp_
     worse = run_dir(tmp_path / "b", name="nearest", psnr=26.0)
     assert warnings(find_runs([better, worse])) == []
     assert "gp has the better psnr_db" in warnings(find_runs([worse]))[0]
+
+
+def test_a_report_of_draws_said_nothing_of_heard_rows(tmp_path):
+    """`evaluate` says of each run who is ahead at the rows that lists hold; the page of draws did not."""
+    runs = []
+    for draw, off in enumerate((0.0, 0.2, -0.1)):
+        figures = {"test/rmse_db": 5.0 + off, "test/rmse_db_with_silent": 2.0, "baseline/gp/rmse_db": 4.0}
+        facts = {"dataset/kind": "rssi", "split/sha256": str(draw), "model/name": "gsparc", "seed": 0}
+        facts |= figures | {"baseline/gp/rmse_db_with_silent": 3.0 + off}
+        runs.append(Run(tmp_path, facts, overrides=(f"split.seed={draw}",)))
+    assert warnings(runs) == [
+        "gsparc is 1.03 ± 0.09 dB better over 3 draws in rmse_db_with_silent than gp, the best baseline",
+        "the baseline gp is 1.03 ± 0.09 dB better over 3 draws in rmse_db of heard rows",
+    ]

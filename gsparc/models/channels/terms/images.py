@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import torch
@@ -25,10 +25,6 @@ class Images(Spherical):
     def from_planes(cls, frame: Frame, planes: Tensor, level: float = 1.0) -> Self:
         """Return images of equal powers."""
         return cls(frame, torch.full((2 * len(planes),), level, dtype=torch.float64), planes=planes)
-
-    def select_planes(self, mask: Tensor) -> Self:
-        """Return some of them, of `mask` (W,) bool."""
-        return replace(self, power=self.power[mask.repeat(2)], planes=self.planes[mask])
 
     def mirror_ends(self, ends: Tensor) -> Tensor:
         """Return images (..., W, 3) [m] of ends (..., 3) where these are said to be."""

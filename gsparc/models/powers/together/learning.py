@@ -31,6 +31,7 @@ from gsparc.training.time_budget import TimeBudget
 
 START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
 SETTLED = 1e-6  # of settings that all stations have alike
+LEAST_DB2 = 1e-6  # of a station's process: levels that are equal to the last digit leave none
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
 LEARNED_EACH = 500  # rows of each station, for the law and for settings that all have alike
@@ -104,7 +105,7 @@ def learn_station_priors(
         for number in numbers:
             some = heard.select_station(number).thin_rows(ENDS_ON, seed)
             _, own = fit_kernel_by_left_out([kernel], *some.distances_terms_values(trend), tolerance=SETTLED)
-            priors[number] = Prior(own, trend)
+            priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
 
@@ -140,7 +141,8 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
         return torch.stack([left_out_density(at, number)[0] for number in views]).sum() / len(few.places)
 
     best, _ = minimise(mean_density, [start.parameters().numpy()], start.bounds(far), tolerance=SETTLED)
-    logs = np.log([float(left_out_density(torch.from_numpy(best), number)[1]) for number in views])
+    amplitudes = [float(left_out_density(torch.from_numpy(best), number)[1]) for number in views]
+    logs = np.log(np.maximum(amplitudes, LEAST_DB2))
     count = np.array([len(values) for _, _, values in views.values()])
     mean = float((count * logs).sum() / count.sum())
     logs = (count * logs + ALIKE * mean) / (count + ALIKE)

@@ -81,7 +81,7 @@ def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, 
         if len(own):
             places[number] = locate_still_end(power_rows(data, own))
             said = say_estimated(places[number] + site.origin)
-            notes.append(f"the place of station {site.stations.name[number]} {said}")
+            notes.append(f"the place of station {site.stations.shown[number]} {said}")
     return places, tuple(notes)
 
 

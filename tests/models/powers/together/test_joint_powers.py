@@ -250,6 +250,29 @@ def test_a_station_whose_place_nobody_gave():
     assert torch.isfinite(field.predict(batch).mean).all()
 
 
+def test_levels_that_are_equal_at_each_station_had_no_definite_covariance():
+    data = town(20)
+    level = (-80 - 3 * data.station)[:, None]
+    same = replace(data, target=(10 ** (level / 10)).astype(np.float32))
+    heard = np.flatnonzero(data.station != 0)
+    field, _ = fitted_to(JointPowerField(), same, heard)
+    asked = same.batch(heard[:40])
+    assert np.abs(db(field.predict(asked).mean) - level[heard[:40], 0]).max() < 0.01
+    assert np.isfinite(db(field.predict(same.batch(np.flatnonzero(data.station == 0))).mean)).all()
+
+
+def test_a_station_of_no_known_place_that_was_never_heard_was_no_number():
+    data = town(20)
+    gone = data.site.stations.position.copy()
+    gone[2:4] = np.nan
+    lost = replace(data, site=replace(data.site, stations=replace(data.site.stations, position=gone)))
+    of = [np.flatnonzero(data.station == number) for number in range(6)]
+    fold = Fold(np.concatenate([of[0], of[1], of[3], of[4], of[5]]), of[0][:0], of[2])
+    method = wrap_per_station(Gsparc(), lost)
+    with pytest.raises(ValueError, match=r"needs them for those without training rows \(.*2\); give them"):
+        method.fit(lost, fold, FitContext(stations="together"))
+
+
 def test_rows_are_thinned_at_places_that_stations_share():
     few = rows_of(town()).thin_rows(20, 0)
     assert np.array_equal(np.bincount(few.station), [20] * 6)
