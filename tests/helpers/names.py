@@ -49,4 +49,5 @@ def _keys(content: dict[str, Any], stem: str = "") -> Iterator[str]:
 def _is_explained(name: str) -> bool:
     parts = SUFFIX.sub("", name).split("/")
     tails = {"/".join(parts[i:]) for i in range(len(parts))} | {name.rpartition("/")[2], name}
+    tails |= {"20%"} if name.endswith("%") else set()
     return bool(ELSEWHERE.match(name) or tails & explained())
