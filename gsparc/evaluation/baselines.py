@@ -79,4 +79,5 @@ def fit_baseline(
 
     contexts = [FitContext(Path())] * len(before.folds)
     fits = fit_folds(method_class(name)(), own, before, contexts, learned=known, keep=said)
-    return FittedBaseline(fits.methods, score_methods(fits.methods, data, split, eval_on), fits.train_s)
+    scores = score_methods(fits.methods, data, split, eval_on, learned)
+    return FittedBaseline(fits.methods, scores, fits.train_s)

@@ -87,8 +87,6 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
         return []
     better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
     note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
-    if rows.get("rows_with_silent", rows["rows"]).gt(rows["rows"]).any():
-        note += f"{'; ' * bool(note)}its bias_db: of heard rows, below 0 where unheard ones are learned from"
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
     return [Table.from_rows(title, shown, named[:WORST].to_dict("records"), note=note)]

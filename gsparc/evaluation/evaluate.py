@@ -101,7 +101,7 @@ def evaluate(
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     if split.name == "none" and eval_on == "test":
         return Evaluation(_about(methods, seconds, data, split), {})
-    scores = score_methods(methods, data, split, eval_on)
+    scores = score_methods(methods, data, split, eval_on, learned)
     # Which baselines serve is decided by the rows that they learn from, not by those scored.
     names = baselines_for(*(learned or (data, split))) if baselines is None else baselines
     if fitted := [name for name in names if name != shared]:
@@ -115,7 +115,7 @@ def evaluate(
     fields = [one for one in alone if one is not None]
     # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
     if len(fields) == len(methods):
-        every[FIELD] = score_methods(fields, data, split, eval_on)
+        every[FIELD] = score_methods(fields, data, split, eval_on, learned)
     for stem, one in every.items():
         own = {**pool_figures(one, data, split), "skill": _skill(one, others)}
         facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
@@ -221,7 +221,8 @@ def _skill(scores: Scores, others: Mapping[str, FittedBaseline]) -> float | None
     if "nearest" not in others:
         return None
     # Rows without a target are NaN in both, so that the means are over the same rows.
-    own, bar = (float(np.nanmean(one.squared_errors())) for one in (scores, others["nearest"].scores))
+    every = (one.samples for one in (scores, others["nearest"].scores))
+    own, bar = (float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"])) for one in every)
     return 1 - own / bar if bar > 0 else None
 
 

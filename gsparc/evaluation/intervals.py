@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 from scipy.stats import norm
 
 from gsparc.data.schema import Measurements
@@ -11,10 +10,9 @@ from gsparc.data.splits import Split
 from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.by_station import best_server, rmse_after_constants
 from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
-from gsparc.evaluation.scores import Scores, errors_with_silent
+from gsparc.evaluation.scores import Scores
 
 SHARE = 0.9  # of the truth that an interval is to hold
-SAME_LEVEL_DB = 4e-4  # levels that differ by less are one: above float32 rounding, below any two real ones
 
 
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
@@ -22,9 +20,10 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
 
     `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
-    `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
-    of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
-    perfect, and `outage/brier_rate` what always saying the rate gives.
+    `interval/width_db` its mean width; of lists that of levels given that they are listed, which exceed the
+    others by `listed_above_db`. Where powers may be too weak to be heard or listed, `outage/rate` is the
+    share of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0
+    when perfect, and `outage/brier_rate` what always saying the rate gives.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     # Decibels of a power need a mean above 0.
@@ -38,24 +37,23 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     heard = (data.censored_side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
     if heard.any():
+        given = [scores.samples[n][known] for n in ("heard_db", "heard_std_db") if n in scores.samples]
+        middle, spread = (part[heard] for part in given or (mean_db, spread_db))
         # z of .95 is 1.645 for the central 90 % of a normal distribution.
-        half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
-        error = np.abs(10 * np.log10(power[heard]) - mean_db[heard])
+        half = norm.ppf((1 + SHARE) / 2) * spread
+        error = np.abs(10 * np.log10(power[heard]) - middle)
         figures |= {"interval/coverage_90": float((error <= half).mean())}
         figures |= {"interval/width_db": float(2 * half.mean())}
-        figures |= {CALIBRATION: float(np.mean((error / spread_db[heard]) ** 2))}
-    level_db = sensitivity_levels(data)
-    if level_db is None:
-        return figures
-    of_row = level_db[0 if data.station is None else data.station[row]]
-    limited = np.isfinite(of_row)
+        figures |= {CALIBRATION: float(np.mean((error / spread) ** 2))}
+        figures |= {"listed_above_db": float((middle - mean_db[heard]).mean())} if given else {}
+    chance = scores.samples.get("heard_share", scores.variance * np.nan)[known]
+    limited = np.isfinite(chance)
     if not limited.any():  # all of them are of stations that heard everything
         return figures
-    chance = norm.cdf((of_row[limited] - mean_db[limited]) / spread_db[limited])
     rate = float(silent[limited].mean())
     return figures | {
         "outage/rate": rate,
-        "outage/brier": float(np.mean((chance - silent[limited]) ** 2)),
+        "outage/brier": float(np.mean((1 - chance - silent)[limited] ** 2)),
         # Brier 1950; saying the rate r each time gives its variance, r (1 - r).
         "outage/brier_rate": rate * (1 - rate),
     }
@@ -73,32 +71,15 @@ def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float |
     return {CALIBRATION: float(np.mean(scores.samples["mse"][known] / variance[known]))}
 
 
-def sensitivity_levels(data: Measurements) -> np.ndarray | None:
-    """Level (T,) [dB] below which each station hears nothing; None where every one heard all.
-
-    NaN where it heard all, or its silent rows have several levels, as in lists of the strongest.
-    """
-    rows = np.flatnonzero(data.censored_side(np.arange(len(data))) > 0)
-    if not len(rows):
-        return None
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
-    # The target of a silent row is its level, a power in stored units.
-    levels = pd.Series(10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale))
-    each = levels.groupby(station[rows]).agg(["first", "min", "max"])
-    one = each["first"].where(each["max"] - each["min"] <= SAME_LEVEL_DB)
-    return one.reindex(range(1 if data.site.stations is None else len(data.site.stations))).to_numpy()
-
-
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number, if any.
 
-    That of heard rows alone favours methods that learn from these alone: lists hold what is strong.
+    That of heard rows alone says nothing of levels that are not heard.
     """
-    error = errors_with_silent(scores.samples, scores.row, data).get("error_db_with_silent")
+    error, silent = scores.samples.get("error_db_with_silent"), data.censored_side(scores.row) > 0
     if error is None:
         return {}
-    silent = int((data.censored_side(scores.row) > 0).sum())
-    return {WITH_SILENT: float(np.sqrt(np.nanmean(error**2))), "silent_samples": silent}
+    return {WITH_SILENT: float(np.sqrt(np.nanmean(error**2))), "silent_samples": int(silent.sum())}
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:

@@ -47,6 +47,7 @@ FIGURES = {
     "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
+GIVEN_LISTED = "rmse_db of rows of lists: of levels given that they are listed"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared

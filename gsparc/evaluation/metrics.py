@@ -204,15 +204,9 @@ class PowerMetrics(SampleMetric):
         return {"prediction": p, "target": t if mask is None else t.masked_fill(~mask.flatten(), torch.nan)}
 
     def compute(self) -> dict[str, np.ndarray]:
-        """Adds `error_db`, `error_power`, `target_power`, `mse`, each (S,)."""
+        """Adds `power_errors`."""
         raw = super().compute()
-        p, t = raw["prediction"], raw["target"]
-        positive = t > 0
-        # A power of 0 or less has no decibels: it counts as the weakest that was measured.
-        floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
-        error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
-        error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
-        return {**raw, "error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
+        return {**raw, **power_errors(raw["prediction"], raw["target"])}
 
     @staticmethod
     def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
@@ -231,6 +225,16 @@ class PowerMetrics(SampleMetric):
             "silent_samples": silent,
             "samples": int((~np.isnan(samples["target"])).sum()),  # those where something was heard
         }
+
+
+def power_errors(p: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
+    """`error_db`, `error_power`, `target_power`, `mse` (S,) of predictions and targets (S,), linear."""
+    positive = t > 0
+    # A power of 0 or less has no decibels: it counts as the weakest that was measured.
+    floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
+    error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
+    error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
+    return {"error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
 
 
 METRICS: dict[Scored, type[SampleMetric]] = {

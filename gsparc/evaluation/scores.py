@@ -12,7 +12,9 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.metrics import METRICS
+from gsparc.data.units import power_in_decibels
+from gsparc.evaluation.given_heard import levels_given_heard
+from gsparc.evaluation.metrics import METRICS, power_errors
 from gsparc.models.method import Method, predict_in_batches
 
 SUBSETS = ("train", "val", "test")
@@ -44,10 +46,6 @@ class Scores:
         """Flat figures over all folds together."""
         return METRICS[self.kind].summary(self.samples)
 
-    def squared_errors(self) -> np.ndarray:
-        """Squared errors (S,), of powers in decibels; NaN where nothing was measured."""
-        return self.samples["error_db"] ** 2 if self.kind == "rssi" else self.samples["mse"]
-
     def dominant_row(self) -> dict[str, Any]:
         """Return the row that alone makes over half of all error or power, and a figure that no row decides.
 
@@ -76,10 +74,8 @@ def errors_with_silent(
     side = data.censored_side(row)
     if data.site.kind != "rssi" or not side.any():
         return {}
-    level, prediction = data.target[row, 0].astype(np.float64) * data.site.target_scale, samples["prediction"]
-    # A prediction of 0 has no logarithm: it is the weakest level, as in `PowerMetrics`.
-    floor = level[level > 0].min() if (level > 0).any() else TINY
-    beyond = side * 10 * np.log10(np.where(prediction > 0, prediction, floor) / np.maximum(level, floor))
+    level = data.target[row, 0].astype(np.float64) * data.site.target_scale
+    beyond = side * power_errors(samples["prediction"], level)["error_db"]
     return {"error_db_with_silent": np.where(side == 0, samples["error_db"], np.maximum(beyond, 0.0))}
 
 
@@ -125,28 +121,30 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
 
 
 def score_methods(
-    methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test"
-) -> Scores:
+    methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test",
+    learned: tuple[Measurements, Split] | None = None,
+) -> Scores:  # fmt: skip
     """Predict the chosen rows of every fold with that fold's method.
 
-    Channels of runs that it did not learn from are scored after the best common phase of each.
+    Channels of runs that it did not learn from are scored after the best common phase of each. Heard rows are
+    judged by `levels_given_heard`, which are among the samples, where it learned from silent ones.
 
     Args:
         methods: one fitted method per fold.
         data: the dataset.
         split: as the methods were fitted with.
         eval_on: `train`, `val` or `test`.
+        learned: what the methods learned from, where it is not `data` and `split`.
 
     Raises:
         ValueError: another number of methods than folds, an empty subset, a prediction with NaN.
     """
     if len(methods) != len(split.folds):
         raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
-    every = [rows_to_score(fold, eval_on) for fold in split.folds]
-    confidence: list[np.ndarray] = []
-    variance: list[np.ndarray] = []
-    samples = []
-    for method, rows, fold in zip(methods, every, split.folds, strict=True):
+    every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
+    own, before = learned or (data, split)
+    limited = data.site.kind == "rssi" and (own.censored_side(before.folds[0].train) > 0).any()
+    for method, rows, fold, taught in zip(methods, every, split.folds, before.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
         turn = best_phase_of_runs(method, data, rows, runs) if len(runs) else None
@@ -162,16 +160,26 @@ def score_methods(
             order.append(chosen)
         # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
-        samples.append({name: values[back] for name, values in metric.compute().items()})
-        confidence.append(outputs["confidence"])
-        variance.append(outputs["variance"])
+        scored = {name: values[back] for name, values in metric.compute().items()} | outputs
+        if limited:
+            # Rows of `val` are not among those learned from where they are the ones scored.
+            known = taught.train if eval_on == "val" else np.concatenate([taught.train, taught.val])
+            silent, variance = own.censored_side(known) > 0, scored["variance"] * data.site.target_scale**2
+            level = power_in_decibels(scored["prediction"], variance)
+            given = levels_given_heard(own.subset(known[silent]), data.subset(rows), *level)
+            # Who learned from heard rows alone predicts such levels.
+            scored |= given if method.uses_censored else {"heard_share": given["heard_share"]}
+        samples.append(scored)
     pooled = {name: np.concatenate([s[name] for s in samples]) for name in samples[0]}
     row = np.concatenate(every)
+    pooled |= errors_with_silent(pooled, row, data)
+    if "heard_db" in pooled:
+        pooled |= power_errors(10 ** (pooled["heard_db"] / 10), pooled["target"])
     return Scores(
         kind=data.site.scored,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),
         row=row,
-        samples=pooled | errors_with_silent(pooled, row, data),
-        confidence=np.concatenate(confidence),
-        variance=np.concatenate(variance),
+        confidence=pooled.pop("confidence"),
+        variance=pooled.pop("variance"),
+        samples=pooled,
     )

@@ -86,13 +86,12 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     Raises:
         CheckpointError: something in the state is of another type, its place is named; or there is no room.
     """
-    site = method.site
-    if site is None:
+    if method.site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
     content = {
         "format": FORMAT, "version": VERSION, "config": config,
         "method": method.name, "target": import_path(method.stored_class),
-        "site": _to_plain(asdict(site), "site"), "state": _to_plain(method.state(), "state"),
+        "site": _to_plain(asdict(method.site), "site"), "state": _to_plain(method.state(), "state"),
         "extra": _to_plain(dict(extra or {}), "extra"),
     }  # fmt: skip
     _write(Path(path), content)

@@ -63,6 +63,7 @@ class ClosedForm(Method):
 
     held: LeftOutRows | None = None
     forgets = asks_visibility = False
+    no_gradient = None
 
     @property
     def count_gaussians(self) -> int:
@@ -85,10 +86,6 @@ class ClosedForm(Method):
             ValueError: not conditioned yet, or they are not kept.
         """
         raise ValueError(f"{self.name}: rows left out are not kept")
-
-    def gradient_problem(self) -> str | None:
-        """None; see `Method.gradient_problem`."""
-        return None
 
     def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """Yield methods that are no mixtures, with their weights in the mean."""

@@ -124,6 +124,8 @@ class Method(MethodFactory):
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     has_gaussians = False  # whether what it learns are Gaussians, which `count_components` then counts
+    # See `gradient_problem`, which others say as they are fitted.
+    no_gradient: str | None = "the method does not say that its operations are differentiable"
     threads_pay: bool = (
         False  # whether several threads answer a single place sooner than one: where it renders
     )
@@ -157,6 +159,13 @@ class Method(MethodFactory):
         """The class that a checkpoint names."""
         return type(self)
 
+    @property
+    def fitted_site(self) -> Site:
+        """The site that was learned from; `ValueError` before `fit` or `restore`."""
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        return self.site
+
     @abstractmethod
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Learn from `fold.train` (and choose settings on `fold.val`); `fold.test` is not looked at."""
@@ -175,7 +184,7 @@ class Method(MethodFactory):
         Then autograd in either mode and `torch.func` follow `predict` at float64 positions of what moves, for
         mean, variance and confidence, in double precision. What float32 positions get is not changed by it.
         """
-        return "the method does not say that its operations are differentiable"
+        return self.no_gradient
 
     @abstractmethod
     def state(self) -> dict[str, Any]:

@@ -100,7 +100,7 @@ class PerStation(Method):
 
     def __init__(self, factory: MethodFactory) -> None:
         self.factory, self.name, self.guesses = factory, factory.name, factory.guesses
-        self.takes_budget = factory.takes_budget
+        self.takes_budget, self.uses_censored = factory.takes_budget, factory.uses_censored
         self._copies: dict[int, Method] = {}
         self._shared = False  # whether one copy knows all stations
 
@@ -256,7 +256,7 @@ class PerStation(Method):
         answers: list[tuple[Tensor, Prediction]] = []
         for number in stations.unique().tolist():
             chosen, copy = (stations == number).nonzero()[:, 0], self.station_method(number)
-            answers.append((chosen, copy.predict(_to_station_query(copy.site, query.rows(chosen)))))
+            answers.append((chosen, copy.predict(_to_station_query(copy.fitted_site, query.rows(chosen)))))
         # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
         return Prediction.joined(parts, torch.argsort(torch.cat(rows)))
@@ -386,9 +386,8 @@ def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
     return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
 
 
-def _to_station_query(site: Site | None, query: Query) -> Query:
+def _to_station_query(site: Site, query: Query) -> Query:
     """Rows of one station as its copy sees them: one pose where the receiver is the station, no number."""
-    assert site is not None
     if site.stations is not None:
         return query
     # One pose instead of B equal ones: what depends on the receiver alone is computed once.

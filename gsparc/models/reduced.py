@@ -68,16 +68,15 @@ class View(Method):
         inner: fitted.
     """
 
+    no_gradient = "what answers faster does so in float32; load the whole model"
+
     def __init__(self, inner: Method) -> None:
         self.inner, self.name, self.threads_pay = inner, inner.name, inner.threads_pay
+        self.uses_censored = inner.uses_censored
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         return self.inner.predict(query)
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "what answers faster does so in float32; load the whole model"
 
     def count_components(self) -> int:
         """Return the inner method's."""

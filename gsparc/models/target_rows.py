@@ -61,6 +61,11 @@ def to_targets(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
     return (10 ** (rows / 10)) if kind == "rssi" else rows.clamp(0.0, 1.0)
 
 
+def linear_powers(decibels: Tensor) -> Tensor:
+    """Return decibels (B,) as linear targets (B, 1)."""
+    return to_targets(decibels[:, None], "rssi", (1,))
+
+
 def to_entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry.
 

@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.intervals import (
-    power_intervals,
-    reduced_chi_squared,
-    rmse_with_silent,
-    sensitivity_levels,
-)
-from gsparc.evaluation.scores import Scores
+from gsparc.evaluation.given_heard import levels_given_heard
+from gsparc.evaluation.intervals import power_intervals, reduced_chi_squared, rmse_with_silent
+from gsparc.evaluation.scores import Scores, errors_with_silent
 
 COUNT, LEVEL = 4000, -80.0
 
@@ -35,12 +31,9 @@ def drawn():
 def scored(data, mean_db, spread_db):
     mean = 10 ** (mean_db / 10)
     linear = (np.log(10) / 10 * mean * spread_db / data.site.target_scale) ** 2
-    samples = {"prediction": mean}
+    silent = data.subset(np.flatnonzero(data.censored_side(np.arange(COUNT)) > 0))
+    samples = {"prediction": mean} | levels_given_heard(silent, data, mean_db, np.full(COUNT, spread_db))
     return Scores("rssi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), linear)
-
-
-def test_the_level_is_that_of_the_file(drawn):
-    assert sensitivity_levels(drawn[0]) == pytest.approx([LEVEL], abs=1e-3)
 
 
 def test_a_true_law_is_calibrated(drawn):
@@ -89,6 +82,7 @@ def test_silent_rows_counted_nowhere(drawn):
     honest, other = (
         {"error_db": said - level, **scored(data, said, 6.0).samples} for said in (mean_db, lifted)
     )
+    honest, other = (one | errors_with_silent(one, np.arange(COUNT), data) for one in (honest, other))
     squares = [float(np.square(one["error_db"][heard]).mean()) for one in (honest, other)]
     both = [replace(scored(data, mean_db, 6.0), samples=one) for one in (honest, other)]
     found = [rmse_with_silent(one, data)["rmse_db_with_silent"] for one in both]
@@ -97,16 +91,23 @@ def test_silent_rows_counted_nowhere(drawn):
     assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
 
 
-def test_levels_of_lists_are_none_of_a_station(drawn):
-    """The last list's level was taken for the sensitivity of a station."""
-    data = replace(drawn[0], target=drawn[0].target * np.linspace(1, 2, COUNT, dtype=np.float32)[:, None])
-    assert np.isnan(sensitivity_levels(data)).all()
-
-
 def test_no_variance_no_figures(drawn):
     data, mean_db = drawn
     scores = scored(data, mean_db, 6.0)
     assert power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
+
+
+def test_levels_of_lists_are_none_of_a_station(drawn):
+    """The last list's level was taken for the sensitivity of a station."""
+    data, _ = drawn
+    silent = data.subset(np.flatnonzero(data.censored_side(np.arange(COUNT)) > 0))
+    west = silent.moving[:, 0] < np.median(data.moving[:, 0])
+    silent = replace(silent, target=np.where(west, 0.1, 10)[:, None].astype(np.float32) * silent.target)
+    found = levels_given_heard(silent, data, np.full(COUNT, LEVEL), np.full(COUNT, 3.0))
+    share = found["heard_share"][np.argsort(data.moving[:, 0])]
+    assert share[: COUNT // 4].min() > 0.9 and share[-COUNT // 4 :].max() < 0.1
+    # Far above what it must exceed a level is what it was.
+    assert found["heard_db"].min() == pytest.approx(LEVEL, abs=0.1)
 
 
 def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
@@ -122,14 +123,18 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
     row = np.flatnonzero(data.station == 1)
     mean = data.target[row, 0].astype(float) * data.site.target_scale
     spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
-    scores = Scores("rssi", 0 * row, row, {"prediction": mean}, np.full(len(row), np.nan), spread)
-    assert set(power_intervals(scores, data)) == {"interval/coverage_90", "interval/width_db", "reduced_chi2"}
+    silent = data.subset(np.flatnonzero(data.censored_side(np.arange(len(data))) > 0))
+    given = levels_given_heard(silent, data.subset(row), 10 * np.log10(mean), np.full(len(row), 3.0))
+    scores = Scores("rssi", 0 * row, row, {"prediction": mean} | given, np.full(len(row), np.nan), spread)
+    figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "listed_above_db"}
+    assert set(power_intervals(scores, data)) == figures
 
 
 def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_decibels(drawn):
     data = drawn[0]
     side = np.where(np.arange(COUNT) == 0, -1, data.censored_side(np.arange(COUNT))).astype(np.int8)
     silent = replace(data, censored=side)
-    one = scored(silent, np.full(COUNT, -np.inf), 6.0)
-    one = replace(one, samples={**one.samples, "error_db": np.zeros(COUNT)})
+    one = scored(silent, np.full(COUNT, LEVEL), 6.0)
+    samples = {**one.samples, "prediction": np.zeros(COUNT), "error_db": np.zeros(COUNT)}
+    one = replace(one, samples=samples | errors_with_silent(samples, one.row, silent))
     assert rmse_with_silent(one, silent)["rmse_db_with_silent"] < 200

@@ -16,6 +16,7 @@ from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     DECIDING,
+    GIVEN_LISTED,
     WITH_SILENT,
     heading_of,
     lower_is_better,
@@ -200,10 +201,6 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         wins = f"a simple baseline wins: take {first.method} for this data and split"
         if own is None or lead is None or lead.sure:
             lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
-    # False for NaN: methods without a variance have no such figure.
-    if own is not None and first.outage > own.outage:
-        both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
-        lines.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
     for row in rows[1:]:
         if own is None or row.method not in SIMPLE or row.score_db <= own.score_db:
             continue
@@ -230,6 +227,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another program (at commit): {old}")
+    lines += [GIVEN_LISTED] * bool(block.outage.notna().any())
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
 

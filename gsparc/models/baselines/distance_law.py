@@ -210,9 +210,8 @@ class DistanceLaw(Differentiable):
         raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
-        assert self.site is not None
         started = TimeBudget()
-        self.law, notes = fit_site_law(rows, self.site)
+        self.law, notes = fit_site_law(rows, self.fitted_site)
         law = self.law
         summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "

@@ -176,8 +176,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return tuple(f"gp: {note}" for note in (kernel.description, fit_note, scheme, basis))
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
-        assert self.site is not None
-        self.powers, notes = process_and_notes(rows, self.site, self.about)
+        self.powers, notes = process_and_notes(rows, self.fitted_site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
     @property
@@ -212,8 +211,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def mean_at(self, query: Query) -> Tensor:
         """Return the mean (B, ...) of `predict` alone: the variance is most of a prediction."""
-        assert self.site is not None
-        places, dtype = query.places(self.site), query.tx.dtype
+        places, dtype = query.places(self.fitted_site), query.tx.dtype
         if self.powers is not None:
             return self._to_targets(self.powers.mean_at(places)[:, None].to(dtype))
         assert self.scores is not None
@@ -231,12 +229,11 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Method.reduce`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
-        assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
         if not isinstance(self.scores, Exact):
             return MeanOnly(self, self.mean_at)
-        stride, grid = int(settings.get("stride", 1)), self.site.grid
+        stride, grid = int(settings.get("stride", 1)), self.fitted_site.grid
         count, lean = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes))), copy.copy(self)
         # A view where all are kept: the axes of thousands of images are hundreds of megabytes.
         every, weights = slice(None), self.scores.weights

@@ -26,6 +26,7 @@ class InverseDistance(Interpolator):
     """
 
     name = "idw"
+    no_gradient = "its nearest samples change in jumps"
     stored = ("positions", "targets")
     NEAR = 1e-6  # [m]; a query on a sample repeats it instead of dividing by zero
 
@@ -42,10 +43,6 @@ class InverseDistance(Interpolator):
         apart = nearest[(nearest > 0) & np.isfinite(nearest)]
         self.spacing = float(np.median(apart)) if len(apart) else 1.0  # [m], of neighbouring places
         return ()
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "its nearest samples change in jumps"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         count = min(self.neighbours, len(self.positions))

@@ -66,9 +66,7 @@ class Interpolator(Method):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        if self.site is None:
-            raise ValueError(f"{self.name}: fit or restore it first")
-        return self._predict_at(query.places(self.site), query.tx.dtype)
+        return self._predict_at(query.places(self.fitted_site), query.tx.dtype)
 
     def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         """Predict at (B, 3) float64 [m], or (B, 6); see `Differentiable`."""
@@ -91,8 +89,7 @@ class Interpolator(Method):
     @property
     def kind(self) -> Kind:
         """Kind of the targets that were learned."""
-        assert self.site is not None
-        return self.site.kind
+        return self.fitted_site.kind
 
     def _to_targets(self, rows: Tensor) -> Tensor:
         return to_targets(rows, self.kind, self.shape)
@@ -121,9 +118,7 @@ class Interpolator(Method):
 class Differentiable(Interpolator):
     """One whose `_answered` is followed by autograd, in the precision that it is given."""
 
-    def gradient_problem(self) -> str | None:
-        """None; see `Method.gradient_problem`."""
-        return None
+    no_gradient = None
 
     @abstractmethod
     def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:

@@ -97,6 +97,7 @@ class Kriging(Interpolator):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"
+    no_gradient = "its systems are solved outside of autograd"
     stored = ("positions", "values", "variogram", "channels")
     system: tuple[np.ndarray, np.ndarray] | None = None
     tree: cKDTree | None = None
@@ -169,10 +170,6 @@ class Kriging(Interpolator):
 
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "its systems are solved outside of autograd"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         block = max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))  # answered at a time

@@ -15,6 +15,7 @@ class Mean(Interpolator):
     """Predicts the training mean everywhere (of decibels for RSSI)."""
 
     name = "mean"
+    no_gradient = "predictions are the same everywhere"
     stored = ("value",)
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
@@ -23,10 +24,6 @@ class Mean(Interpolator):
             total += to_real(targets[part], self.kind).sum(0, dtype=np.float64)
         self.value = torch.from_numpy(total / len(targets)).float()
         return ()
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "predictions are the same everywhere"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         return Prediction(self._to_targets(self.value.expand(len(queries), -1).contiguous()))

@@ -13,13 +13,10 @@ class Zero(Interpolator):
     """Predicts zeros."""
 
     name = "zero"
+    no_gradient = "predictions are the same everywhere"
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         return ()
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "predictions are the same everywhere"
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         dtype = torch.complex64 if self.kind == "csi" else torch.float32

@@ -167,8 +167,7 @@ class ComplexGP(ClosedForm):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         known, dtype = self._posterior(), query.tx.dtype
-        assert self.site is not None
-        posterior = known.answer(query.places(self.site), dtype == torch.float64)
+        posterior = known.answer(query.places(self.fitted_site), dtype == torch.float64)
         share = posterior.variance / (1 + self.kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
         told = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))

@@ -281,9 +281,8 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     def lags(self) -> SpectrumLags:
         """Return the array's lags, computed once."""
-        assert self.site is not None
         if self._lags is None:
-            self._lags = SpectrumLags(*self.site.array_geometry())
+            self._lags = SpectrumLags(*self.fitted_site.array_geometry())
         return self._lags
 
     _lags: SpectrumLags | None = None

@@ -145,8 +145,7 @@ class ReducedMean(View):
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        assert self.inner.site is not None
-        return Prediction(self._query(query.places(self.inner.site)).image.clamp_(0, 1))
+        return Prediction(self._query(query.places(self.inner.fitted_site)).image.clamp_(0, 1))
 
     def count_components(self) -> int:
         """Return the number of components kept."""

@@ -52,6 +52,7 @@ class CalibratedRayTracer(Method):
     """
 
     name = "calibrated_raytracer"
+    no_gradient = "rays are traced to a place anew"
     kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
     scene: str | None = None
     start: Start = "generic"
@@ -142,10 +143,6 @@ class CalibratedRayTracer(Method):
         energy = np.vdot(traced, traced).real
         return complex(np.vdot(traced, data.target[rows].ravel()) / energy) if energy > 0 else 0j
 
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "rays are traced to a place anew"
-
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
         if self.site is None or self.learned is None:
@@ -166,8 +163,7 @@ class CalibratedRayTracer(Method):
 
     def _trace(self, places: np.ndarray) -> Paths:
         """Paths to places (B, 3) [m], local."""
-        assert self.site is not None
-        return self._loaded_tracer().trace(places + self.site.origin, self._effects())
+        return self._loaded_tracer().trace(places + self.fitted_site.origin, self._effects())
 
     def _effects(self) -> Effects:
         # Diffuse scattering has parameters of its own, which nothing here learns.

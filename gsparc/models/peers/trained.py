@@ -115,6 +115,7 @@ class TrainedPeer(Method):
         name: as it appears in tables.
     """
 
+    no_gradient = "its network answers in float32 and keeps no graph"
     resumable: ClassVar[bool] = True  # type: ignore[misc]
     takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
@@ -209,10 +210,6 @@ class TrainedPeer(Method):
     def count_components(self) -> int:
         """Return the number of Gaussians or virtual transmitters; 0 without, and before `fit`."""
         return 0 if self.network is None else self.network.count
-
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "its network answers in float32 and keeps no graph"
 
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:

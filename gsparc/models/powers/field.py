@@ -33,7 +33,7 @@ from gsparc.models.powers.settings import (
     choose_candidate,
     mix_candidates,
 )
-from gsparc.models.target_rows import power_rows, to_entry_variance, to_targets
+from gsparc.models.target_rows import linear_powers, power_rows, to_entry_variance
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximation_label
@@ -192,8 +192,8 @@ class PowerField(ClosedForm):
         parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
         joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
         mean, spread, share, explained = joined
-        power = self._to_powers(mean)
-        explained_power = self._to_powers(explained) if self.count_components() else None
+        power = linear_powers(mean)
+        explained_power = linear_powers(explained) if self.count_components() else None
         return Prediction(power, to_entry_variance(spread, power, "rssi"), share, explained_power)
 
     def left_out(self) -> LeftOutRows:
@@ -214,7 +214,7 @@ class PowerField(ClosedForm):
                 decibels, torch.from_numpy(places), torch.from_numpy(nearest_distances(places)), self.known
             )
             spread = spread * factor
-        mean = self._to_powers(decibels.float())
+        mean = linear_powers(decibels.float())
         return LeftOutRows(self.known, mean, to_entry_variance(spread.float(), mean, "rssi"))
 
     def state(self) -> dict[str, Any]:
@@ -254,6 +254,3 @@ class PowerField(ClosedForm):
         if self.powers is None:
             raise ValueError("a field of powers: condition it first")
         return self.powers
-
-    def _to_powers(self, decibels: Tensor) -> Tensor:
-        return to_targets(decibels[:, None], "rssi", (1,))

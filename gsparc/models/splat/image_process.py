@@ -122,8 +122,7 @@ class ImageProcess(LearnedField):
         # The process without its variance is float32 and has no slopes, which float64 is asked for.
         exact = query.tx.dtype == torch.float64
         other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
-        assert self.site is not None
-        return replace(own, mean=mix_means(own.mean, other, weight, self.site))
+        return replace(own, mean=mix_means(own.mean, other, weight, self.fitted_site))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -137,9 +136,8 @@ class ImageProcess(LearnedField):
         result = LearnedField.reduce(twin, settings, measured)
         if self._average is None:
             return result
-        assert self.site is not None
         process, weight = self._average
-        return average_with_process(result, process, partial(mix_means, weight=weight, site=self.site))
+        return average_with_process(result, process, partial(mix_means, weight=weight, site=self.fitted_site))
 
     def count_components(self) -> int:
         """Return the number of Gaussians."""

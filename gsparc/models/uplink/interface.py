@@ -40,6 +40,8 @@ def root_mean_power(channels: Tensor) -> Tensor:
 class UplinkMethod(Method):
     """A method that needs the snapshot's own uplink; a position alone is no question to it."""
 
+    no_gradient = "predictions follow from an uplink, not from a position"
+
     def query_uplinks(self, query: Query) -> Tensor:
         """Return the uplinks (B, U, L) of a query.
 
@@ -55,14 +57,9 @@ class UplinkMethod(Method):
             )
         return query.uplink
 
-    def gradient_problem(self) -> str | None:
-        """See `Method.gradient_problem`."""
-        return "predictions follow from an uplink, not from a position"
-
     def select_antennas(self, uplink: Tensor) -> Tensor:
         """Return those of uplinks (B, U, L) that are heard by the antennas that answer, (B, A, L)."""
-        assert self.site is not None
-        return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
+        return uplink[:, torch.from_numpy(np.asarray(self.fitted_site.antennas))]
 
     def _require_uplink(self, data: Measurements) -> Site:
         if data.site.kind != "csi" or data.uplink is None or data.site.antennas is None:

@@ -117,16 +117,6 @@ def test_losers_are_not_hidden():
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
 
 
-def test_the_smaller_error_may_have_the_worse_outages():
-    """Who leaves silent rows out is nearer at places that were heard, and calls a courtyard covered."""
-    found = [
-        filled(name, error, 0, kind="rssi", **{"test/outage/brier": outage})
-        for name, error, outage in (("kriging", 7.0, 0.028), ("gsparc", 7.3, 0.015))
-    ]
-    said = " | ".join(remarks(split_by_problem(average_cells(found, {}))[0], "gsparc"))
-    assert "kriging predicts outages worse: Brier score 0.0280, of gsparc 0.0150" in said
-
-
 def test_what_an_earlier_program_measured_is_said():
     old = filled("gsrf", 29.0, 0, 60.0, earlier="0123abcd")
     found = split_by_problem(average_cells([*FOUND[:1], old], {}))[0]

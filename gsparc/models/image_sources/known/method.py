@@ -84,9 +84,8 @@ class KnownWallsGP(ImageSourceGP):
 
     def _initial_scene(self, rows: Rows, settings: SearchSettings) -> Scene:
         """The static end and its images that some receiver sees, with amplitudes to start from."""
-        assert self.site is not None
         transmitter = self._transmitter_in_frame()
-        mirrors = images.Mirrors.from_walls(self.walls, self.site.origin + self.frame.middle.numpy())
+        mirrors = images.Mirrors.from_walls(self.walls, self.fitted_site.origin + self.frame.middle.numpy())
         if mirrors.left_out:
             most = images.MOST_PATCHES
             log.info("the %d smallest of the walls are left out: more than %d", mirrors.left_out, most)

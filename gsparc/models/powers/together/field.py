@@ -33,7 +33,7 @@ from gsparc.models.powers.together.learning import (
 )
 from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
 from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, rows_of_stations
-from gsparc.models.target_rows import to_entry_variance, to_targets
+from gsparc.models.target_rows import linear_powers, to_entry_variance
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.places import moving_end, other_end
@@ -129,10 +129,6 @@ class JointPowerField(ClosedForm):
         """Sectors whose processes those of a site share; None: each station has its own."""
         return trend if isinstance(trend := self.own.never.trend, Sectors) else None
 
-    def count_components(self) -> int:
-        """None: no Gaussians."""
-        return 0
-
     @property
     def terms(self) -> tuple[str, ...]:
         """`power` always: its law is of the site."""
@@ -171,7 +167,7 @@ class JointPowerField(ClosedForm):
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._law_share(moving_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
-        power = self._to_powers(mean)
+        power = linear_powers(mean)
         return Prediction(power, to_entry_variance(spread, power, "rssi"), share)
 
     @torch.no_grad()
@@ -212,7 +208,7 @@ class JointPowerField(ClosedForm):
             loud = process.extra == 0
             means.append((process.given_values()[:, 0] - error)[loud])
             spreads.append(variance[loud])
-        mean = self._to_powers(torch.cat(means).float())
+        mean = linear_powers(torch.cat(means).float())
         variance = to_entry_variance(torch.cat(spreads).float(), mean, "rssi")
         return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), mean, variance)
 
@@ -322,9 +318,6 @@ class JointPowerField(ClosedForm):
         table = torch.from_numpy(self.places).nan_to_num(math.inf)
         apart, number = torch.cdist(places.detach(), table).min(1)
         return torch.where(apart <= SAME_PLACE_M, number, NEVER)
-
-    def _to_powers(self, decibels: Tensor) -> Tensor:
-        return to_targets(decibels[:, None], "rssi", (1,))
 
 
 def rows_per_station(stations: int) -> int:
