@@ -54,13 +54,13 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
     Args:
         method: fitted or restored.
-        site: the dataset's fixed facts.
+        site: the dataset's fixed facts: `kind`, the `box` of places [m, local] and its `origin`, `stations`.
         whole: asked for the confidence, where `method` spares it; None asks `method`.
-        point: the operating point `method` answers at, if one was chosen.
-        extra: what else the checkpoint holds.
-        trusted: which confidence is answered, and from when on a prediction is accepted.
-        kind: of the confidence; None: as `trusted` says.
-        unit: of powers; None: that of the measurements.
+        point: the operating point `method` answers at, if one was chosen (`load(budget_ms=...)`), else None.
+        extra: what else the checkpoint holds, such as the split's hash; empty after `fit`.
+        trusted: which confidence is answered, and from when on a prediction is accepted (`gsparc calibrate`).
+        kind: of the confidence, as in `load`; None: as `trusted` says.
+        unit: of powers; None: that of the measurements. The attribute is "1" of channels and spectra.
 
     Raises:
         ValueError: no unit that these measurements can be turned into.
@@ -91,7 +91,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
     @property
     def known(self) -> str:
-        """What answers are known up to: rows of channels may have had factors of their own."""
+        """Say in words what answers are known up to: `all`, or `up to a phase of each row` of channels."""
         free = self.site.freedom
         return "all" if free == "none" else f"up to {describe_freedom(free)} of each row"
 
@@ -128,7 +128,11 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
 
     def in_levels(self, unit: str | None) -> Predictor:
-        """Return the same model whose powers are levels in a unit, dBm or dBW; None: as measured."""
+        """Return the same model whose powers and maps are levels in `unit`, dBm or dBW; None: as measured.
+
+        Raises:
+            ValueError: decibels of a reference that nobody knows.
+        """
         return self._copy_with(self.method, self._whole, self.site.in_levels(unit), None)
 
     def _answer_unit(self, unit: str | None) -> PowerUnit:
@@ -143,8 +147,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
     def predict(
         self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False
     ) -> Prediction:
-        """Return mean, variance and confidence (B, ...) at once, as tensors, in the unit of the measurements.
+        """Return mean (B, ...), variance and confidence (B,) at once, as tensors, in the measurements' unit.
 
+        The variance is the expected squared error of an entry, None where the method states none.
         The confidence is None where the method has none; else the one that `confidence` answers. With `grad`
         it is the method's own, and None where `confidence` answers another.
 
@@ -164,7 +169,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return replace(_to_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def predict_query(self, query: Query) -> Prediction:
-        """Return what the model says of a query, whose places are local, in stored units."""
+        """Return what the model says of a query, whose places are local (less `site.origin`) [m].
+
+        In stored units: measured ones divided by `site.target_scale`; `predict` answers in measured ones.
+        """
         return predict_with_threads(self.method, query)
 
     def predict_linear(self, tx: Any = None, rx: Any = None) -> Prediction:
@@ -230,9 +238,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return stations
 
     def cycle_places(self, places: np.ndarray) -> Call:
-        """Return calls for a clock: one place (n, 3), or of both ends (n, 6) [m, local], another every time.
+        """Return a function for a clock, which asks about one of the places each time it is called.
 
-        Of several stations the first that the model answers for is asked.
+        Places are (n, 3), of both ends (n, 6) [m], local: less `site.origin`. Of several stations the first
+        that the model answers for is asked.
         """
         predictor = next(filter(None, self._each_station()), self)
         ask = getattr(predictor, self.site.kind)
@@ -241,7 +250,15 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return lambda number: ask(**dict(zip(ends, world[number % len(world)], strict=True)))
 
     def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
-        """Return amplitudes by direction, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
+        """Return amplitudes by direction at the receiver, (B, H, W) float32 in [0, 1], as they were measured.
+
+        Their square is the power; 1 is the largest of all stored ones or
+        of its own image, as the file was scaled. Row i is an elevation of the receiver, column j an azimuth:
+        i x 90/H and j x 360/W degrees unless the file gives `grid_deg`. (H, W) of a single place.
+
+        Args:
+            tx, rx: positions [m, world]; `rx` may be a world `Pose`, of a receiver that is turned.
+            grad: as in `predict`.
 
         >>> predictor.spectrum(rx=[2.0, 1.0, 1.5])  # of a model of powers
         Traceback (most recent call last):
@@ -292,8 +309,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
-        """Return gains, delays and directions: of what an uplink (B, U, L) holds, or of a coherent field at
-        positions; see `gsparc.prediction.channels`.
+        """Return gains, delays [s], directions: of what an uplink (B, U, L) holds or of a field at positions.
+
+        See `gsparc.prediction.channels.Paths` for shapes: gains complex64 in the unit of the channels.
 
         Raises:
             ValueError: the model's channels are not made of paths.
@@ -305,7 +323,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return channels.paths_at(self._whole, self.site, self.queries.query(tx, rx).query)
 
     def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
-        """Return the Gaussians that are rendered, in the world, with what they emit for these positions.
+        """Return the N Gaussians that are rendered, with what they emit for these positions.
+
+        Means (N, 3) and standard deviations (N, 3) [m, world], quaternions, opacities (N,) in [0, 1] and
+        strengths (N,) in the unit that `label` says; see `gsparc.data.site_objects.GaussianCloud`.
 
         Raises:
             ValueError: what answers is not rendered of Gaussians.

@@ -287,6 +287,11 @@ def test_fingerprints_from_a_file_to_places(hall, tmp_path):
     assert facts["locate/coverage"] is None and len(facts["dataset/sha256"]) == 64
 
 
+def test_a_mean_of_milliseconds_was_called_a_median(hall, tmp_path):
+    facts, _ = located(tmp_path, *hall, "against=[]")
+    assert facts["time/locate_ms"] > 0 and "time/locate_ms_p50" not in facts, "all are located at once"
+
+
 def test_fingerprints_of_unknown_places(hall, tmp_path):
     more = f"data='{tmp_path}/unplaced.npz'", "rows=20"
     facts, rows = located(tmp_path, *hall, *more)

@@ -2,6 +2,7 @@
 
 import pytest
 from doors import knock
+from names import find_unexplained
 from pages import Tiny, commands, compare_files
 
 from gsparc.__main__ import main
@@ -63,3 +64,4 @@ def test_a_command_of_a_page_ends_well(line, tiny, tmp_path, monkeypatch):
     answer = knock(main, "gsparc", [name, *tiny.line(name, tuple(overrides), tmp_path / "run")])
     assert answer.status == 0, [text[:300] for text in answer.err[-3:]]
     assert compare_files(name, tmp_path / "run") == ([], [])
+    assert find_unexplained(tmp_path / "run") == []

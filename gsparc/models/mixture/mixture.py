@@ -154,7 +154,7 @@ class Mixture(LearnsTogether, ClosedForm):
         """
         budget = context.time_budget()
         end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
-        log.info("training a Gaussian field with closed-form weights: init=%s%s", " and ".join(parts), end)
+        log.info("training in closed form: init=%s%s", " and ".join(parts), end)
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
         self.runs = _estimate_run_factors(data, known, context)
         data = self.runs.remove_factors(data)
@@ -171,10 +171,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
             self.condition(data, known)
-        log.info(
-            "%s of %d Gaussians from init=%s, terms %s", type(self).__name__, self.count_gaussians,
-            self.started, ", ".join(self.terms) or "none",
-        )  # fmt: skip
+        log.info("%d Gaussians from init=%s", self.count_gaussians, self.description)
         seconds = budget.by_clock.wall
         if several:
             context.log_curve(seconds, "final")

@@ -16,7 +16,6 @@ from gsparc.data.limits import check_arguments, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.module import GaussianModule
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
@@ -71,8 +70,8 @@ class ImageProcess(LearnedField):
                 self.most_steps = 0
             choices, _ = resolve_auto(self.settings, self.init.name, data.site)
             log.info(
-                "training %s by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
-                GaussianModule.__name__, self.settings.field.count, self.effects, choices.init,
+                "training by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
+                self.settings.field.count, self.effects, choices.init,
                 ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
             )  # fmt: skip
         # Settings of the field count as heeded only where the field has a part in the answer.

@@ -11,6 +11,7 @@ import pytest
 import torch
 from cities import city, fold
 from doors import knock
+from names import find_unexplained
 
 from gsparc import load
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
@@ -240,6 +241,7 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     assert facts["beams/64/gain_db"] > facts["beams/8/gain_db"]
     assert facts["pusch/qpsk/perfect/4dB/bler"] <= facts["pusch/qpsk/perfect/3dB/bler"]
     assert facts["pusch/truth"] == "rays" and 0 <= facts["tradeoff/qpsk/predicted/100%"] <= 1
+    assert find_unexplained(tmp_path) == []
 
 
 def _split():
