@@ -37,6 +37,5 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
         facts, tables, lines = locate_fingerprints(config, run_dir)
     else:
         plan = read_plan_settings(to_dict(config))
-        open_at = None if plan is None else plan.is_open
-        facts, tables, lines = locate_by_model(config, run_dir, open_at)
+        facts, tables, lines = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
     return finish_run(run_dir, facts, *tables, lines=lines)

@@ -95,10 +95,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         if layer.words:
             write_samples(run_dir / file_name(layer, ".csv"), layer.class_table())
         if layer.words and tiff:
-            where = run_dir / file_name(layer, ".tif")
-            write_classes(where, field, predictor.site.georeference, layer.values, layer.words, layer.table())
+            write_classes(run_dir / file_name(layer, ".tif"), field, layer.values, layer.words, layer.table())
     if tiff:
-        write_geotiff(run_dir / "map.tif", field, predictor.site.georeference)
+        write_geotiff(run_dir / "map.tif", field)
     facts = {
         **field.summarise(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,

@@ -59,6 +59,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     if predictor is not None and predictor.site.stations is not None:
         every = "all stations alike (a map shows the strongest)"
         before += f" of {every if stations is None else ', '.join(map(str, stations))}"
+        if promise is not None and (each := promise.stations_of_place()) < len(predictor.site.stations):
+            before += f", a place lists the {each} strongest of {len(predictor.site.stations)}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
     before += f", a way of {plan.length_m:.0f} m, {kind}; rows logged on the way not counted; plan "
     return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)

@@ -10,7 +10,6 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.maps.floor_plan import read_plan_settings
-from gsparc.apps.maps.making import read_place
 from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
@@ -21,6 +20,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import whole
 from gsparc.evaluation.open_runs import check_dataset
+from gsparc.prediction.query import read_place
 from gsparc.prediction.timing import peak_memory
 
 log = logging.getLogger(__name__)

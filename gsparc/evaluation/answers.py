@@ -278,8 +278,9 @@ def _in_order(
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
         known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*taken}]
         if role is not None and known:
-            # As they were written: 48.191910 is no 48.19191 to a join. A column `cell` replaces the list's.
-            taken += [known[0]] + ["cell"] * (head == "cell")
+            # As they were written: 48.191910 is no 48.19191 to a join. Names of stations under any other head
+            # are repeated: which columns there are depends on the model alone.
+            taken.append(head if role == "station" else known[0])
             ordered[head] = words[predictions.place]
         elif role is None:
             # A user's own column called like one of ours keeps its words under another head.

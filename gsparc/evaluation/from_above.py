@@ -19,11 +19,15 @@ DART = Path([(-0.22, 0.75), (0.0, 0.0), (0.22, 0.75), (0.0, 1.0), (-0.22, 0.75)]
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
-def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, **labels: str) -> None:
-    """Equal scales from corner (2,) to corner (2,) [m], in plain numbers; "x [m]" unless labels say more."""
-    labels = {"xlabel": "x [m]", "ylabel": "y [m]"} | labels
+def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, **labels: str) -> None:
+    """Equal scales from corner (2,) to corner (2,) [m], in plain numbers about an `origin` that axes name."""
+    names = {"xlabel": "x [m]", "ylabel": "y [m]"}
+    if origin is not None:
+        where = f"{abs(origin.longitude):g}° {'E' if origin.longitude >= 0 else 'W'}"
+        north = f"{abs(origin.latitude):g}° {'N' if origin.latitude >= 0 else 'S'}"
+        names = {"xlabel": f"metres east of {where}", "ylabel": f"metres north of {north}"}
     across, up = np.transpose([low, high])
-    axis.set(xlim=across, ylim=up, aspect="equal", **labels)
+    axis.set(xlim=across, ylim=up, aspect="equal", **names | labels)
     # UTM northings, 5e6 m, would be shown as small numbers beside an offset at the axis' end.
     axis.ticklabel_format(useOffset=False, style="plain")
     axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share

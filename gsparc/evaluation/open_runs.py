@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
+from gsparc.data.inner_folds import cut_folds
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
@@ -99,11 +100,19 @@ class Opened:
         """
         config = self.stored[0].configuration
         if "model" not in config:
-            raise DataError(f"{self.stored[0].path} does not say how it was trained")
+            raise DataError(f"{self.stored[0].path} does not say how it was trained: train it anew")
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
         factory = build(config["model"], trusted=False)
         context = FitContext(**effort_settings(config) | others)
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
+
+    def group_places(self, places: np.ndarray, count: int, seed: int) -> np.ndarray:
+        """Return which of `count` groups, cut as test rows were, trained places (n, D) [m] are of, or -1."""
+        fold, split = self.split.folds[0], effort_settings(self.stored[0].configuration)["split"]
+        known, group = np.concatenate([fold.train, fold.val]), np.full(len(self.data), -1)
+        for number, inner in enumerate(cut_folds(self.data, fold, split, count, seed).folds):
+            group[inner.test] = number
+        return group[known[cKDTree(self.data.moving[known]).query(places)[1]]]
 
 
 def open_files(

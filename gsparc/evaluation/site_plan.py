@@ -82,13 +82,16 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
     value = power[row, entry] if data.site.kind == "csi" else 10 * np.log10(power[row, entry])
-    # Powers of channels are averaged linearly, levels of stations in decibels.
-    mean = pd.Series(value).groupby(which[row]).mean().reindex(range(count)).to_numpy()
+    # Powers of channels are averaged linearly, levels of a station in decibels.
+    each = [which[row]]
+    if data.site.kind == "rssi" and data.station is not None:
+        each.append(data.station[row])
+    level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
     if data.site.kind == "rssi":
-        of = ", mean of the stations heard" if several else ""
-        return mean, f"received power{of} [{data.site.level_unit}]"
+        of = " of the strongest station" if several else ""
+        return level, f"received power{of} [{data.site.level_unit}]"
     with np.errstate(divide="ignore"):
-        return 10 * np.log10(mean), "mean channel power" + (" of all stations" if several else "") + " [dB]"
+        return 10 * np.log10(level), "mean channel power" + (" of all stations" if several else "") + " [dB]"
 
 
 def draw_site(
@@ -182,7 +185,7 @@ def _draw_map(
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
         axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
-    set_bounds(axis, low, high, **_labels(data))
+    set_bounds(axis, low, high, site.georeference)
     _draw_stations(axis, data, jumping)
     _draw_suspicious(axis, places, low, high)
 
@@ -234,15 +237,6 @@ def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray
             annotate(axis, f"{places.rows[row]} at ({at})", where, "red")
     for row in near[:MOST_MARKS]:
         annotate(axis, places.rows[row], places.place[row], "red", above=False)
-
-
-def _labels(data: Measurements) -> dict[str, str]:
-    origin = data.site.georeference
-    if origin is None:
-        return {"xlabel": "x [m]", "ylabel": "y [m]"}
-    where = f"{abs(origin.longitude):g}° {'E' if origin.longitude >= 0 else 'W'}"
-    north = f"{abs(origin.latitude):g}° {'N' if origin.latitude >= 0 else 'S'}"
-    return {"xlabel": f"metres east of {where}", "ylabel": f"metres north of {north}"}
 
 
 def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep], unit: str) -> None:

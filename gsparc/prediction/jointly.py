@@ -12,6 +12,8 @@ from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
 from gsparc.models.per_station import OneStationView, PerStation
 from gsparc.prediction.query import Queries
 
+TOGETHER, UNREAD = 64, 1e12  # places at a time; variance of what is not measured [dB^2]
+
 
 class JointMixin:
     """What a `Predictor` of powers says of several places or stations at once."""
@@ -49,6 +51,27 @@ class JointMixin:
         count = 0 if self.site.stations is None else len(self.site.stations)
         level, covariance, _ = self._predict_levels(more, places, count + torch.arange(len(sectors)))
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+
+    def noise_by_others(self, places: Any, stations: Any, listed: np.ndarray) -> np.ndarray:
+        """Return variances (G, k) that a measured place lacks of what measuring each station tells [dB^2].
+
+        Infinite of a station that neither the place lists nor others tell of; below 0 where others tell more.
+
+        Args:
+            places, stations: see `predict_joint`.
+            listed: (G, k) bool, stations that are measured.
+        """
+        more = np.where(listed, 0, np.inf)
+        for part in np.array_split(np.arange(len(places)), len(places) // TOGETHER + 1):
+            if (joint := self.predict_joint(places[part], stations)) is not None:
+                field = joint.covariance - np.diag(joint.noise)
+                read = field + np.eye(len(stations)) * np.where(listed[part], joint.noise, UNREAD)[:, None]
+                told = field @ np.linalg.solve(read, field)
+                own, told = (one.diagonal(axis1=1, axis2=2) for one in (field, told))
+                noise = own * (own - told) / np.maximum(told, 1 / UNREAD)
+                # k stations tell as much as k measurements of one at best.
+                more[part] = np.maximum(noise, joint.noise / len(stations)) - joint.noise
+        return more
 
     def _joint_method(self) -> HasJoint | None:
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None

@@ -54,6 +54,15 @@ def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, ch
     assert warning in caplog.text
 
 
+def test_runs_of_powers_had_unknown_complex_factors(tmp_path, arrays):
+    run, levels = np.repeat([0, 1], 5), np.linspace(-90, -50, 10)
+    for name, measured, said in (("a", {"rssi_db": levels}, False), ("b", {"csi": 1j * levels}, True)):
+        ends = {**arrays, "run": run, "frequency_hz": np.array(3e9), **measured}
+        write_own(tmp_path / f"{name}.npz", {key: value for key, value in ends.items() if key != "spectrum"})
+        text = " ".join(_said(tmp_path / f"{name}.npz")[1].split())
+        assert "runs 2" in text and ("of unknown factors" in text) == said
+
+
 def test_a_place_without_a_fix_is_left_out_and_named(tmp_path):
     """It was refused for its 11,000 km in metres, later by the number of the first such row alone."""
     rng = np.random.default_rng(0)

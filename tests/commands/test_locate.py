@@ -10,6 +10,7 @@ import towns
 from campaigns import compose, powers, spectra
 from PIL import Image
 
+from gsparc.apps.locate import locator
 from gsparc.commands.locate import locate
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_as_found
@@ -119,11 +120,39 @@ def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
         74_500,
     ]
     assert np.median(np.linalg.norm(off, axis=1)) < 30
-    rows = (folder / "phone.csv").read_text().splitlines()
-    long = ["scan,cell,rssi", *(f"{row.split(',')[0]},roof-1,{row.split(',')[1]}" for row in rows[1:])]
-    (tmp_path / "long.csv").write_text("\n".join(long) + "\n")
-    with pytest.raises(DataError, match="expected one row a moment with a column of levels per station"):
-        located(tmp_path / "long", f"ckpt={ckpt}", f"data='{tmp_path}/long.csv'", "calibrate=0")
+
+
+def test_a_long_log_was_refused_though_it_has_times(roofs, tmp_path, caplog):
+    """`which are of one moment? expected one row a moment`, though rows of one scan have one time."""
+    ckpt, folder, _ = roofs
+    head, *rows = [row.split(",") for row in (folder / "phone.csv").read_text().splitlines()]
+    links = [
+        (int(row[0]), name, level) for row in rows for name, level in zip(head[1:], row[1:], strict=True)
+    ]
+
+    def log(name, columns, line):
+        (tmp_path / f"{name}.csv").write_text("\n".join([columns, *(line(*link) for link in links)]) + "\n")
+        return f"ckpt={ckpt}", f"data='{tmp_path}/{name}.csv'", "calibrate=0"
+
+    timed = log("timed", "date,time,cell,rssi", lambda i, a, b: f"2026-11-27,10:00:{i:02d},{a},{b}")
+    wide = located(tmp_path / "wide", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")[1]
+    with caplog.at_level("INFO"):
+        found = located(tmp_path / "run", *timed)[1]
+    assert "20 snapshots in 59 rows" in caplog.text
+    assert [[row[axis] for axis in "xy"] for row in found] == [[row[axis] for axis in "xy"] for row in wide]
+    for name, columns, line, said in (
+        ("scan", "scan,cell,rssi", lambda i, a, b: f"{i},{a},{b}", "expected a column of times, or one row"),
+        ("day", "date,cell,rssi", lambda i, a, b: f"2026-11-27,{a},{b}", "'date' has 1 values in 60 rows"),
+        ("each", "time,cell,rssi", lambda i, a, b: f"{i}.{a[-1]},{a},{b}", "'time' has 60 values in 60 rows"),
+        (
+            "gap",
+            "time,cell,rssi",
+            lambda i, a, b: f"{i or ''},{a},{b}",
+            "'time' has 20 values in 60 rows, 3 empty",
+        ),
+    ):
+        with pytest.raises(DataError, match=said):
+            located(tmp_path / name, *log(name, columns, line))
 
 
 def test_a_final_model_spoke_of_test_rows_alone(roofs, tmp_path):
@@ -134,8 +163,9 @@ def test_a_final_model_spoke_of_test_rows_alone(roofs, tmp_path):
         located(tmp_path / "run", f"ckpt={roofs[0]}")
 
 
-def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, caplog):
+def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, monkeypatch, caplog):
     """Areas were calibrated anew by every call, though the checkpoint held what was learned."""
+    monkeypatch.setattr(locator, "HELD_OUT", 6)
     ckpt = shutil.copy(roofs[0], tmp_path / "model.ckpt")
     given = f"ckpt={ckpt}", f"data='{roofs[1]}/phone.csv'", "rows=3"
     first, rows = located(tmp_path / "first", *given, "calibrate=2")
@@ -147,6 +177,53 @@ def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, caplog):
     with caplog.at_level("INFO"):
         located(tmp_path / "other", *given, "calibrate=2", "share=0.8")
     assert "calibration 1 of 2" in caplog.text
+
+
+def test_200_snapshots_left_out_were_each_sought_twice_from_the_coarse_grid_on(
+    roofs, tmp_path, monkeypatch, caplog
+):
+    """Minutes before the first answer of a model of many stations."""
+    monkeypatch.setattr(locator, "TRUSTED", 8)
+    monkeypatch.setattr(locator, "HELD_OUT", 20)
+    ckpt, before = shutil.copy(roofs[0], tmp_path / "model.ckpt"), []
+    search = locator.Locator.search_cells
+    counted = lambda *given: before.append(given[3:]) or search(*given)  # noqa: E731
+    monkeypatch.setattr(locator.Locator, "search_cells", counted)
+    with caplog.at_level("INFO"):
+        facts, _ = located(tmp_path / "run", f"ckpt={ckpt}", "eval_on=train", "rows=1", "calibrate=2")
+    assert facts["locate/calibrated_on"] == 20 and "calibrated on 20 snapshots left out" in caplog.text
+    assert [bool(one and one[0]) for one in before[:48]] == [False] * 8 + [True] * 8 + [False] * 12 + [
+        True
+    ] * 20
+
+
+def test_the_log_showed_trust_as_an_object(roofs, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(locator, "HELD_OUT", 3)
+    given = f"ckpt={roofs[0]}", "store=false", "eval_on=train", "rows=1", "calibrate=2"
+    with caplog.at_level("INFO"):
+        located(tmp_path / "run", *given)
+    assert "3 snapshots left out: areas of 100.0 %" in caplog.text and "Trust(" not in caplog.text
+
+
+def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monkeypatch, caplog):
+    """A plan that changed under its name was not noticed, and `calibrate=0` took whatever was stored."""
+    monkeypatch.setattr(locator, "HELD_OUT", 6)
+    ckpt, paper = shutil.copy(roofs[0], tmp_path / "model.ckpt"), np.full((40, 40, 3), 255, np.uint8)
+    low, high = (site := checkpoint.read(ckpt).site).moving_box[:, :2] + site.origin[:2]
+    points = f"plan_points=[[0,40,{low[0]},{low[1]}],[40,40,{high[0]},{low[1]}]]"
+    given = f"ckpt={ckpt}", "eval_on=train", "rows=1", f"plan='{tmp_path}/plan.png'", points
+    said = []
+    for number, wall in enumerate((0, 0, 20)):
+        paper[:, :wall] = 0
+        Image.fromarray(paper).save(tmp_path / "plan.png")
+        caplog.clear()
+        with caplog.at_level("INFO"):
+            located(tmp_path / str(number), *given, "calibrate=2")
+        said += [[word in caplog.text for word in ("calibrated before", "calibrated with cells=")]]
+    assert said == [[False, False], [True, False], [False, True]]
+    located(tmp_path / "stored", *given, "calibrate=0")
+    with pytest.raises(ValueError, match=r"was calibrated with plan=.*, plan_points=.*, cells=\w{8}: "):
+        located(tmp_path / "box", *given[:3], "calibrate=0")
 
 
 def test_ctrl_c_lost_all_that_was_located(tmp_path):

@@ -81,6 +81,12 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     assert "; rows logged on the way not counted" in said
 
 
+def test_a_plan_did_not_say_how_many_stations_a_place_lists(mapped, model, tmp_path, monkeypatch):
+    monkeypatch.setattr("gsparc.apps.maps.promise.Promise.stations_of_place", lambda self: 1)
+    done = run("plan", f"ckpt={model}", "count=1", "area=[-20,0,80,60]", folder=tmp_path)
+    assert any(", a place lists the 1 strongest of 2, a way of" in line for line in done.out), done
+
+
 def test_the_file_of_a_way_held_no_stops(model, tmp_path):
     assert run("plan", f"ckpt={model}", "count=6", "promised=false", folder=tmp_path).status == 0
     way, *stops = json.loads((tmp_path / "plan.geojson").read_text())["features"]

@@ -123,8 +123,17 @@ def test_a_column_of_cells_was_renamed(town, tmp_path, monkeypatch, labels):
     monkeypatch.setitem(vars(town.site.stations), "label", labels)
     asked = "mast" if labels is None else "B-1"
     (row,) = answered(town, tmp_path, ["x", "y", "z", "cell"], [[5, 5, 1.5, asked]])
-    assert [*row][:5] == ["x", "y", "z", "cell", "rssi_db"] and row["cell"] == asked
-    assert "station" not in row
+    assert [*row][:4] == ["x", "y", "z", "cell"] and row["cell"] == asked
+
+
+@pytest.mark.parametrize("labels", [None, ("A-1", "A-2", "B-1")])
+def test_columns_of_predictions_changed_with_those_of_places(town, tmp_path, monkeypatch, labels):
+    """Of places with a column `cell` there was no `station`, and one of any other head replaced it."""
+    monkeypatch.setitem(vars(town.site.stations), "label", labels)
+    (plain,) = answered(town, tmp_path, ["x", "y", "z"], [[5, 5, 1.5]], station="mast")
+    for head in ("station", "cell", "PCI"):
+        (row,) = answered(town, tmp_path, ["x", "y", "z", head], [[5, 5, 1.5, "mast"]])
+        assert {*row} == {*plain, head} and row["station"] == plain["station"]
 
 
 def test_coordinates_were_written_anew_under_other_heads(valley, tmp_path):

@@ -43,17 +43,18 @@ def shown(data, figures):
     return figures[-1], words(figures[-1])
 
 
-def test_levels_are_means_over_what_was_heard():
+def test_check_drew_the_mean_of_the_stations_heard():
+    """A number that no planner uses; the strongest is drawn."""
     place = scattered(10)
     level = np.stack([np.full(10, -60.0), np.full(10, -80.0), np.full(10, -70.0)], axis=1)
     level[3, 0], level[4, :2] = np.nan, np.nan
     data = from_arrays({"rx_position": place, "station_position": scattered(3), "rssi_db": level})
     found = find_spots(data, link_levels(data))
     assert np.allclose(found.place, place[:, :2])  # world coordinates, in the order of measuring
-    expected = np.full(10, -70.0)
-    expected[3] = -75
+    expected = np.full(10, -60.0)
+    expected[[3, 4]] = -70
     assert np.allclose(found.level_db, expected, atol=1e-4) and not found.suspicious.any()
-    assert found.label == "received power, mean of the stations heard [dB]"
+    assert found.label == "received power of the strongest station [dB]"
 
 
 def test_of_the_sectors_of_a_mast_the_last_alone_was_named(figures):

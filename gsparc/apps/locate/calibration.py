@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,32 +11,22 @@ from scipy.optimize import minimize
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.search import Search
 
-log = logging.getLogger(__name__)
-
 # Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
 SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
-LOOKS, SAID = 160, 40  # trials, and those after which it is said
+LOOKS = 100  # trials
 
 
-def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: float, start: Trust) -> Trust:
-    """Return the trust under which held-out places are most likely, with an area that holds a share.
-
-    All numbers but the level maximise the mean log density at the true places, a proper score; the level is
-    then the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
-    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
-    the share of places that are exchangeable with these.
+def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, start: Trust) -> Trust:
+    """Return the trust under which held-out places are most likely: of the highest mean log density there.
 
     Args:
         snapshots: with their likelihoods over cells.
         places: (n, 3), where they were heard [m, local].
-        share: of places, to be held.
         start: of the search.
     """
     edge = float(np.max([one.cells.edge.max() for one in snapshots]))
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
-
-    trials = itertools.count(1)
 
     # In logarithms: all are positive and known up to factors.
     def decode_trust(point: np.ndarray) -> Trust:
@@ -46,8 +34,6 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
         return Trust(inflation, temperature, tail, edge * spread)
 
     def surprise(point: np.ndarray) -> float:
-        if (number := next(trials)) % SAID == 0:
-            log.info("how far it is trusted: %d of at most %d trials", number, LOOKS)
         trust, pairs = decode_trust(point), zip(snapshots, places, strict=True)
         return -float(np.mean([one.posterior(trust).log_density_at(place) for one, place in pairs]))
 
@@ -55,12 +41,16 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, share: floa
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
     simplex = first + np.vstack([np.zeros(4), np.diag([1.0, -1.5, 1.0, 1.0])])
     how = {"maxfev": LOOKS, "initial_simplex": simplex}
-    optimum = minimize(surprise, first, method="Nelder-Mead", options=how)
-    return calibrate_level(decode_trust(optimum.x), snapshots, places, share)
+    return decode_trust(minimize(surprise, first, method="Nelder-Mead", options=how).x)
 
 
 def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
-    """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit."""
+    """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit.
+
+    The level is the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
+    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
+    the share of places that are exchangeable with these.
+    """
     levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
     # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
     rank = int(np.ceil((len(levels) + 1) * share))

@@ -89,14 +89,12 @@ def cover_box(
     count = np.where(live, np.maximum(np.ceil(extent / step), 1), 1).astype(int)
     edge = np.where(live, extent / count, 0.0)
     middle = np.median(trained, axis=0)
-    laid = [low[i] + edge[i] * (np.arange(count[i]) + 0.5) for i in range(3)]
-    sides = [laid[i] if live[i] else middle[i : i + 1] for i in range(3)]
-    centre = np.stack(np.meshgrid(*sides, indexing="ij"), -1).reshape(-1, 3)
+    laid = [low[i] + edge[i] * (np.arange(count[i]) + 0.5) if live[i] else middle[[i]] for i in range(3)]
+    centre = np.stack(np.meshgrid(*laid, indexing="ij"), -1).reshape(-1, 3)
     if around:
         tree = cKDTree(np.unique(trained, axis=0))
         apart = np.median(tree.query(tree.data, k=min(2, tree.n))[0][:, -1])
-        near = tree.query(centre)[0] <= max(REACH * apart, np.linalg.norm(edge))
-        centre = centre[near]
+        centre = centre[tree.query(centre)[0] <= max(REACH * apart, np.linalg.norm(edge))]
     if open_at is not None:
         centre = centre[open_at(centre)]
         if not len(centre):

@@ -50,11 +50,9 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
         "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
         "time/locate_ms": each_ms,
     }  # fmt: skip
-    columns = columns_of_places(place, heard.position)
-    return report(run_dir, config.against, METHOD, *both, columns, facts)
+    return report(run_dir, config, METHOD, *both, columns_of_places(place, heard.position), facts)
 
 
 def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:
     """Return rows as snapshots of powers."""
-    values = torch.from_numpy(rows.level).double()
-    return Snapshots("rssi", values, None, rows.position)
+    return Snapshots("rssi", torch.from_numpy(rows.level).double(), None, rows.position)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 from matplotlib.collections import PatchCollection
 from matplotlib.patches import Rectangle
 from omegaconf import DictConfig
 
 from gsparc.apps.locate import locator as locating
-from gsparc.apps.locate.cells import Cells, beyond_box, cover_box
+from gsparc.apps.locate.cells import beyond_box, cover_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
 from gsparc.apps.locate.neighbours import locate_by_neighbours
@@ -35,7 +36,7 @@ log = logging.getLogger(__name__)
 Report = tuple[dict[str, Any], list[Table], list[str]]  # facts, tables and sentences
 SHOWN = 6  # snapshots, evenly over all
 ABOUT = {"area_m2": "area", "modes": "modes", "doubt": "doubt", "inside": "inside"}  # columns of `Located`
-TRUST_IS_OF = ("calibrate", "share", "prior", "plan", "plan_points", "phase_known", "offset_db")  # settings
+TRUST_IS_OF = ("share", "prior", "plan", "plan_points")  # settings
 
 
 def columns_of_places(
@@ -50,19 +51,20 @@ def columns_of_places(
 
 
 def report(
-    run_dir: Path, against: Sequence[str], method: str, heard: Snapshots, trained: Snapshots,
-    columns: dict[str, Any], facts: dict[str, Any], promise: str = "",
+    run_dir: Path, config: DictConfig, method: str, heard: Snapshots, trained: Snapshots,
+    columns: dict[str, Any], facts: dict[str, Any], promise: str = "", group: np.ndarray | None = None,
 ) -> Report:  # fmt: skip
     """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
 
     Args:
         run_dir: where the file goes.
-        against: names of plain methods beside it.
+        config: see conf/locate.yaml.
         method: name.
         heard, trained: what was located, and what was learned from.
         columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
         facts: for the summary, with the milliseconds of a snapshot.
         promise: what the areas promise, in words.
+        group: see `locate_by_neighbours`.
     """
     write_samples(run_dir / "locate.csv", columns)
     area, inside = columns.get("area_m2"), columns.get("inside")
@@ -72,17 +74,17 @@ def report(
     if "error_m" not in columns:
         return facts, [], doubts
     rows = []
-    for name in dict.fromkeys([method, *against]):
+    for name in dict.fromkeys([method, *config.against]):
         stem, error = "locate", columns["error_m"]
         if name != method:
             stem = f"baseline/{name}"
-            place, *seconds = locate_by_neighbours(name, trained, heard)
+            place, *seconds = locate_by_neighbours(name, trained, heard, group)
             facts[f"{stem}/locate_ms"], facts[f"time/{stem}/fit_s"] = seconds
             error = np.linalg.norm(place - heard.place, axis=1)
         median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
         facts |= {f"{stem}/median_m": median, f"{stem}/p90_m": p90}
         rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
-    title = f"{facts['dataset/name']}, {len(heard)} snapshots"
+    title = f"{Path(config.data).stem if config.data else facts['dataset/name']}, {len(heard)} snapshots"
     shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
     if inside is not None:
@@ -97,8 +99,8 @@ def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
     for key, why in locating.DOUBTS.items():
         facts[f"locate/{key}"] = count = int((doubt == why).sum())
         if count:
-            of = f"{count} of {len(doubt)} snapshots"
-            lines.append(f"{of}: {why}, where areas promise nothing (locate.csv, doubt)")
+            said = f"{why}, where areas promise nothing (locate.csv, doubt)"
+            lines.append(f"{count} of {len(doubt)} snapshots: {said}")
     if lines and "inside" in columns and (sure := doubt == "").any():
         held = np.mean(np.array(columns["inside"])[sure])
         lines.append(f"areas of the other {sure.sum()} hold {held:.0%} of places")
@@ -122,24 +124,28 @@ def locate_by_model(
     data, fold = run.data, run.split.folds[0]
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
-    how = {name: to_dict(config)[name] for name in TRUST_IS_OF}
-    stored = run.stored[0].extra.get(locating.KEY, {})
-    anew = config.calibrate and (config.renew or stored.get("how") != how)
-    # What was learned earlier for other settings is refused: its areas would hold another share.
-    start = Trust() if anew else locating.restore_trust(run.stored[0].extra, unknown, share)
     # A plan is in world metres, cells are local.
     origin = data.site.origin
     light = None if open_at is None else lambda places: open_at(places[:, :2] + origin[:2])
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
-    locator = Locator(SiteField(run.predictor), box, wider, unknown, start, share)
-    count = stored.get("count", 0)
+    # Not of names alone: a plan's image, and rows, change under the same name.
+    extra, cells_hash = run.stored[0].extra, joblib.hash((box, wider, learned, data.site.sha256))[:8]
+    how = {name: to_dict(config)[name] for name in TRUST_IS_OF} | asdict(unknown) | {"cells": cells_hash}
+    stored, other = extra.get(locating.KEY, {}), locating.find_other_settings(extra, how)
+    anew = bool(config.calibrate and (config.renew or other))
+    start, count = Trust() if anew else locating.restore_trust(extra, how), stored.get("count", 0)
+    locator = Locator(SiteField(run.predictor), box, wider, unknown, start)
     if anew:
-        trust, count = _trust(config, run, locator, cells, run_dir)
+        if stored:
+            log.info("it was calibrated with %s: calibrated anew", ", ".join(other) or "the same settings")
+        seconds, seed = float(config.calibrate_s), int(config.seed)
+        retraining = run.retraining(run_dir=run_dir / "left_out", seed=seed, budget_s=seconds)
+        trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:
-            update_extra(config.ckpt, locating.trust_state(trust, unknown, share, how=how, count=count))
+            update_extra(config.ckpt, {locating.KEY: {"trust": asdict(trust), "how": how, "count": count}})
     elif config.calibrate:
         log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
 
@@ -148,36 +154,22 @@ def locate_by_model(
         table = {} if heard.row is None else {"row": heard.row[first]}
         world = np.array([one.place for one in located]) + origin
         table |= columns_of_places(world, heard.place[first] + origin, run.predictor)
-        about = ABOUT if placed else {head: name for head, name in ABOUT.items() if head != "inside"}
-        return table | {head: [getattr(one, name) for one in located] for head, name in about.items()}
+        about = {head: [getattr(one, name) for one in located] for head, name in ABOUT.items()}
+        return table | {head: values for head, values in about.items() if values[0] is not None}
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
     own = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
-    promise = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
+    said = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
-    promise += f", {beyond} true places lie beyond these" * bool(beyond)
+    said += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
-    result = run.methods[0].name, heard, trained, columns(located), facts, promise
-    return report(run_dir, config.against, *result)
-
-
-def _trust(
-    config: DictConfig, run: Opened, locator: Locator, cells: Callable[[np.ndarray], Cells], run_dir: Path
-) -> tuple[Trust, int]:
-    """Learned from training rows that were left out, and their number."""
-    brief = {"run_dir": run_dir / "left_out", "seed": int(config.seed), "budget_s": float(config.calibrate_s)}
-    try:
-        learned = run.retraining(**brief)
-    except DataError as error:
-        raise DataError(f"{error}; calibrate=0 goes without calibration") from None
-    result = locating.learn_trust(learned, locator, int(config.calibrate), cells)
-    log.info("calibrated on %d snapshots left out: areas of %.1f %%", result[1], 100 * result[0].level)
-    return result
+    group = run.group_places(trained.place, int(config.calibrate) or 3, int(config.seed))
+    return report(run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, said, group)
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
@@ -191,7 +183,9 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
     else:
         data, placed = read_like_stored(run.stored[0], config.data)
     heard = group_snapshots(data, np.arange(len(data)) if rows is None else rows)
-    heard = heard if placed else replace(heard, place=np.full_like(heard.place, np.nan))
+    if not placed:
+        log.info("%s: %d snapshots in %d rows, at unknown places", config.data, len(heard), len(data))
+        heard = replace(heard, place=np.full_like(heard.place, np.nan))
     return heard.subset(sample_rows(config, len(heard))), placed
 
 
@@ -219,16 +213,14 @@ def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np
         order = np.argsort(density)  # cells above one another: the likeliest is seen
         corners = cells.centre[order, :2] - cells.edge[order, :2] / 2
         boxes = [Rectangle(*box) for box in zip(corners, *cells.edge[order, :2].T, strict=True)]
-        patches = PatchCollection(boxes, cmap="Blues", linewidth=0)
         # 12 below the largest, a factor of 160,000: what is fainter is no different from white.
-        patches.set_array(np.maximum(density[order], density.max() - 12))
-        axis.add_collection(patches)
+        shade = np.maximum(density[order], density.max() - 12)
+        axis.add_collection(PatchCollection(boxes, cmap="Blues", linewidth=0, array=shade))
         axis.plot(*known[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
         axis.plot(*one.place[:2], "x", color="#D55E00", label="located")
         if true is not None:
             axis.plot(*true[number, :2], "o", markerfacecolor="none", color="black", label="heard at")
-        axis.set_aspect("equal")
-        axis.set(xlabel="x [m]", ylabel="y [m]")
+        axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         axis.set_title(f"snapshot {number}: {one.modes} mode{'s' if one.modes > 1 else ''}", fontsize=9)
     axes.flat[0].legend(fontsize=7)
     save(figure, path)

@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-# 32 MB in float64: blocks of snapshots are made no larger.
-MOST = 4_000_000  # entries of an array (n, P, G) at a time
 TINY = 1e-30
 
 
@@ -39,7 +38,7 @@ class Misfit:
         squared, size, silent = (torch.cat(pair, 1) for pair in pairs)
         return Misfit(squared, size, self.count, silent)
 
-    def subset(self, places: Tensor) -> Misfit:
+    def subset(self, places: np.ndarray) -> Misfit:
         """Return the misfit at places (g,) by number."""
         return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
 
@@ -129,14 +128,9 @@ def level_misfit(
     size = seen @ log_variance.T + shared.log()
     silent = torch.zeros_like(squared)
     if floor is not None and not torch.isnan(floor).all():
-        spread = (variance + offset_db**2).sqrt()
-        parts = []
-        for block in floor.split(max(MOST // max(mean.numel(), 1), 1)):
-            # log_ndtr, not the logarithm of ndtr, which is -inf from 38 deviations on.
-            chance = torch.special.log_ndtr((block[:, None] - mean) / spread)
-            counted = ~torch.isnan(block)[:, None] & ~torch.isnan(mean)  # silent, and with a prediction
-            parts.append(torch.where(counted, chance, torch.zeros_like(chance)).sum(2))
-        silent = torch.cat(parts)
+        # log_ndtr, not the logarithm of ndtr, which is -inf from 38 deviations on.
+        chance = torch.special.log_ndtr((floor[:, None] - mean) / (variance + offset_db**2).sqrt())
+        silent = chance.nansum(2)  # of what is silent, and has a prediction
     return Misfit(squared, size, seen.sum(1), silent)
 
 

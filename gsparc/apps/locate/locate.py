@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
 
@@ -9,12 +11,14 @@ import numpy as np
 import torch
 
 from gsparc.apps.locate.cells import cover_box
-from gsparc.apps.locate.locator import FURTHER, MOST, Located, Locator, restore_trust, to_world
+from gsparc.apps.locate.locator import FURTHER, KEY, MOST, Located, Locator, restore_trust, to_world
 from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import snapshots_of_values
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places
+
+log = logging.getLogger(__name__)
 
 
 def locate(
@@ -59,6 +63,10 @@ def _locator(
     """Of world places (m, 3); None: of the box of the measured ones."""
     site = predictor.site
     local = site.moving_box[:, :3] if places is None else np.asarray(places) - site.origin
-    trust = restore_trust(predictor.extra, unknown, share)
+    trust = restore_trust(predictor.extra, {"share": share, **asdict(unknown)})
+    how = predictor.extra.get(KEY, {}).get("how", {})
+    before = how.get("prior"), how.get("plan")
+    if how and before != ("box" if places is None else "where", None):
+        log.warning("locate: areas were calibrated with prior=%s, plan=%s, not here", *before)
     cells, wider = (cover_box(local, MOST, places is not None, beyond=beyond) for beyond in (0, FURTHER))
-    return Locator(SiteField(predictor), cells, wider, unknown, trust, share)
+    return Locator(SiteField(predictor), cells, wider, unknown, trust)

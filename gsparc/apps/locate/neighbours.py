@@ -8,24 +8,28 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from sklearn.model_selection import GridSearchCV, GroupKFold
+from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
 from gsparc.apps.locate.snapshots import Snapshots
 
 PLAIN = {"nearest": (1,), "weighted_knn": (1, 2, 3, 4, 5, 7, 9, 13)}  # numbers of neighbours that are tried
-FOLDS = 5  # of places, that choose the number
+FOLDS = 5  # of places, that choose the number where no groups are given
 MAX_ROWS = 2_000  # that choose it
 BELOW = 0.02  # of the range of values, that a silent one is put below the least
 
 
-def locate_by_neighbours(name: str, trained: Snapshots, heard: Snapshots) -> tuple[np.ndarray, float, float]:
+def locate_by_neighbours(
+    name: str, trained: Snapshots, heard: Snapshots, group: np.ndarray | None = None
+) -> tuple[np.ndarray, float, float]:
     """Return places (n, 3) of snapshots by the nearest trained ones, weighed by their inverse distances.
 
     Args:
         name: of `PLAIN`; of several numbers of neighbours the one of least error at places left out is taken.
         trained: snapshots of known places, in whose coordinates places come [m].
         heard: snapshots to be placed.
+        group: (m,) int64 of trained ones, left out together to choose that number, -1 where never; None:
+            fifths of the places.
 
     Returns:
         Places, milliseconds of each, and seconds of learning.
@@ -39,8 +43,8 @@ def locate_by_neighbours(name: str, trained: Snapshots, heard: Snapshots) -> tup
         raise ValueError(f"{name}: no row that could be learned from holds a value")
     floor = np.nanmin(known) - BELOW * (np.nanmax(known) - np.nanmin(known))
     known, asked = (np.where(np.isfinite(one), one, floor) for one in (known, asked))
-    nearest = KNeighborsRegressor(weights="distance", algorithm="brute")
-    nearest.set_params(n_neighbors=_count(nearest, PLAIN[name], known, places)).fit(known, places)
+    count = _count(PLAIN[name], known, places, group)
+    nearest = KNeighborsRegressor(count, weights="distance", algorithm="brute").fit(known, places)
     fitted = time.perf_counter()
     place = nearest.predict(asked)
     return place, (time.perf_counter() - fitted) / max(len(heard), 1) * 1e3, fitted - started
@@ -61,17 +65,19 @@ def feature_vectors(heard: Snapshots) -> np.ndarray:
     return np.hstack([turned.real, turned.imag])
 
 
-def _count(model: KNeighborsRegressor, counts: tuple[int, ...], known: np.ndarray, places: np.ndarray) -> int:
-    """The number of neighbours of least median error at places left out, by fifths; else the first."""
+def _count(counts: tuple[int, ...], known: np.ndarray, places: np.ndarray, group: np.ndarray | None) -> int:
+    """The number of neighbours of least median error at places left out; else the first."""
     rows = np.random.default_rng(0).permutation(len(known))[:MAX_ROWS]
-    group = np.unique(places[rows], axis=0, return_inverse=True)[1].reshape(-1)
+    place = np.unique(places[rows], axis=0, return_inverse=True)[1].reshape(-1)
     # Half of the rows: a fold without a place that was visited often has not many more.
     possible = [count for count in counts if count <= len(rows) // 2]
-    if len(possible) < 2 or group.max() + 1 < FOLDS:
+    if len(possible) < 2 or place.max() + 1 < FOLDS:
         return counts[0]
 
     def score(fitted: KNeighborsRegressor, asked: np.ndarray, true: np.ndarray) -> float:
         return -float(np.median(np.linalg.norm(fitted.predict(asked) - true, axis=1)))
 
-    search = GridSearchCV(model, {"n_neighbors": possible}, scoring=score, cv=GroupKFold(FOLDS))
-    return int(search.fit(known[rows], places[rows], groups=group).best_params_["n_neighbors"])
+    folds = GroupKFold(FOLDS).split(rows, groups=place) if group is None else PredefinedSplit(group[rows])
+    model = KNeighborsRegressor(weights="distance", algorithm="brute")
+    search = GridSearchCV(model, {"n_neighbors": possible}, scoring=score, cv=folds)
+    return int(search.fit(known[rows], places[rows]).best_params_["n_neighbors"])

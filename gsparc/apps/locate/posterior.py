@@ -113,10 +113,8 @@ class Posterior:
         centre, edge = self.cells.centre[some], self.cells.edge[some]
         pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
         # Cells touch where centres are no farther apart than half the sum of edges, 1 % for rounding.
-        touch = (np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
-                 <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)  # fmt: skip
-        pairs = pairs[touch]
+        pairs = pairs[(np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
+                 <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)]  # fmt: skip
         graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some)))
         part = connected_components(graph, directed=False)[1]
-        mass = np.bincount(part, self.mass[some])
-        return max(int((mass >= MODE).sum()), 1)
+        return max(int((np.bincount(part, self.mass[some]) >= MODE).sum()), 1)

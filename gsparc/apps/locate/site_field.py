@@ -41,10 +41,9 @@ class SiteField:
 
     def __init__(self, predictor: Predictor) -> None:
         self.predictor, self.site = predictor, predictor.site
-        site = self.site
-        if site.static_end is None:
+        if self.site.static_end is None:
             raise ValueError("locate: both ends move; one that stands still is needed")
-        self.count = 1 if site.stations is None else len(site.stations)
+        self.count = 1 if self.site.stations is None else len(self.site.stations)
 
     @torch.no_grad()
     def moments_at(self, places: Tensor) -> Moments:

@@ -15,6 +15,7 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import machine_memory
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, check_arguments, finite_array, number, or_null
+from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site
 from gsparc.prediction.query import usual_heights
 
@@ -36,6 +37,7 @@ class Grid:
         height: of all cells [m], world.
         step: side of a cell [m].
         inside: (ny, nx) bool, cells that are asked for.
+        origin: of the metres, where places came in degrees.
     """
 
     x: np.ndarray
@@ -43,6 +45,7 @@ class Grid:
     height: float
     step: float
     inside: np.ndarray
+    origin: Georeference | None = None
 
     def places(self, cells: np.ndarray | None = None) -> np.ndarray:
         """World places (n, 3) [m] of `cells` (n,), numbers into the flat map; None: of those inside."""
@@ -93,7 +96,7 @@ def lay_grid(
     inside = np.ones((ny, nx), bool) if contains is None else np.array([contains(row) for row in rows])
     if not inside.any():
         raise DataError(f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer")
-    return Grid(x, y, height, step, inside)
+    return Grid(x, y, height, step, inside, None if site is None else site.georeference)
 
 
 def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.making import predict_levels, query_ends, to_local
+from gsparc.apps.maps.making import choose_stations, predict_levels
 from gsparc.apps.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import query_ends, to_local
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
 SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
@@ -24,22 +25,24 @@ class ErrorCovariance:
     Attributes:
         covariance: (S, S) of the power without a measurement's own noise; changes as places are measured.
         noise: variance of one measurement.
+        measured: (S,) the same of a measurement at each place, infinite where it would not list the station.
         weight: (S,) what held-out blocks say that variances are to be multiplied with.
     """
 
     covariance: np.ndarray
     noise: float
+    measured: np.ndarray
     weight: np.ndarray
 
     def condition_on(self, place: int) -> None:
         """Condition on a measurement at one of the places."""
         column = self.covariance[:, place].copy()
-        self.covariance -= np.outer(column, column / (column[place] + self.noise))
+        self.covariance -= np.outer(column, column / (column[place] + self.measured[place]))
 
     def variance_reductions(self, targets: np.ndarray) -> np.ndarray:
         """Return what a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
         explained = (self.weight * targets) @ self.covariance**2
-        return explained / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+        return explained / (np.maximum(self.covariance.diagonal(), 0) + self.measured)
 
     def variances(self) -> np.ndarray:
         """Return variances of a measurement's error at each place (S,), as held-out blocks scale it."""
@@ -52,26 +55,32 @@ def error_covariances(
 ) -> list[ErrorCovariance]:  # fmt: skip
     """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
-    Held-out blocks of `promise` scale the variances.
+    Held-out blocks of `promise` scale the variances. What is measured at a place lists those that are
+    predicted strongest there, as many as training rows have in the mean.
 
     Raises:
         ValueError: the model has no process.
     """
-    covariances = []
+    covariances, every = [], choose_stations(predictor, None)[0]
+    names = [""] if predictor.site.stations is None else predictor.site.stations.name
+    ask = {name: predictor.select_station(name) if name else predictor for name in every}
+    told = {name: predict_levels(ask[name], places, other_end) for name in every}
+    each = len(every) if promise is None else min(promise.stations_of_place(), len(every))
+    level = np.nan_to_num([told[name][0] for name in every], nan=-np.inf)
+    listed = (level >= np.sort(level, 0)[-each]).T
+    more = predictor.noise_by_others(places, [names.index(name) for name in every], listed).T
     for name in stations:
-        asking = predictor if predictor.site.stations is None else predictor.select_station(name)
-        number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
+        number, asking = names.index(name), ask[name]
         covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
         weight = np.ones(len(places))
         if promise is not None:  # expected squared errors of held-out blocks over the process's variance
             calibration = promise.calibration()
-            spread = predict_levels(asking, places, other_end)[1]
             far = promise.distance(to_local(asking.site, places, other_end), number)
             inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
-            _, error = calibration.half_and_error(spread, inside, np.full(len(far), number))
+            _, error = calibration.half_and_error(told[name][1], inside, np.full(len(far), number))
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
-        covariances.append(ErrorCovariance(covariance, noise, weight))
+        covariances.append(ErrorCovariance(covariance, noise, noise + more[every.index(name)], weight))
     return covariances
 
 
@@ -83,4 +92,5 @@ def prior_covariances(places: np.ndarray, length_m: float | None) -> list[ErrorC
     variance, scaled = SHADOWING_DB**2, np.sqrt(3) * cdist(places, places) / length
     # Matern-3/2 about a level that is as uncertain: Rasmussen and Williams 2006, eq. 4.17.
     prior = variance * ((1 + scaled) * np.exp(-scaled) + 1)
-    return [ErrorCovariance(prior, variance * NOISE, np.ones(len(places)))]
+    one = np.ones(len(places))
+    return [ErrorCovariance(prior, variance * NOISE, variance * NOISE * one, one)]

@@ -16,7 +16,6 @@ from gsparc.apps.maps.geojson import write_shapes
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
 from gsparc.data.limits import finite_array
-from gsparc.data.links.georeference import Georeference
 
 REFUSED = -1  # of `best_server`
 NO_CLASS = 65535  # in a file of classes
@@ -287,7 +286,7 @@ def check_geotiff(wanted: bool | None) -> bool:
     return there and wanted is not False
 
 
-def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | None) -> None:
+def write_geotiff(path: str | Path, raster: FieldMap) -> None:
     """Write float32 bands, north up; named, NaN where nothing is said.
 
     Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
@@ -299,7 +298,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
     bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
     if len(raster.stations) > 1:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
-    profile = _profile(raster, origin, count=len(bands), dtype="float32", nodata=float("nan"))
+    profile = _profile(raster, count=len(bands), dtype="float32", nodata=float("nan"))
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         file.update_tags(unit=raster.unit, threshold_db=raster.threshold_db, height_m=raster.grid.height)
         for number, (name, values) in enumerate(bands.items(), 1):
@@ -311,8 +310,7 @@ def write_geotiff(path: str | Path, raster: FieldMap, origin: Georeference | Non
 
 
 def write_classes(
-    path: str | Path, raster: FieldMap, origin: Georeference | None, number: np.ndarray,
-    names: Sequence[str], colours: np.ndarray,
+    path: str | Path, raster: FieldMap, number: np.ndarray, names: Sequence[str], colours: np.ndarray
 ) -> None:  # fmt: skip
     """Write numbers (ny, nx) of classes with a table of their colours (k, 3), and named areas as GeoJSON."""
     import rasterio
@@ -320,27 +318,27 @@ def write_classes(
     from rasterio.warp import transform_geom
 
     values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
-    profile = _profile(raster, origin, count=1, dtype="uint16", nodata=NO_CLASS)
+    profile = _profile(raster, count=1, dtype="uint16", nodata=NO_CLASS)
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         # Before the values, which fix what colours mean.
         file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
         file.write(values, 1)
     named = []
     for area, one in shapes(values, values != NO_CLASS, transform=profile["transform"]):
-        area = area if origin is None else transform_geom(profile["crs"], "EPSG:4326", area)
+        area = area if raster.grid.origin is None else transform_geom(profile["crs"], "EPSG:4326", area)
         named.append((area, {"number": int(one), "station": names[int(one)]}))
     write_shapes(Path(path).with_suffix(".geojson"), named)
 
 
-def _profile(raster: FieldMap, origin: Georeference | None, **bands: Any) -> dict[str, Any]:
+def _profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
     """What rasterio is told of a file and its `bands`, in the projection of `Georeference`.
 
     Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample them. Without
-    an `origin` coordinates are metres.
+    an origin coordinates are metres.
     """
     from rasterio.transform import from_origin
 
-    left, _, _, high = raster.grid.extent
+    (left, _, _, high), origin = raster.grid.extent, raster.grid.origin
     # Without a title programs show it as "unknown".
     form = "+proj=aeqd +datum=WGS84 +lat_0={0!r} +lon_0={1!r} +title=equidistant_about_{0}_{1}"
     place = None if origin is None else form.format(origin.latitude, origin.longitude)

@@ -21,13 +21,13 @@ from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
 from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import finite_array
 from gsparc.data.links.stations import all_names, find_station
-from gsparc.data.schema import End, Site
+from gsparc.data.schema import Site
 from gsparc.data.spacing import neighbour_distance
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import query_ends, to_local
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 ALL_CELLS = 40_000  # of a map that are all asked about
@@ -242,45 +242,6 @@ def predict_levels(
         parts.append(predicted_levels(predictor.predict_linear(**ends), predictor.site.kind))
     level, spread = np.concatenate(parts, axis=1)
     return level, spread
-
-
-def query_ends(
-    site: Site, places: np.ndarray, other_end: Sequence[float] | None, station: np.ndarray | None = None
-) -> dict[End, np.ndarray]:
-    """World places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
-
-    `other_end` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
-
-    Raises:
-        DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
-    """
-    if station is not None and site.static_end is not None:
-        return {site.static_end: station, site.moving_end: places}
-    if site.static_end is not None:
-        if other_end is not None:
-            raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
-        return {site.moving_end: places}
-    if other_end is None:
-        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other_end), places.shape)}
-
-
-def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
-    """(3,) [m] of the setting `name`, with 2 `axes` also (2,); `DataError` where it is no place."""
-    place = finite_array(value)
-    if place.shape not in ((axes,), (3,)):
-        raise DataError(f"{name}={value}: {('two', 'three')[axes - 2]} finite numbers [m] are needed")
-    return place
-
-
-def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) -> np.ndarray:
-    """World places (n, 3) of the moving end as local ones, (n, 6) of both ends where both moved [m].
-
-    Raises:
-        DataError: both moved, and nobody says where the other end stands.
-    """
-    ends = query_ends(site, places, other_end)
-    return np.hstack([ends[end] - site.origin for end in ("tx", "rx") if end in ends])
 
 
 def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: float | None) -> np.ndarray:

@@ -204,7 +204,7 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
-    from_above.set_bounds(axis, (left, low), (right, high), title=title)
+    from_above.set_bounds(axis, (left, low), (right, high), field.grid.origin, title=title)
     draw_measured_places(axis, field)
     from_above.scale_bar(axis)
     if field.refused.any():
@@ -225,7 +225,8 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     for colour, word, _ in shown[:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
     if len(listed["number"]) > MOST_COLOURS:
-        axis.plot([], [], " ", label=f"all {len(listed['number'])}: {file_name(layer, '.csv')}")
+        fewer = f"{len(listed['number']) - MOST_COLOURS} more, that serve less: {file_name(layer, '.csv')}"
+        axis.plot([], [], " ", label=fewer)
 
 
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
@@ -288,7 +289,7 @@ def draw_measurement_plan(
         image = np.full(batch.grid.inside.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
-        from_above.set_bounds(axis, (left, low), (right, high), ylabel="", title=title)
+        from_above.set_bounds(axis, (left, low), (right, high), batch.grid.origin, title=title)
         from_above.scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
@@ -296,12 +297,10 @@ def draw_measurement_plan(
     after.plot(*batch.path.T, color="red", linewidth=1, zorder=3)
     after.plot(*batch.places[:, :2].T, "o", color="red", markeredgecolor="white", markersize=6, zorder=3)
     for number, place in enumerate(batch.places[:60], 1):
-        after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
-                       path_effects=from_above.OUTLINE, zorder=4)  # fmt: skip
+        from_above.annotate(after, str(number), place[:2])
     figure.colorbar(mesh, ax=[before, after], label="expected error [dB]", shrink=0.8)
     curve.plot(np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)]), ".-")
     curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
-    curve.set_ylim(bottom=0)  # what the walk gains is seen beside what is left
     curve.grid(alpha=0.3)
     save(figure, path, 100)
 
@@ -315,7 +314,7 @@ def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: st
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     from_above.draw_stations(axis, placing.stations)
     from_above.draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
-    from_above.set_bounds(axis, (left, low), (right, high))
+    from_above.set_bounds(axis, (left, low), (right, high), placing.grid.origin)
     from_above.scale_bar(axis)
     from_above.legend_below(figure)
     save(figure, path, 100)

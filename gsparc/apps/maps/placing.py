@@ -210,7 +210,8 @@ def lay_candidates(
     if station_height_m is None and np.isnan(known).all():
         raise DataError("station_height_m: no station's height is known; say station_height_m=METRES")
     height = float(np.nanmedian(known) if station_height_m is None else station_height_m)
-    candidates, given = _candidates(grid, sites, predictor, height, count)
+    lattice = grid if sites is not None else coarse_grid(predictor, area, height_m, count=count)
+    candidates, given = _candidates(lattice, sites, predictor, height, count)
     try:
         _new(predictor, candidates[0], grid.places()[:1], antenna)
     except ValueError as refused:
@@ -252,9 +253,9 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         given = {head: words for head, role, words in asked.table if role in (None, "row_name")}
         return to_world(replace(asked, ends={end: replace(where, height=above)}), site)[end], given
     if sites is not None:
-        every, _ = walkable_places(sites, grid, predictor.site.georeference, "sites")
+        every, _ = walkable_places(sites, grid, "sites")
     else:
-        every = grid.places()
+        every, count = grid.places(), 2 * count  # so many more lie in an area that the lattice missed
     few = every[evenly_spaced(len(every), count)]
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 

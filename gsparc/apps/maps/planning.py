@@ -17,13 +17,13 @@ from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
-from gsparc.apps.maps.making import choose_stations, read_place
+from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
-from gsparc.data.links.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import read_place
 
 # Covariances are over all places: 900 targets and 900 candidates are 26 MB in float64.
 TARGETS = 900  # places that the error is averaged over, about
@@ -102,8 +102,9 @@ def plan_measurements(
         area, height_m, plan: see `lay_grid`; with a promise and neither area nor plan, what it answers for.
         walkable: GeoJSON file of where somebody may measure: polygons, or lines such as streets, along which
             the walk then goes; None: the whole area.
-        stations, other_end: see `predict_map`; what is measured at a place is measured of all of them.
-        promise: evidence of held-out blocks, which scales the model's own variances.
+        stations, other_end: see `predict_map`; whose error is to fall.
+        promise: evidence of held-out blocks, which scales the model's own variances, and tells how many
+            stations a place lists, those that are predicted strongest there; None: a place measures all.
         least_gain_db: stop where a place takes less than this off the expected error.
         route: whether places are put in the order of a short walk, or drive; else the most telling first.
         start: (2,) where the walk starts [m]; None: anywhere.
@@ -115,12 +116,11 @@ def plan_measurements(
     """
     metres = {"route_m": or_null(POSITIVE), "length_m": or_null(POSITIVE)}
     check_arguments(locals(), count=whole(1), least_gain_db=number(0), **metres)
-    origin = None if predictor is None else predictor.site.georeference
     grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets, streets = grid.places(), None
     places, first = targets, 0  # candidates are the places from `first` on
     if walkable is not None:
-        allowed, streets = walkable_places(walkable, grid, origin)
+        allowed, streets = walkable_places(walkable, grid)
         places, first = np.concatenate([targets, allowed]), len(targets)
     # Before anything is measured only the distance over which powers are alike is known.
     if predictor is None:
@@ -132,8 +132,9 @@ def plan_measurements(
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
-    before, before_db = mean_error(unknown), _expected(unknown, wanted)
-    chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour)
+    before = mean_error(unknown)
+    before_db = float(np.sqrt(np.mean(before[wanted] ** 2)))
+    chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour, before_db)
     order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64)
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
@@ -146,9 +147,9 @@ def plan_measurements(
 
 def coarse_grid(
     predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None,
-    promise: Promise | None = None,
+    promise: Promise | None = None, count: int = TARGETS,
 ) -> Grid:  # fmt: skip
-    """Return about `TARGETS` cells; where nobody says which, those that a promise reaches."""
+    """Return about `count` cells; where nobody says which, those that a promise reaches."""
     fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
@@ -157,7 +158,7 @@ def coarse_grid(
         fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
     left, right, low, high = fine.extent
     share = fine.inside.mean()
-    step = float(np.sqrt((right - left) * (high - low) * share / TARGETS))
+    step = float(np.sqrt((right - left) * (high - low) * share / count))
     x, y = (np.arange(a + step / 2, b, step) for a, b in ((left, right), (low, high)))
     column, row = (((v - a) / fine.step).astype(int).clip(0, n - 1)
                    for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y))))  # fmt: skip
@@ -167,12 +168,10 @@ def coarse_grid(
     return replace(fine, x=x, y=y, step=step, inside=inside)
 
 
-def walkable_places(
-    path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable"
-) -> tuple[np.ndarray, Streets | None]:
+def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.ndarray, Streets | None]:
     """Return places (n, 3) in polygons or along lines of a file, and these lines; None: it holds none."""
     left, right, south, north = grid.extent
-    area, lines = read_shapes(path, key, origin, True, max(right - left, north - south))
+    area, lines = read_shapes(path, key, grid.origin, True, max(right - left, north - south))
     from shapely import contains_xy
 
     points, streets = [np.zeros((0, 2))], None
@@ -199,16 +198,15 @@ def walkable_places(
 
 def choose_greedily(
     unknown: list[ErrorCovariance], first: int, wanted: np.ndarray, count: int, least_gain_db: float,
-    tour: Tour,
+    tour: Tour, error: float,
 ) -> tuple[list[int], list[float], str]:  # fmt: skip
     """Chosen candidates, expected error after each, and why it stopped early.
 
-    Candidates are the places from `first` on, by whose numbers they are in `tour`.
+    Candidates are the places from `first` on, by whose numbers they are in `tour`; `error` is that before.
     """
     free = np.ones(len(wanted) - first, bool)
     chosen: list[int] = []
     expected: list[float] = []
-    error = _expected(unknown, wanted)
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
         gains = np.sum([one.variance_reductions(wanted)[first:] for one in unknown], axis=0)
@@ -218,13 +216,12 @@ def choose_greedily(
             return chosen, expected, f"{why} after {len(chosen)} places"
         best = int(np.where(possible, gains, -np.inf).argmax())
         # Mean square errors subtract, roots do not.
-        left = error**2 - gains[best] / (len(unknown) * wanted.sum())
-        gain = error - float(np.sqrt(max(left, 0)))
-        if gain < least_gain_db:
+        left = float(np.sqrt(max(error**2 - gains[best] / (len(unknown) * wanted.sum()), 0)))
+        if (gain := error - left) < least_gain_db:
             return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
         for one in unknown:
             one.condition_on(first + best)
-        error = _expected(unknown, wanted)
+        error = left
         chosen.append(best)
         expected.append(error)
         tour.add(best)
@@ -235,7 +232,3 @@ def choose_greedily(
 def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:
     """Return the root of the mean variance over stations at each place (S,) [dB]."""
     return np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
-
-
-def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(mean_error(unknown)[wanted] ** 2)))

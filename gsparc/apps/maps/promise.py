@@ -72,6 +72,12 @@ class Promise:
         """See `gsparc.apps.maps.intervals.cross_validate`."""
         return intervals.cross_validate(self.evidence, share)
 
+    def stations_of_place(self) -> int:
+        """Return how many stations have a level at a place that was learned from, in the mean."""
+        links = np.column_stack([self.known, self.station])
+        each = len(np.unique(links, axis=0)) / len(np.unique(self.known, axis=0))
+        return max(round(each * float((self.evidence.side <= 0).mean())), 1)
+
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
         """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
         return intervals.nearest_distances(self.known, self.station, places, np.full(len(places), station))

@@ -34,7 +34,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("scale", "" if powers or scale == 1 else f"measurements are divided by {scale:.4g}, then stored"),
         ("censored", f"of {len(data)} powers {weak} lie under a level (unheard, unlisted), {strong} above one"
          if data.censored is not None else ""),
-        ("runs", "" if data.run is None else f"{data.run.max() + 1}, each with an unknown complex factor"),
+        ("runs", "" if data.run is None else f"{data.run.max() + 1}" + ", of unknown factors" * (not powers)),
         ("phases", "" if phases is None else str(phases)),
         ("mask", f"{data.mask.mean():.1%} of the entries were measured"
          if data.mask is not None and data.censored is None else ""),

@@ -7,7 +7,7 @@ what one station measured at one place, in the order of measuring; levels are in
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,16 +77,12 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 
 def floor_warnings(levels: LinkLevels) -> list[str]:
     """Warn of stations whose levels pile up at a receiver's own noise, or lowest reading."""
-    heard = [(t, levels.level_db[used]) for t, used in levels.heard() if t not in levels.limited]
-    # Of a station that is seldom heard weak levels are missing, not piled up.
-    often = max((len(level) for _, level in heard), default=0) / 2
-    found = {t: find_floor_pile(level) for t, level in heard if len(level) >= often}
-    piles = [(_of([levels.names[t]], len(levels.names)), *pile) for t, pile in found.items() if pile]
-    if not piles and not levels.limited:
-        every = find_floor_pile(levels.level_db[np.isfinite(levels.level_db)])
-        piles = [("", *every)] if every else []
+    piles, names = find_noise(levels.station, levels.level_db, levels.limited), levels.names
     # Upwards, so that levels below what is said are those of the pile; single precision has errors of 1e-6.
-    said = [(who, float(np.ceil(round(100 * top, 3)) / 100), share) for who, top, share in piles]
+    said = [
+        ("" if t < 0 else _of([names[t]], len(names)), float(np.ceil(round(100 * top, 3)) / 100), share)
+        for t, (top, share) in piles.items()
+    ]
     shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in said])
     return [
         f"not heard? {shares}, a receiver's noise or lowest reading, are learned as signals; sensitivity_db="
@@ -94,6 +90,22 @@ def floor_warnings(levels: LinkLevels) -> list[str]:
         "of each its own) takes levels below as not heard"
         for top in sorted(top for _, top, _ in said)[-1:]
     ]
+
+
+def find_noise(
+    station: np.ndarray, level_db: np.ndarray, limited: Container[int] = ()
+) -> dict[int, tuple[float, float]]:
+    """Return `find_floor_pile` of stations (n,) whose levels (n,) [dB] have one, else that of all under -1.
+
+    NaN are no levels; stations `limited` have a level of hearing that is known.
+    """
+    station, level_db = station[known := np.isfinite(level_db)], level_db[known]
+    heard = {int(t): level_db[station == t] for t in np.unique(station) if t not in limited}
+    # Of a station that is seldom heard weak levels are missing, not piled up.
+    often = max(map(len, heard.values()), default=0) / 2
+    piles = {t: find_floor_pile(level) for t, level in heard.items() if len(level) >= often}
+    piles |= {} if limited or any(piles.values()) else {-1: find_floor_pile(level_db)}
+    return {t: pile for t, pile in piles.items() if pile}
 
 
 def find_floor_pile(levels: np.ndarray) -> tuple[float, float] | None:

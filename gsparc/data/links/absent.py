@@ -43,17 +43,17 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
     check.notes.append(f"{silent} links without a level were not heard, as dataset.absent=silent says")
 
 
-def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) -> None:
+def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -> int:
     """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out.
 
-    Not `wanted`, these are said to flatter the figures of what they list; nothing else judges it.
+    Returns how many lists leave out. Where `absent` is not `auto` what it does to figures is said alone.
     """
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
     whole = levels.ndim == 1 and "mask" not in arrays
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
     if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
-        return
+        return 0
     # Noise below a stated level has its place in a list, and bounds what is not listed by that level.
     levels = np.where(np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels)
     moment = number_lists(arrays["place"][heard], of[heard])
@@ -63,15 +63,14 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
     strongest = lists.are_strongest()
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
     said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
-    found = None if strongest or said else lists.below_floor()
+    found = None if strongest or said or absent == "silent" else lists.below_floor()
     if not strongest and found is None:
-        return
+        return 0
     missing = f"lists of the {lists.length} strongest of {count} stations"
     if found is not None:
         (floor, may), lists = found, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"
-        limits = f"{np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB"
-        how = f"not heard, below the weakest of each station ({limits})"
+        how = f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         stated = np.full(count, np.nan if floor is None else floor)
@@ -79,11 +78,14 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
         may = np.isnan(lists.level)
         how = "one that a full list leaves out is below its weakest"
         how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"
-    if not wanted:
-        flattered = "unlisted ones are predicted too high, and figures of listed rows do not show it"
-        unknown = f"{missing} with dataset.absent=unknown: {flattered}; leave absent out"
-        check.notes.append(Severe(unknown))
-        return
+    if absent != "auto":
+        does = "unlisted ones are predicted too high, and figures of listed rows do not show it"
+        if absent == "silent":
+            weakest = np.nanmin(lists.level[lists.full], 1)
+            does = f"what full lists leave out is below their weakest ({weakest.min():.4g} to "
+            does += f"{weakest.max():.4g} dB), not all below {np.nanmin(floor):.4g}: predictions are too low"
+        check.notes.append(Severe(f"{missing} with dataset.absent={absent}: {does}; leave absent out"))
+        return 0
     most, every = UNLISTED_EACH * len(heard), int(may.sum())
     of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
@@ -91,6 +93,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, wanted: bool) 
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
     used = f"{used} {every} unlisted are used (dataset.absent=unknown takes none)"
     check.notes.append(f"{missing}: {how}; beside {len(heard)} listed, {used}")
+    return len(below) * strongest
 
 
 def _floors(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:

@@ -144,11 +144,10 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
         check, _selected(check, measured, stations, part) or stations, measured in POWERS
     )
     absent = check.raw.attributes.get("absent", "auto")
+    unlisted = add_unlisted(check, stations, static, absent) if measured == "rssi_db" else 0
     if absent == "silent":
         add_absent(check, measured, len(stations))
-    if absent != "silent" and measured == "rssi_db":
-        add_unlisted(check, stations, static, absent == "auto")
-    return censor_rows(check, measured, Links(static, stations))
+    return censor_rows(check, measured, Links(static, stations), unlisted)
 
 
 def _unrolled(raw: Raw, measured: str, count: int) -> Raw:

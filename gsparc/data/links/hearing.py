@@ -39,13 +39,14 @@ def check_said(attributes: Mapping[str, Any]) -> None:
         limit.check(f"dataset.{name}", attributes.get(name, default))
 
 
-def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
+def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) -> Links | None:
     """Leave out rows without a value; censored ones hold the level that they lie below or above, masked.
 
     Args:
         check: of the file, whose `raw` is changed; takes notes, and what is wrong.
         measured: name of the measurement.
         links: of its rows; returned with `censored`, None where something is wrong.
+        unlisted: rows that lists of the strongest leave out.
     """
     values, arrays, before = check.raw.arrays[measured], check.raw.arrays, len(check.problems)
     floor = _stated_floor(check, measured, values)
@@ -93,7 +94,8 @@ def censor_rows(check: Checker, measured: str, links: Links) -> Links | None:
         none = " or without any power" if measured == "spectrum" else ""
         below = np.zeros(1) if floor is None or not censored.any() else floor[censored]
         limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
-        unheard = f"powers were not heard: below {limits} dB"
+        what = "not listed" + " or not heard" * bool(censored.sum() > unlisted) if unlisted else "not heard"
+        unheard = f"powers were {what}: below {limits} dB"
         for flags, what in ((~keep, f"values are missing{none}"), (censored, unheard)):
             check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
         arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]

@@ -27,7 +27,7 @@ _STATIONS = "|".join(sorted(heads.STATION_WORDS))
 # A letter or a number that remains of a head names a station; a whole word says another quantity.
 STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
 MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
-BY_ROW = "#"  # in place of a head: the number of the row
+BY_ROW = "#"  # in place of a head: the number of the row; before heads: of what they hold together
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -53,7 +53,8 @@ class Column(Head):
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
         """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
         if self.by_row:
-            return pd.factorize(np.array(sheet.rows))[0].astype(float)
+            moments = sheet.joined(self.label.split(BY_ROW)) if self.label else np.array(sheet.rows)
+            return pd.factorize(moments)[0].astype(float)
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not unit_suits(self.role, self.unit):
@@ -239,8 +240,8 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
-    if text == BY_ROW:
-        return (Column(role),)
+    if text.startswith(BY_ROW):
+        return (Column(role, text.removeprefix(BY_ROW)),)
     # A factor, as in `pathloss*-1`, is looked for after the head as it is: heads may hold a `*`.
     times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text)
     head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None

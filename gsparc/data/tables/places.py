@@ -11,7 +11,7 @@ import numpy as np
 from gsparc.data.errors import Caution, DataError, list_first
 from gsparc.data.links.stations import PER_STATION, SECTOR
 from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations
-from gsparc.data.tables.heads import AXES, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
+from gsparc.data.tables.heads import AXES, LISTS, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.data.tables.sheet import Sheet
@@ -88,7 +88,7 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
         end: that moved, `tx` or `rx`.
 
     Raises:
-        DataError: rows are of one station each, and nothing says which of them are of one moment.
+        DataError: rows are of one station each, and no column of times says which are of one moment.
     """
     sheet, _ = read_sheet(path)
     roles = [f"{before}{axis}" for before in ("", "rx_", "tx_") for axis in AXES]
@@ -97,10 +97,28 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
     chosen, _ = choose_columns(sheet, here, {}, [*roles, "station"])
     if any(role in chosen for role in roles):
         return {}
+    apart = BY_ROW
     if "station" in chosen:
-        fault = "no coordinates, and rows of one station each: which are of one moment?"
-        raise DataError(f"{path}: {fault} expected one row a moment with a column of levels per station")
-    return {**dict.fromkeys(said), f"{end}_x": BY_ROW, f"{end}_y": BY_ROW, f"{end}_z": 0}
+        apart += BY_ROW.join(_times(sheet, sheet.joined(column.head for column in chosen["station"])))
+    return {**dict.fromkeys(said), f"{end}_x": apart, f"{end}_y": apart, f"{end}_z": 0}
+
+
+def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
+    """Heads of the columns that tell which rows, of a station (S,) each, are of one moment, or DataError."""
+    heads = [head for head in sheet.heads if LISTS["time"] & set(words_of(head))]
+    asked = f"{sheet.source}: no coordinates, and rows of one station each: which are of one moment?"
+    wanted = "expected a column of times, or one row a moment with a column of levels per station"
+    if not heads:
+        raise DataError(f"{asked} {wanted}")
+    moment, named = sheet.joined(heads), list_first([*map(repr, heads)])
+    links, moments = len({*zip(moment.tolist(), station.tolist(), strict=True)}), len(set(moment))
+    alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
+    # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
+    if empty or alone or 2 * links < len(moment):
+        raise DataError(
+            f"{asked} {named} has {moments} values in {len(moment)} rows, {empty} empty; {wanted}"
+        )
+    return heads
 
 
 def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np.ndarray | None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsparc.apps.locate import calibration
-from gsparc.apps.locate.calibration import calibrate_trust
+from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
 from gsparc.apps.locate.cells import cover_box
 from gsparc.apps.locate.likelihood import Trust, level_misfit
 from gsparc.apps.locate.search import Search
@@ -41,7 +41,8 @@ def test_areas_hold_the_promised_share(monkeypatch):
     rng = np.random.default_rng(0)
     cells = cover_box(CORNERS, 400, False)
     (places, values), (others, tested) = (snapshots(count, rng, 3.0) for count in (150, 400))
-    trust = calibrate_trust(looked(values, cells), places, 0.9, Trust())
+    trust = calibrate_trust(looked(values, cells), places, Trust())
+    trust = calibrate_level(trust, looked(values, cells), places, 0.9)
     field = replace(Trust(1.0, 1.0, 100.0), level=0.9)
     seen = list(zip(looked(tested, cells), others, strict=True))
     held, believed = (
@@ -55,4 +56,4 @@ def test_few_places_promise_the_whole_area():
     rng = np.random.default_rng(1)
     cells = cover_box(CORNERS, 100, False)
     places, values = snapshots(5, rng, 3.0)
-    assert calibrate_trust(looked(values, cells), places, 0.9, Trust()).level == 1.0
+    assert calibrate_level(Trust(), looked(values, cells), places, 0.9).level == 1.0

@@ -1,13 +1,9 @@
 """Misfits of snapshots at places against what they are by definition."""
 
-import logging
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
 
-from gsparc.apps.locate import judging
 from gsparc.apps.locate.likelihood import Trust, channel_misfit, level_misfit, spectrum_misfit
 
 RNG = np.random.default_rng(0)
@@ -72,11 +68,3 @@ def test_heavy_tail_forgives_a_bad_snapshot():
     found = level_misfit(values, mean, torch.ones(2, 20).double())
     light, heavy = (Trust(1.0, 1.0, tail).log_likelihood(found)[0] for tail in (1e6, 2.0))
     assert light[1] - light[0] > 100 and 0 < heavy[1] - heavy[0] < 10
-
-
-def test_the_log_showed_trust_as_an_object(monkeypatch, caplog, tmp_path):
-    monkeypatch.setattr(judging.locating, "learn_trust", lambda *_: (Trust(), 3))
-    run = SimpleNamespace(retraining=lambda **_: None)
-    with caplog.at_level(logging.INFO):
-        judging._trust(SimpleNamespace(seed=0, calibrate=2, calibrate_s=1), run, None, None, tmp_path)
-    assert "3 snapshots left out: areas of 90.0 %" in caplog.text and "Trust(" not in caplog.text

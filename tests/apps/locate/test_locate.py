@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -12,8 +13,6 @@ from campaigns import powers, spectra
 import gsparc
 from gsparc.apps.locate import locate
 from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.locator import trust_state
-from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import group_snapshots
 from gsparc.data.own import from_arrays
@@ -24,6 +23,12 @@ from gsparc.prediction.predictor import Predictor
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     return towns.trained(spectra(tmp_path_factory.mktemp("located") / "own.npz", rows=80), "gp")
+
+
+def calibrated(**trust):
+    """As `gsparc locate` stored it before it kept the prior, the plan and the cells, too."""
+    before = {"unknown": {"phase_known": False, "offset_db": 0.0}, "share": 0.9}
+    return {"locate": {"trust": asdict(Trust(**trust)), **before}}
 
 
 def test_a_predicted_spectrum_is_located_where_it_was_predicted(trained):
@@ -44,16 +49,27 @@ def test_areas_are_those_that_were_calibrated(trained, caplog):
     with caplog.at_level(logging.WARNING):
         before = locate(predictor, spectrum)[0]
     assert "not calibrated" in caplog.text
-    checkpoint.update_extra(trained, trust_state(Trust(spread=0.2), Nuisances(), 0.9))
+    checkpoint.update_extra(trained, calibrated(spread=0.2))
     after = locate(gsparc.load(trained), spectrum)[0]
     assert after.area > 2 * before.area
     with pytest.raises(ValueError, match=r"was calibrated with share=0\.9"):
         locate(gsparc.load(trained), spectrum, share=0.5)
 
 
+def test_a_calibration_of_another_prior_was_taken_unsaid(trained, tmp_path, caplog):
+    path = shutil.copy(trained, tmp_path / "model.ckpt")
+    how = {"share": 0.9, "phase_known": False, "offset_db": 0.0, "prior": "box", "plan": None}
+    checkpoint.update_extra(path, {"locate": {"trust": asdict(Trust()), "how": how}})
+    predictor = gsparc.load(path)
+    middle = (predictor.site.moving_box + predictor.site.origin).mean(0)[None]
+    for where, said in ((None, False), (middle + np.diag([0.3, 0.3, 0.1]), True)):
+        locate(predictor, predictor.spectrum(tx=middle), where=where)
+        assert ("calibrated with prior=box, plan=None, not here" in caplog.text) == said
+
+
 def test_a_snapshot_unlike_all_that_were_left_out_had_an_area_as_any_other(trained, tmp_path):
     path = shutil.copy(trained, tmp_path / "model.ckpt")
-    checkpoint.update_extra(path, trust_state(Trust(worst=2.0), Nuisances(), 0.9))
+    checkpoint.update_extra(path, calibrated(worst=2.0))
     predictor = gsparc.load(path)
     like = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
     unlike = np.roll(np.asarray(like), like.shape[-1] // 2, -1)[..., ::-1, :].copy()
@@ -62,7 +78,7 @@ def test_a_snapshot_unlike_all_that_were_left_out_had_an_area_as_any_other(train
 
 def test_the_larger_box_was_asked_about_again_by_each_call(trained, tmp_path, monkeypatch):
     path = shutil.copy(trained, tmp_path / "model.ckpt")
-    checkpoint.update_extra(path, trust_state(Trust(worst=0.0), Nuisances(), 0.9))
+    checkpoint.update_extra(path, calibrated(worst=0.0))
     predictor, asked, moments = gsparc.load(path), [], SiteField.moments_at
     spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
     counted = lambda field, places: asked.append(len(places)) or moments(field, places)  # noqa: E731

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from releases import real
 
 from gsparc.apps.locate.fingerprints import fingerprint_snapshots
-from gsparc.apps.locate.neighbours import PLAIN, feature_vectors, locate_by_neighbours
+from gsparc.apps.locate.judging import report
+from gsparc.apps.locate.neighbours import PLAIN, _count, feature_vectors, locate_by_neighbours
 from gsparc.apps.locate.snapshots import Snapshots
 from gsparc.data.datasets.fingerprints import read_fingerprints, split_fingerprints
 
@@ -36,6 +38,29 @@ def test_a_hall_is_learned_also_from_two_rows(name):
     silent = heard(np.full((4, 8), np.nan), known.place[:4])
     with pytest.raises(ValueError, match="no row that could be learned from holds a value"):
         locate_by_neighbours(name, silent, asked)
+
+
+def test_one_neighbour_was_chosen_by_places_that_lie_between_others():
+    """Of a drive tested in gaps the nearest row had 300 m, three to nine rows 200 to 218."""
+    rng = np.random.default_rng(0)
+    squares = np.repeat(np.stack(np.meshgrid(range(6), range(6)), -1).reshape(-1, 2) * 10.0, 4, 0)
+    places = np.c_[squares + rng.normal(0, 0.3, squares.shape), np.zeros(len(squares))]
+    posts = rng.uniform(0, 50, (12, 2))
+    level = -np.linalg.norm(places[:, None, :2] - posts, axis=2)
+    # What places of a square share, as shadowing, tells of no other square.
+    level += np.repeat(rng.normal(0, 8, (36, 12)), 4, 0)
+    square = np.repeat(np.arange(36), 4) % 5
+    counts = [_count(PLAIN["weighted_knn"], level, places, group) for group in (None, square)]
+    assert counts[0] <= 3 < counts[1]
+
+
+def test_a_table_was_called_as_the_trained_file(tmp_path):
+    """Of `data=sec40.csv` the table said `drive`, the file that was learned from."""
+    known, columns = hall(20, 0), {"error_m": np.ones(20)}
+    config = OmegaConf.create({"data": "logs/sec40.csv", "against": []})
+    facts = {"dataset/name": "drive"}
+    _, tables, _ = report(tmp_path, config, "gp", known, known, columns, facts)
+    assert tables[0].title == "sec40, 20 snapshots"
 
 
 def test_silence_tells_rooms_apart():

@@ -17,6 +17,12 @@ from gsparc.data.links.georeference import Georeference
 ORIGIN = Georeference(47.2, 11.3)
 
 
+def town_on_earth():
+    predictor = gsparc.load(town_model())
+    predictor.site = replace(predictor.site, georeference=ORIGIN)
+    return predictor
+
+
 def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
     """Drawn in degrees with heights and a hole; rasterio masks the file's cells by the same polygon."""
     pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
@@ -24,15 +30,14 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
     from rasterio.features import geometry_mask
     from rasterio.warp import transform_geom
 
-    predictor = gsparc.load(town_model())
-    predictor.site = replace(predictor.site, georeference=ORIGIN)
+    predictor = town_on_earth()
     rings = [[[5, 5], [75, 10], [60, 55], [10, 50], [5, 5]], [[30, 20], [50, 20], [40, 40], [30, 20]]]
     degrees = [np.stack([*ORIGIN.to_degrees(np.array(ring, float))[::-1], np.full(len(ring), 570.0)], 1)
                for ring in rings]  # fmt: skip
     drawn = {"type": "Polygon", "coordinates": [ring.tolist() for ring in degrees]}
     (tmp_path / "area.geojson").write_text(json.dumps({"type": "Feature", "geometry": drawn}))
     found = predict_map(predictor, tmp_path / "area.geojson", step_m=1.0)
-    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
+    write_geotiff(tmp_path / "map.tif", found)
     with rasterio.open(tmp_path / "map.tif") as file:
         assert file.descriptions[0] == "power_db" and file.count == 11
         units = dict(zip(file.descriptions, file.units, strict=True))
@@ -48,11 +53,11 @@ def test_a_file_for_other_programs_said_neither_unit_nor_colours(tmp_path):
     pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
     import rasterio
 
-    found = predict_map(gsparc.load(town_model()), step_m=4.0, threshold_db=-70)
+    found = predict_map(town_on_earth(), step_m=4.0, threshold_db=-70)
     colours = np.linspace(0, 1, 3 * len(found.stations)).reshape(-1, 3)
     number = found.layer("best_server")
-    write_geotiff(tmp_path / "map.tif", found, ORIGIN)
-    write_classes(tmp_path / "best.tif", found, ORIGIN, number, found.stations, colours)
+    write_geotiff(tmp_path / "map.tif", found)
+    write_classes(tmp_path / "best.tif", found, number, found.stations, colours)
     with rasterio.open(tmp_path / "map.tif") as file:
         tags = file.tags()
         assert (tags["unit"], tags["threshold_db"]) == ("dB", "-70.0")
@@ -68,9 +73,9 @@ def test_polygons_of_best_servers_had_no_names(tmp_path):
     from shapely import contains_xy
     from shapely.geometry import shape
 
-    found = predict_map(gsparc.load(town_model()), step_m=4.0)
+    found = predict_map(town_on_earth(), step_m=4.0)
     number = found.layer("best_server")
-    write_classes(tmp_path / "best_server.tif", found, ORIGIN, number, found.stations, np.zeros((2, 3)))
+    write_classes(tmp_path / "best_server.tif", found, number, found.stations, np.zeros((2, 3)))
     told = json.loads((tmp_path / "best_server.geojson").read_text())["features"]
     areas = [(shape(one["geometry"]), tuple(one["properties"].values())) for one in told]
     cell = np.flatnonzero(np.isfinite(number))

@@ -11,7 +11,14 @@ import gsparc
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import predict_map
-from gsparc.apps.maps.placing import Antenna, NewStationError, assumption, new_station_error, place_station
+from gsparc.apps.maps.placing import (
+    Antenna,
+    NewStationError,
+    assumption,
+    lay_candidates,
+    new_station_error,
+    place_station,
+)
 from gsparc.apps.maps.promise import Promise, held_out_evidence
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
@@ -53,6 +60,14 @@ def test_the_best_place_is_far_from_those_that_serve(together, promise):
     assert (gain_low <= found.gain).all() and (found.gain <= gain_high + 0.01).all()
     assert found.gain == pytest.approx(found.coverage - found.before)
     assert (np.diff(found.coverage) <= 1e-12).all() and (found.places[:, 2] == 8).all()
+
+
+def test_candidates_lay_on_diagonal_stripes(together):
+    """Every n-th of flattened squares: thin along one side alone."""
+    _, places, _ = lay_candidates(gsparc.load(together[2]), count=48)
+    across, up = (np.unique(places[:, axis]) for axis in (0, 1))
+    assert len(places) == len(across) * len(up) and 40 <= len(places) <= 56
+    assert np.diff(across) == pytest.approx(np.diff(up)[0])
 
 
 def test_the_share_as_it_is_was_taken_as_exact(together, promise):

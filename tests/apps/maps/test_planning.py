@@ -8,12 +8,14 @@ from scipy.spatial import cKDTree
 from towns import town_model
 
 import gsparc
-from gsparc.apps.maps.covariance import ErrorCovariance
+from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
 from gsparc.data.errors import DataError
+from gsparc.models.method import JointLevels
+from gsparc.prediction.jointly import JointMixin
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +26,11 @@ def predictor():
 def test_gains_are_what_conditioning_takes_away():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
-    one = ErrorCovariance(root @ root.T, 0.3, np.ones(6))
+    one = ErrorCovariance(root @ root.T, 0.3, np.full(6, 0.3), np.ones(6))
     every = np.ones(6, bool)
     gains, before = one.variance_reductions(every), one.variances().sum()
     for place in range(6):
-        twin = ErrorCovariance(one.covariance.copy(), 0.3, np.ones(6))
+        twin = ErrorCovariance(one.covariance.copy(), 0.3, one.measured, np.ones(6))
         twin.condition_on(place)
         assert before - twin.variances().sum() == pytest.approx(gains[place])
 
@@ -77,6 +79,45 @@ def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predi
     assert cKDTree(known + predictor.site.origin).query(found.at)[0].max() <= reach + found.grid.step < 10
     assert found.places[:, 0].max() < 50 and not found.grid.inside[:, -1].any()
     assert plan_measurements(predictor, 6, [0, 0, 80, 60], promise=promise).at[:, 0].max() > 70
+
+
+def promised(predictor, count, stations):
+    """Evidence of rows that list so many of the two stations at each of `count` places."""
+    rng, rows = np.random.default_rng(0), np.arange(count * stations)
+    level = rng.normal(size=len(rows))
+    evidence = Evidence(level, 0 * level, 1 + 0 * level, rows / 10, rows, rows % 2, rows < 0)
+    known = np.column_stack([rng.uniform(0, [40, 60], (count, 2)), np.full(count, 1.5)])
+    known = np.repeat(known - predictor.site.origin, stations, 0)
+    return Promise(evidence, known, rows % 2, 5.0)
+
+
+def test_a_plan_promised_what_lists_of_the_strongest_cannot_give(predictor):
+    """A place counted as a measurement of all stations, of 24 cells of which 6 are listed."""
+    area, names = [0, 0, 80, 60], predictor.site.stations.name
+    whole, lists = (promised(predictor, 120, count) for count in (2, 1))
+    assert whole.stations_of_place() == 2 and lists.stations_of_place() == 1
+    gains = []
+    for promise in (whole, lists):
+        found = plan_measurements(predictor, 6, area, promise=promise)
+        gains.append(found.before_db - found.after_db)
+    assert 0 < gains[1] < 0.8 * gains[0]
+    places = np.array([[12.0, 20, 1.5], [68, 45, 1.5]])  # beside either mast
+    measured = [one.measured for one in error_covariances(predictor, places, names, lists)]
+    assert np.isinf(measured).tolist() == [[False, True], [True, False]]
+
+
+def test_a_station_that_is_not_listed_was_learned_nothing_of_by_its_sites_others():
+    class Sectors(JointMixin):
+        def predict_joint(self, places, stations):
+            field = np.array([[4.0, 3.2, 0], [3.2, 4, 0], [0, 0, 4]])
+            known = np.tile(field + np.eye(3), (len(places), 1, 1))
+            return JointLevels(np.zeros((len(places), 3)), known, np.ones(3))
+
+    listed = np.array([[True, False, False]] * 2)
+    own, beside, apart = Sectors().noise_by_others(np.zeros((2, 3)), [0, 1, 2], listed)[0]
+    left = 4 - 3.2**2 / (4 + 1)  # variance of the second given the first
+    assert own == pytest.approx(0) and 4 - 4**2 / (4 + 1 + beside) == pytest.approx(left)
+    assert apart > 1e9
 
 
 def test_a_long_walk_for_nothing_was_not_called_so(predictor):

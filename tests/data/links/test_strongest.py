@@ -154,3 +154,26 @@ def test_lost_levels_are_below_no_floor(share):
     for level in (off, np.where(rng.random(off.shape) < share, np.nan, one.measured)):
         arrays = {"rx_position": one.moment, "station_position": one.place, "rssi_db": level}
         assert interpret(Raw(arrays), "drive").data.censored is None
+
+
+def test_silence_was_believed_of_lists_of_the_strongest():
+    """`check` said good; the law's exponent became 4.7 for 3.7, listed rows were off by 9.6 for 7.0 dB."""
+    arrays = network(0).arrays(6)
+    reading = interpret(Raw(arrays, {"absent": "silent"}), "drive")
+    (severe,) = [note for note in reading.notes if isinstance(note, Severe)]
+    assert severe.startswith("lists of the 6 strongest of 30 stations with dataset.absent=silent: what full ")
+    least = f"{arrays['rssi_db'].min():.4g}"
+    assert severe.endswith(f" dB), not all below {least}: predictions are too low; leave absent out")
+    heard = network(0).measured > np.quantile(network(0).measured, 0.6)  # all that is heard: no such lists
+    level = np.where(heard, network(0).measured, np.nan)
+    wide = {"rx_position": network(0).moment, "station_position": network(0).place, "rssi_db": level}
+    assert not [n for n in interpret(Raw(wide, {"absent": "silent"}), "drive").notes if isinstance(n, Severe)]
+
+
+def test_what_lists_leave_out_was_called_not_heard():
+    """The same rows were `unlisted` in one line and `not heard` in the next."""
+    arrays = network(0).arrays(6)
+    floor = np.array(np.quantile(arrays["rssi_db"], 0.3))
+    for more, said in (({}, "not listed"), ({"sensitivity_db": floor}, "not listed or not heard")):
+        notes = interpret(Raw(arrays | more), "drive").notes
+        assert len([note for note in notes if f"powers were {said}: below" in note]) == 1

@@ -18,6 +18,7 @@ import torch
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from gsparc.data.checks.plausibility import find_noise
 from gsparc.data.errors import Caution
 from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
@@ -134,10 +135,14 @@ def learn_network(
         network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
         levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
     )  # fmt: skip
+    # A receiver's noise is no level of a sector: no azimuth is doubted by it.
+    piles = find_noise(sector_of(loud.places), loud.decibels).values()
+    top = max((top for top, _ in piles), default=-math.inf)
+    quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side))
     with nullcontext() if budget is None else end_when(budget.is_spent):
-        rough, gains, scale = _fit_rough(few, start)
-        turned, notes = _correct_azimuths(few, rough, gains, scale, names)
-        if notes:
+        rough, gains, scale = _fit_rough(quiet, start)
+        turned, notes = _correct_azimuths(quiet, rough, gains, scale, names)
+        if notes or piles:
             rough, gains, scale = _fit_rough(few, turned)
         trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
     shadowing = cast(SectorShadowing, kernel.terms[0])
@@ -200,7 +205,7 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
 def _correct_azimuths(
     rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
 ) -> tuple[Sectors, list[str]]:
-    """Azimuths that rows contradict turned to where they fit, and a note of each."""
+    """Azimuths that rows contradict turned to where they fit, and a note that names all."""
     table, notes = trend.table.clone(), list[str]()
     for t in range(len(table)):
         part = rows.subset(np.flatnonzero(sector_of(rows.places) == t))
@@ -216,12 +221,10 @@ def _correct_azimuths(
         gained, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
         if abs(said) >= CONTRADICTED_DEG and gained > SURE[0] + SURE[1] * len(part.index):
             found = float((table[t, 0] + said) % ROUND_DEG)
-            notes.append(Caution(
-                f"azimuth of {names[t]}: {float(table[t, 0]):.0f} deg is contradicted by its levels, which "
-                f"fit {found:.0f} deg, used instead"
-            ))  # fmt: skip
+            notes.append(f"{names[t]} ({float(table[t, 0]):.0f} deg: levels fit {found:.0f})")
             table[t, 0] = found
-    return replace(trend, table=table), notes
+    every = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(notes)}"
+    return replace(trend, table=table), [Caution(every)] if notes else []
 
 
 def _fit_by_evidence(
