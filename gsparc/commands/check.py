@@ -108,7 +108,7 @@ def read_settings(words: Sequence[str]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; exit status 0 when everything given is good, else 1."""
+    """Run the command; exit status 0 when everything given is good, else 1."""
     own = files("gsparc.conf").joinpath("dataset/own.yaml").read_text(encoding="utf-8")
     told = f"settings dataset.KEY=VALUE, as training takes them:\n\n{own[own.index('stations: ') :]}"
     parser = argparse.ArgumentParser(

@@ -23,7 +23,7 @@ def describe_set(one: PublicSet) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; exit status 0 when everything named is there, else 1."""
+    """Run the command; exit status 0 when everything named is there, else 1."""
     parser = argparse.ArgumentParser(prog="gsparc data", description=__doc__)
     parser.add_argument("name", nargs="*", help=f"sets to fetch, from GitHub or from the mirror {MIRROR}")
     parser.add_argument("accept", nargs="?", help="accept=true: also where the makers state no licence")

@@ -387,5 +387,5 @@ def task(config: DictConfig) -> float:
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command."""
     cli.run(task, "train")

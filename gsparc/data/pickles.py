@@ -71,7 +71,7 @@ class _Unpickler(pickle.Unpickler):
         self.stand_ins = stand_ins
 
     def find_class(self, module: str, name: str) -> Any:
-        """What builds an array, or the stand-in; nothing else is imported."""
+        """Return what builds an array, or the stand-in; nothing else is imported."""
         plain = module.replace("numpy._core", "numpy").replace("numpy.core", "numpy")
         if f"{plain}.{name}" in ARRAYS:
             return ARRAYS[f"{plain}.{name}"]

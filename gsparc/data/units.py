@@ -124,5 +124,5 @@ class PowerUnit:
 
 
 def power_in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
+    """Return the mean and deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
     return 10 * np.log10(mean), DB * np.sqrt(variance) / mean

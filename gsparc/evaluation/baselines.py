@@ -22,7 +22,7 @@ BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 
 
 def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
-    """Names of all plain methods that serve these measurements and rows."""
+    """Return names of all plain methods that serve these measurements and rows."""
     site, names = data.site, BASELINES
     if site.kind == "rssi":
         # Both fit decibels over distance, which only powers have.

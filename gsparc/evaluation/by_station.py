@@ -18,7 +18,7 @@ ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones w
 
 
 def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
-    """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
+    """Return RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
 
     Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
     """

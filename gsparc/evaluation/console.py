@@ -31,7 +31,7 @@ PATH = r"^\S*/\S*: "  # at its head
 
 
 def open_console() -> Console:
-    """Console without line breaks in sentences; tables as wide as the terminal, or `WIDE` in a log.
+    """Open a console without line breaks in sentences; tables as wide as the terminal, or `WIDE` in a log.
 
     Without markup: square brackets of a path or a title are no style.
     """
@@ -138,7 +138,7 @@ def config_folder() -> Path:
 
 
 def list_choices(group: str) -> list[str]:
-    """Every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
+    """List every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
     folder = config_folder() / group
     own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
     stored = ConfigStore.instance().repo.get(group, {})

@@ -109,7 +109,7 @@ def panels(
 
 
 def set_log_axis(axes: Any, decades: float = 3.0) -> None:
-    """Horizontal axis in decades, with plain numbers also between them where it has fewer `decades`.
+    """Set the horizontal axis in decades, with plain numbers also between them where it has fewer `decades`.
 
     Linear where nothing is above zero.
     """

@@ -165,7 +165,8 @@ def _about(
 def time_methods(
     methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings | None = None
 ) -> dict[str, float | int | str | None]:
-    """`time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others, timed in turns.
+    """Return `time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others,
+    timed in turns.
 
     Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
@@ -197,7 +198,7 @@ def time_methods(
 
 
 def dataset_facts(data: Measurements) -> dict[str, Any]:
-    """`dataset/*`."""
+    """Return `dataset/*`."""
     names = ("name", "sha256", "stand_in", "convergence_error", "freedom")
     seconds = data.provenance.get("simulate_s")
     return {
@@ -210,7 +211,7 @@ def dataset_facts(data: Measurements) -> dict[str, Any]:
 
 
 def split_facts(split: Split) -> dict[str, Any]:
-    """`split/*`; counts are sums over folds."""
+    """Return `split/*`; counts are sums over folds."""
     counts = {f"split/{k}": sum(len(getattr(f, k)) for f in split.folds) for k in ("train", "val", "test")}
     hashes = {"split/sha256": split.sha256, "split/test_sha256": hash_indices(split.folds, ["test"])}
     return {"split/name": split.name, **hashes, "split/folds": len(split.folds), **counts}

@@ -20,7 +20,9 @@ OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
 def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, **labels: str) -> None:
-    """Equal scales from corner (2,) to corner (2,) [m], in plain numbers about an `origin` that axes name."""
+    """Set equal scales from corner (2,) to corner (2,) [m],
+    in plain numbers about an `origin` that axes name.
+    """
     names = {"xlabel": "x [m]", "ylabel": "y [m]"}
     if origin is not None:
         where = f"{abs(origin.longitude):g}° {'E' if origin.longitude >= 0 else 'W'}"
@@ -34,7 +36,9 @@ def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, *
 
 
 def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of a map: the known ones of places (n, 2) and a share of their extent around them."""
+    """Return corners (2,) of a map: the known ones of places (n,
+    2) and a share of their extent around them.
+    """
     known = places[np.isfinite(places).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
     # 1 mm: a single place, or places at one point, have a frame all the same.
@@ -43,7 +47,7 @@ def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.nd
 
 
 def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", **how: Any) -> None:
-    """Marks at places (n, 2) [m], black unless `how` says another colour."""
+    """Mark places (n, 2) [m], black unless `how` says another colour."""
     marks = {"marker": "^", "color": "k", "markersize": 9, "markeredgecolor": "white", "linestyle": ""}
     axis.plot(*places.T, label=label, **{**marks, "zorder": 4, **how})
 
@@ -58,7 +62,7 @@ def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
 
 
 def draw_measured(axis: Any, places: np.ndarray) -> None:
-    """Places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
+    """Mark places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
     if len(places):
         few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
         # By the root of their number, so that the area that marks hide stays the same.
@@ -68,7 +72,7 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
 
 
 def draw_walls(axis: Any, triangles: np.ndarray) -> None:
-    """Upright triangles (n, 3, 3) [m] as lines; at most `MOST_WALLS`, the longest."""
+    """Draw upright triangles (n, 3, 3) [m] as lines; at most `MOST_WALLS`, the longest."""
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     # .1 = sin 6 degrees from upright; 1e-12 m^2 keeps triangles without area from dividing by 0.
     upright = triangles[np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1).clip(1e-12)][:, :, :2]

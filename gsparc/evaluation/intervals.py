@@ -16,7 +16,7 @@ SHARE = 0.9  # of the truth that an interval is to hold
 
 
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """Figures of predicted normal distributions of decibels; empty where the method has no variance.
+    """Return figures of predicted normal distributions of decibels; empty where the method has no variance.
 
     `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
@@ -72,7 +72,8 @@ def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float |
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number, if any.
+    """Return RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number,
+    if any.
 
     That of heard rows alone says nothing of levels that are not heard.
     """
@@ -83,7 +84,8 @@ def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | No
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies and `reduced_chi_squared`; of powers `rmse_with_silent`, `power_intervals`, `best_server`.
+    """Return accuracies and `reduced_chi_squared`; of powers `rmse_with_silent`, `power_intervals`,
+    `best_server`.
 
     Of stations held out also the errors left after a constant of each.
     """

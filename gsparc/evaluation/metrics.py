@@ -204,7 +204,7 @@ class PowerMetrics(SampleMetric):
         return {"prediction": p, "target": t if mask is None else t.masked_fill(~mask.flatten(), torch.nan)}
 
     def compute(self) -> dict[str, np.ndarray]:
-        """Adds `power_errors`."""
+        """Add `power_errors`."""
         raw = super().compute()
         return {**raw, **power_errors(raw["prediction"], raw["target"])}
 
@@ -228,7 +228,9 @@ class PowerMetrics(SampleMetric):
 
 
 def power_errors(p: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
-    """`error_db`, `error_power`, `target_power`, `mse` (S,) of predictions and targets (S,), linear."""
+    """Return `error_db`, `error_power`, `target_power`, `mse` (S,) of predictions and targets (S,),
+    linear.
+    """
     positive = t > 0
     # A power of 0 or less has no decibels: it counts as the weakest that was measured.
     floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny

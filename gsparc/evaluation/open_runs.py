@@ -74,7 +74,7 @@ class Opened:
     trained: tuple[Measurements, Split] | None = None
 
     def facts(self) -> dict[str, Any]:
-        """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
+        """Return `dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
         own = {"split/foreign": self.doubt, "model/name": self.methods[0].name}
         return dataset_facts(self.data) | split_facts(self.split) | own
 

@@ -43,7 +43,7 @@ class Scores:
     variance: np.ndarray
 
     def figures(self) -> dict[str, float | None]:
-        """Flat figures over all folds together."""
+        """Return flat figures over all folds together."""
         return METRICS[self.kind].summary(self.samples)
 
     def dominant_row(self) -> dict[str, Any]:
@@ -70,7 +70,10 @@ class Scores:
 def errors_with_silent(
     samples: Mapping[str, np.ndarray], row: np.ndarray, data: Measurements
 ) -> dict[str, np.ndarray]:
-    """`error_db_with_silent` (S,): of silent rows what predictions exceed their level; {} where none is."""
+    """Return `error_db_with_silent` (S,): of silent rows what predictions exceed their level.
+
+    {} where none is.
+    """
     side = data.censored_side(row)
     if data.site.kind != "rssi" or not side.any():
         return {}
@@ -80,7 +83,7 @@ def errors_with_silent(
 
 
 def rows_to_score(fold: Fold, eval_on: str) -> np.ndarray:
-    """Rows of the subset `train`, `val` or `test`.
+    """Return rows of the subset `train`, `val` or `test`.
 
     Raises:
         ValueError: another name, or an empty subset.
@@ -94,7 +97,9 @@ def rows_to_score(fold: Fold, eval_on: str) -> np.ndarray:
 
 
 def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
-    """Numbers (R,) of runs with channels among the rows `eval_on` and none among those learned from."""
+    """Return numbers (R,) of runs with channels among the rows `eval_on` and none among those learned
+    from.
+    """
     if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
     # Rows of `val` are not among those learned from where they are the ones scored.

@@ -49,7 +49,9 @@ class Spots:
 
 
 def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
-    """Places of the moving end (of the receiver where both move), the levels there and what looks wrong."""
+    """Return places of the moving end (of the receiver where both move),
+    the levels there and what looks wrong.
+    """
     site = data.site
     of_row = data.moving[:, -3:]
     # np.unique sorts by coordinate; `first` leads back to the order of measuring.
@@ -147,7 +149,7 @@ def _title(data: Measurements, places: Spots) -> str:
 
 
 def static_positions(data: Measurements) -> np.ndarray:
-    """World x and y (T, 2) of the ends that stand still, where that is known."""
+    """Return world x and y (T, 2) of the ends that stand still, where that is known."""
     site = data.site
     if site.stations is not None:
         place = site.stations.position

@@ -114,12 +114,15 @@ def new_run_id() -> str:
 
 
 def provenance() -> dict[str, str | None]:
-    """`git`: commit of the source tree (`-dirty` when edited, None outside one); `versions`: what matters."""
+    """Return `git`: commit of the source tree (`-dirty` when edited, None outside one).
+
+    `versions`: what matters.
+    """
     return {"git": _git(), "versions": _versions()}
 
 
 def program_version(origin: Mapping[str, str | None]) -> str:
-    """`gsparc 0.1.0`, and the commit of `provenance()` where there is a source tree."""
+    """Return `gsparc 0.1.0`, and the commit of `provenance()` where there is a source tree."""
     commit = origin["git"]
     return f"gsparc {version('gsparc')}" + (f" at commit {commit[:8]}" if commit else "")
 
@@ -150,7 +153,9 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Remarks on a table: rows that are not unseen, stand-ins, a busy machine, a baseline that is better."""
+    """Return remarks on a table: rows that are not unseen, stand-ins, a busy machine,
+    a baseline that is better.
+    """
     seen = {
         "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
         "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
@@ -184,7 +189,9 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
-    """No test, stand-ins, rows that were learned from, a training that seconds ended, and a busy machine."""
+    """Say what limits figures: no test, stand-ins, rows that were learned from,
+    a training that seconds ended, and a busy machine.
+    """
     conditions = []
     if facts.get("split/name") == "none" and not facts.get("split/test"):
         count = facts["split/train"] + facts["split/val"]

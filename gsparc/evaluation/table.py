@@ -38,7 +38,7 @@ class Interval:
         return [[max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)]
 
     def text(self, form: str = ".2f") -> str:
-        """`29.08 [27.4, 30.6]`, or `29.08 ± 0.30`."""
+        """Return `29.08 [27.4, 30.6]`, or `29.08 ± 0.30`."""
         ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
         error = "" if self.error is None or math.isnan(self.error) else f" ± {self.error:{form}}"
         return f"{to_text(self.value, form)}{ends}{error}"
@@ -133,7 +133,7 @@ class Table:
         return [column.name for column in self.columns], rows
 
     def csv(self) -> str:
-        """Comma-separated, an interval as a column for each part that it has."""
+        """Return it comma-separated, an interval as a column for each part that it has."""
         parts: dict[str, list[Any]] = {}
         for number, column in enumerate(self.columns):
             cells = [row[number] for row in self.rows]

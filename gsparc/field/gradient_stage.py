@@ -92,14 +92,17 @@ class ReportSteps(L.Callback):
     """Steps of training as a metric: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
-        """Also after a checkpoint with every step done; of an unfinished schedule, what was taken is kept."""
+        """Save, also after a checkpoint with every step done.
+
+        Of an unfinished schedule, what was taken is kept.
+        """
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
         if trainer.global_step < module.total_steps:
             trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
 
 
 def step_is_complete(trainer: L.Trainer) -> bool:
-    """Whether a step is done with, at the end of its batch or of its look at validation rows.
+    """Tell whether a step is done with, at the end of its batch or of its look at validation rows.
 
     Lightning leaves out a look that follows, where a run goes on from a state before it.
     """

@@ -93,12 +93,12 @@ def _blur(images: Tensor) -> Tensor:
 
 
 def fits_ssim_window(images: Tensor | np.ndarray) -> bool:
-    """Whether images (..., H, W) are as large as the window of `ssim`, 11 x 11."""
+    """Tell whether images (..., H, W) are as large as the window of `ssim`, 11 x 11."""
     return min(images.shape[-2:]) > 2 * WINDOW_RADIUS
 
 
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5, data range 1.
+    """Return the mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5, data range 1.
 
     Args:
         prediction, target: (B, H, W) in [0, 1].
@@ -148,7 +148,8 @@ def task_loss(prediction: Tensor, batch: Batch, settings: LossSettings) -> Tenso
 def channel_loss(
     prediction: Tensor, target: Tensor, mask: Tensor | None = None, snapshot: Snapshot = "none"
 ) -> Tensor:
-    """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,).
+    """Return the mean squared error of complex channels scaled to unit power (paper, eq. 5): (B,
+    ...) -> (B,).
 
     Args:
         prediction, target: alike; (B, A, K) complex where snapshots have offsets.

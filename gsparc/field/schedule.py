@@ -22,7 +22,7 @@ def to_steps(given: int | float, total: int) -> int:
 
 
 def acts_at_step(step: int, start: int | float, stop: int | float, interval: int | float, total: int) -> bool:
-    """Whether a callback acts at a step: on a multiple of `interval` from `start` to `stop`.
+    """Tell whether a callback acts at a step: on a multiple of `interval` from `start` to `stop`.
 
     Where the interval is a share, not before `FIRST` steps were taken: a training that short has gradients of
     its initial weights alone, and would not recover.

@@ -172,7 +172,9 @@ class _Rows:
     length: float
 
     def align_along_tree(self, direct_wave: np.ndarray | None) -> np.ndarray:
-        """Factors (n, K) that turn each row to the next of a tree of near places, about a direct wave."""
+        """Return factors (n, K) that turn each row to the next of a tree of near places,
+        about a direct wave.
+        """
         values = self.values if direct_wave is None else self.values * direct_wave.conj()
         factors = np.ones((len(values), len(self.tones)), np.complex128)
         trunk = covering_rows(self.places, TREE, 0)

@@ -157,7 +157,7 @@ class Origin:
         return {"data": self.site.sha256, "auxiliary": self.auxiliary, "rows": self.rows}
 
     def require_same(self, stored: Stored) -> None:
-        """Whether training may go on from `stored`; settings of its schedule that changed are logged.
+        """Tell whether training may go on from `stored`; settings of its schedule that changed are logged.
 
         Raises:
             ValueError: it is of other data, rows, seed or settings, which are named.

@@ -103,7 +103,7 @@ class MethodFactory(ABC):
         return "" if budget_s is None else f"within {budget_s:g} s"
 
     def learns_jointly(self, site: Site) -> bool:
-        """Whether it learns several stations of this site at once, told which by `Query.station`."""
+        """Tell whether it learns several stations of this site at once, told which by `Query.station`."""
         return False
 
     def choose_stations(

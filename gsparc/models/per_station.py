@@ -367,7 +367,7 @@ class AllStationsView(OneStationView):
         self.count = count
 
     def predict(self, query: Query) -> Prediction:
-        """Mean and variance (B, T); the ends that stand are not read."""
+        """Return the mean and variance (B, T); the ends that stand are not read."""
         rows = torch.arange(len(query)).repeat_interleave(self.count)
         station = torch.arange(self.count).repeat(len(query))
         said = self.inner.predict(replace(query.rows(rows), station=station))

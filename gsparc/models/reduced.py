@@ -87,7 +87,7 @@ class View(Method):
         return self.inner.objects()
 
     def fit(self, *unused: Any, **options: Any) -> NoReturn:
-        """Refused: `TypeError`."""
+        """Refuse: `TypeError`."""
         raise TypeError("a view of a trained method is neither trained nor stored")
 
     # Refused as well: what is stored is the whole method.

@@ -40,7 +40,7 @@ class RunFactors(Stored):
 
     @staticmethod
     def has_several_runs(data: Measurements, rows: np.ndarray) -> bool:
-        """Whether rows (n,) are channels of more than one run."""
+        """Tell whether rows (n,) are channels of more than one run."""
         return data.site.kind == "csi" and data.run is not None and len(np.unique(data.run[rows])) > 1
 
     def __len__(self) -> int:

@@ -196,7 +196,7 @@ def _require_paths(method: Method) -> SeparatesPaths:
 
 
 def uplink_query(method: Method, site: Site, uplink: Any) -> Query:
-    """Uplinks (B, U, L) or (U, L) in physical units, from places that nobody says."""
+    """Return uplinks (B, U, L) or (U, L) in physical units, from places that nobody says."""
     if not isinstance(method, UplinkMethod):
         raise ValueError(f"uplink=: {method.name} reads no uplink; give tx= or rx=")
     if site.uplink_array is None or site.uplink_hz is None:

@@ -250,9 +250,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return lambda number: ask(**dict(zip(ends, world[number % len(world)], strict=True)))
 
     def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
-        """Return what arrives by direction at the receiver, (B, H, W) float32 in [0, 1], as it was measured.
+        """Return amplitudes by direction at the receiver, (B, H, W) float32 in [0, 1], as they were measured.
 
-        Amplitudes where the measurements are (their square is the power), 1 the largest of all stored ones or
+        Their square is the power; 1 is the largest of all stored ones or
         of its own image, as the file was scaled. Row i is an elevation of the receiver, column j an azimuth:
         i x 90/H and j x 360/W degrees unless the file gives `grid_deg`. (H, W) of a single place.
 

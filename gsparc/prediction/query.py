@@ -212,7 +212,7 @@ def _float(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
 def query_ends(
     site: Site, places: np.ndarray, other_end: Sequence[float] | None, station: np.ndarray | None = None
 ) -> dict[End, np.ndarray]:
-    """World places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
+    """Return world places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
 
     `other_end` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
 
@@ -231,7 +231,7 @@ def query_ends(
 
 
 def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
-    """(3,) [m] of the setting `name`, with 2 `axes` also (2,); `DataError` where it is no place."""
+    """Return (3,) [m] of the setting `name`, with 2 `axes` also (2,); `DataError` where it is no place."""
     place = finite_array(value)
     if place.shape not in ((axes,), (3,)):
         raise DataError(f"{name}={value}: {('two', 'three')[axes - 2]} finite numbers [m] are needed")
@@ -239,7 +239,7 @@ def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
 
 
 def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) -> np.ndarray:
-    """World places (n, 3) of the moving end as local ones, (n, 6) of both ends where both moved [m].
+    """Return world places (n, 3) of the moving end as local ones, (n, 6) of both ends where both moved [m].
 
     Raises:
         DataError: both moved, and nobody says where the other end stands.

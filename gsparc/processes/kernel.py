@@ -331,5 +331,5 @@ class Kernel(Stored):
 
 
 def to_number(value: Tensor) -> Tensor | float:
-    """A tensor () as it is where gradients flow, else its number."""
+    """Return a tensor () as it is where gradients flow, else its number."""
     return value if value.requires_grad else float(value)

@@ -209,7 +209,7 @@ class RayTracer(Engine):
         generate, stored = solver._candidate_generator, list[Any]()
 
         def counted(**arguments: Any) -> Any:
-            """Keeps how many candidates there are, which the solver does not report."""
+            """Keep how many candidates there are, which the solver does not report."""
             buffer = generate(**arguments)
             stored.append(buffer.paths_counter)
             return buffer

@@ -74,7 +74,7 @@ NOTHING = Spent()
 
 
 def worst_clock(*clocks: Clock | None) -> Clock | None:
-    """Of clocks that decided something, return the one whose seconds repeat results worst; None of none."""
+    """Return, of clocks that decided something, the one whose seconds repeat results worst; None of none."""
     return "wall" if "wall" in clocks else next(filter(None, clocks), None)
 
 
@@ -142,7 +142,7 @@ class TimeBudget:
         self._since = Spent(self._since.wall, 0.0)
 
     def is_spent(self) -> bool:
-        """Whether it is spent; whoever asks then ends what it does."""
+        """Tell whether it is spent; whoever asks then ends what it does."""
         result = self.spent > self.seconds
         # For good: what it ended stays ended, though time may be charged later.
         self.limited |= result

@@ -47,7 +47,7 @@ class Channels:
     source: str
 
     def select_positions(self, index: np.ndarray) -> Channels:
-        """Some of the positions."""
+        """Return some of the positions."""
         at = torch.from_numpy(index)
         rest = self.variance[at], self.confidence[at], self.source
         return Channels(self.true[at], self.predicted[at], *rest)
@@ -61,7 +61,8 @@ def predict_channels(
     method: Method, data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray,
     antennas: slice = slice(None),
 ) -> Channels:  # fmt: skip
-    """True and predicted channels of rows (n,) at absolute frequencies (K,) [Hz], of some of the antennas.
+    """Return true and predicted channels of rows (n,) at absolute frequencies (K,) [Hz],
+    of some of the antennas.
 
     Raises:
         ValueError: a frequency outside the measured band.
@@ -88,7 +89,7 @@ def predict_channels(
 
 
 def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
-    """True channels (n, A, K) in the data's units and frame, and how they were come by."""
+    """Return true channels (n, A, K) in the data's units and frame, and how they were come by."""
     assert data.site.subcarriers_hz is not None
     if data.site.name == "argos-sim" and data.uplink is not None:
         return _of_streets(data, rows, frequency_hz), "rays"
@@ -97,7 +98,7 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
 
 
 def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
-    """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
+    """Return evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     error, own = errors_and_scores(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
     return Evidence(rows, data.moving[rows], error, own | position_scores(data, fold, data.moving[rows]))
 

@@ -32,7 +32,7 @@ LEAST_RATE = 3e-4
 
 
 def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
-    """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
+    """Draw BLER above, BER below, a column a modulation; bars are 95 % intervals."""
     figure, axes = panels(5.6 * len(rates), 8, 2, len(rates), grid=False)
     for column, (modulation, curves) in enumerate(rates.items()):
         for name, (label, colour, line) in STYLES.items():
@@ -58,7 +58,7 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
 
 
 def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
-    """Throughput over noise, and the confidence of right and wrong choices."""
+    """Draw throughput over noise, and the confidence of right and wrong choices."""
     figure, ((left, right),) = panels(11, 4, 1, 2)
     for name, (style, label) in RATES.items():
         mean = [getattr(one, name).mean() / 1e6 for one in rates]
@@ -76,7 +76,9 @@ def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) ->
 
 
 def draw_acceptance(acceptance: Mapping[str, tuple[float, pd.DataFrame]], share: float, path: Path) -> None:
-    """Block error rate of the surest share of positions, as of `acceptance`, a panel a modulation."""
+    """Draw the block error rate of the surest share of positions, as of `acceptance`,
+    a panel a modulation.
+    """
     figure, grid = panels(5.5 * len(acceptance), 4, 1, len(acceptance))
     for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
         for name in rates:

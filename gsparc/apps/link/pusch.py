@@ -148,7 +148,9 @@ class _Wiener:
 
 
 def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: float, count: int) -> np.ndarray:
-    """Normalised correlation over frequency at lags 0 to count - 1 of `spacing_hz`, from channels (n, K)."""
+    """Return the normalised correlation over frequency at lags 0 to count - 1 of `spacing_hz`,
+    from channels (n, K).
+    """
     if len(tones_hz) == 1:
         return np.ones(count, complex)
     # Each channel to power 1, so that strong places do not decide the correlation.

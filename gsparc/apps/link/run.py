@@ -76,7 +76,10 @@ class LinkStudy:
         }  # fmt: skip
 
     def beams(self) -> dict[str, Any]:
-        """`beams/*` of all test positions, as nothing of a beam was chosen on any; empty for one antenna."""
+        """Return `beams/*` of all test positions, as nothing of a beam was chosen on any.
+
+        Empty for one antenna.
+        """
         if self.data.target.shape[1] == 1:
             return {}
         every = predict_channels(self.method, self.data, self.fold.test, self.tones)
@@ -85,7 +88,7 @@ class LinkStudy:
         return study.beam_facts(every.true, every.predicted, accepted)
 
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:
-        """Rate adaptation at every noise level and its facts."""
+        """Return rate adaptation at every noise level and its facts."""
         own, other = (
             predict_channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
@@ -96,7 +99,7 @@ class LinkStudy:
     def send(
         self, modulation: str, levels: list[float]
     ) -> tuple[dict[str, pd.DataFrame], tuple[float, pd.DataFrame], dict[str, Any]]:
-        """`curves`, `acceptance` and facts of blocks at every Eb/N0 [dB]."""
+        """Return `curves`, `acceptance` and facts of blocks at every Eb/N0 [dB]."""
         begun = time.perf_counter()
         # Only training rows: the estimator's correlation must not know test channels.
         heard = self.data.targets(self.fold.train)[:, self.antenna]

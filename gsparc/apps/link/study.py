@@ -34,7 +34,9 @@ def find_crossing(rate: pd.Series, target: float = 0.1) -> float | None:
 
 
 def beam_gain(true: Tensor, predicted: Tensor) -> Tensor:
-    """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
+    """Return the power gain over one average antenna, beams from `predicted` (n, A, K):
+    mean over tones (n,), linear.
+    """
     # Maximum ratio transmission: the conjugate prediction, normalised per tone.
     weight = predicted / torch.linalg.vector_norm(predicted, dim=1, keepdim=True).clamp_min(1e-30)
     received = (true * weight.conj()).sum(1).abs().square()
@@ -50,7 +52,7 @@ def beam_loss_db(true: Tensor, predicted: Tensor) -> Tensor:
 
 
 def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
-    """`beams/<antennas>/*`: gain of true and predicted beams, and the loss [dB]; 8 and all antennas.
+    """Return `beams/<antennas>/*`: gain of true and predicted beams, and the loss [dB]; 8 and all antennas.
 
     Positions whose channel is silent have no beam: they are counted in `beams/silent` and left out.
 
@@ -83,7 +85,7 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
 
 
 def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Rates]:
-    """Rates at noise levels that put the median position at `snr_db` of the settings.
+    """Return rates at noise levels that put the median position at `snr_db` of the settings.
 
     Args:
         band: of the positions to be judged.
@@ -106,7 +108,7 @@ def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Ra
 
 
 def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
-    """`mcs/<snr>dB/*`: throughput against the oracle.
+    """Return `mcs/<snr>dB/*`: throughput against the oracle.
 
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
     most; of all positions, of accepted ones, and of all where the others send pilots.
@@ -140,7 +142,7 @@ def _shortfall(chosen: np.ndarray, oracle: np.ndarray) -> float | None:
 
 
 def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int, int, int]) -> pd.DataFrame:
-    """Blocks at every Eb/N0, as of `Pusch.run`: a few everywhere, all where curves fall.
+    """Send blocks at every Eb/N0, as of `Pusch.run`: a few everywhere, all where curves fall.
 
     Args:
         band: of the positions that blocks are sent over, by turns.
@@ -161,7 +163,7 @@ def send_blocks(pusch: Pusch, band: Band, levels: list[float], sizes: tuple[int,
 
 
 def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.DataFrame]:
-    """Each receiver's curve on all and on accepted positions, and prediction with fallback on all.
+    """Return each receiver's curve on all and on accepted positions, and prediction with fallback on all.
 
     A curve's index is the Eb/N0 [dB], its columns `bler`, `ber` (NaN without a block), `errors`, `blocks`.
     """
@@ -180,7 +182,9 @@ def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.Dat
 
 
 def pusch_facts(modulation: str, rates: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
-    """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
+    """Return `pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %,
+    and how far behind perfect.
+    """
     facts: dict[str, Any] = {}
     crossings = {name: find_crossing(curve.bler) for name, curve in rates.items()}
     for name, curve in rates.items():

@@ -198,7 +198,7 @@ def sample_rows(config: DictConfig, count: int) -> np.ndarray:
 
 
 def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np.ndarray, path: Path) -> None:
-    """Masses of the cells of a few snapshots from above, as one PNG.
+    """Draw masses of the cells of a few snapshots from above, as one PNG.
 
     `true` (n, 3) [m] in the coordinates of `found`, or None; `known` (m, 3): places learned from.
     """

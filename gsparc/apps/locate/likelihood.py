@@ -70,7 +70,7 @@ class Trust:
     worst: float = math.inf
 
     def log_likelihood(self, misfit: Misfit) -> Tensor:
-        """(n, G), up to a constant of each snapshot."""
+        """Return log likelihoods (n, G), up to a constant of each snapshot."""
         squared = self.temperature / self.inflation * misfit.squared
         count = self.temperature * misfit.count[:, None]
         # log1p: for small misfits the logarithm of 1 + x loses the digits of x.

@@ -92,7 +92,7 @@ class Locator:
         return replace(self, cells=self.wider)
 
     def search_cells(self, heard: Snapshots, trust: Trust, before: Search | None = None) -> Search:
-        """One snapshot's misfit at cells that are halved as long as few of them hold the mass.
+        """Return one snapshot's misfit at cells that are halved as long as few of them hold the mass.
 
         `before`: the same under another trust, whose cells are halved further.
         """

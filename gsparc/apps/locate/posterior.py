@@ -67,7 +67,7 @@ class Posterior:
         return float(np.log(self._parts(place[None])[0].sum() + rest + LEAST))
 
     def mass_above(self, place: np.ndarray) -> float:
-        """Mass of all cells more likely than a place (3,), and half of that of those as likely."""
+        """Return the mass of all cells more likely than a place (3,), and half of that of those as likely."""
         here, mass = self.log_density_at(place), self.mass
         # Half of those as likely, so that equal densities have a level in the middle of their mass.
         return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())

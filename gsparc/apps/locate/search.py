@@ -36,7 +36,7 @@ class Search:
     misfit: Misfit
 
     def log_density(self, trust: Trust) -> np.ndarray:
-        """(G,) of total mass 1."""
+        """Return log densities (G,) of total mass 1."""
         log_like, log_size = trust.log_likelihood(self.misfit)[0], torch.from_numpy(np.log(self.cells.volume))
         return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
 

@@ -44,7 +44,7 @@ class Snapshots:
 
 
 def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
-    """Rows (m,) of measurements as snapshots: rows of one place at different stations are one.
+    """Return rows (m,) of measurements as snapshots: rows of one place at different stations are one.
 
     Of several visits of a station to a place the first is of the first snapshot there, and so on.
     """
@@ -74,7 +74,7 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
 def snapshots_of_values(
     site: Site, values: np.ndarray | Tensor, silent: np.ndarray | Tensor | None = None
 ) -> Snapshots:
-    """Snapshots at unknown places from what predictions of the site look like.
+    """Return snapshots at unknown places from what predictions of the site look like.
 
     Args:
         site: with T stations, or one static end.
@@ -105,7 +105,7 @@ def snapshots_of_values(
 
 
 def flatten_targets(targets: Tensor) -> Tensor:
-    """Targets (n, ...) as rows (n, P): of spectra every k-th row and column."""
+    """Return targets (n, ...) as rows (n, P): of spectra every k-th row and column."""
     if targets.ndim == 3 and not targets.is_complex():
         step = max(round((targets[0].numel() / PIXELS) ** 0.5), 1)
         targets = targets[:, step // 2 :: step, step // 2 :: step]

@@ -48,7 +48,10 @@ class Grid:
     origin: Georeference | None = None
 
     def places(self, cells: np.ndarray | None = None) -> np.ndarray:
-        """World places (n, 3) [m] of `cells` (n,), numbers into the flat map; None: of those inside."""
+        """Return world places (n, 3) [m] of `cells` (n,), numbers into the flat map.
+
+        None: of those inside.
+        """
         chosen = np.flatnonzero(self.inside) if cells is None else cells
         row, column = np.divmod(chosen, len(self.x))
         return np.column_stack([self.x[column], self.y[row], np.full(len(chosen), self.height)])

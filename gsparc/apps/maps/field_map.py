@@ -99,7 +99,7 @@ class FieldMap:
         return replace(self, **levels, threshold_db=self.threshold_db + decibels, unit=unit)
 
     def layer(self, name: str) -> np.ndarray:
-        """One of `ARRAYS` (ny, nx), of the strongest station; NaN where refused."""
+        """Return one of `ARRAYS` (ny, nx), of the strongest station; NaN where refused."""
         if name == "best_server":
             return np.where(self.best_server == REFUSED, np.nan, self.best_server)
         values = getattr(self, name)
@@ -118,7 +118,7 @@ class FieldMap:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     def summarise(self) -> dict[str, float | int | str | None]:
-        """`map/*` for `summary.json`; shares are of the cells that something is said of."""
+        """Return `map/*` for `summary.json`; shares are of the cells that something is said of."""
         known = self.grid.inside & ~self.refused
 
         def reduce(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
@@ -139,7 +139,7 @@ class FieldMap:
 
 
 def empty_layers(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]:
-    """`ARRAYS` of a map (ny, nx) about which nothing is said yet."""
+    """Return `ARRAYS` of a map (ny, nx) about which nothing is said yet."""
     shapes = {name: (stations, *shape) if name in OF_STATIONS else shape for name in ARRAYS}
     values = {name: np.full(size, np.nan, np.float32) for name, size in shapes.items()}
     return values | {"best_server": np.full(shape, REFUSED, np.int16)}
@@ -156,7 +156,7 @@ def best_server(power_db: np.ndarray) -> np.ndarray:
 def server_chance(
     power_db: np.ndarray, error_db: np.ndarray, floor_db: np.ndarray, alike: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
+    """Return the probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
 
     Errors are taken for normal. Given the strongest's own level its rivals are taken for independent: who
     beats one station is likelier to beat another, and the product of all chances alone is far too small.
@@ -182,7 +182,8 @@ def server_chance(
 def outage_probability(
     power_db: np.ndarray, error_db: np.ndarray, threshold_db: float, alike: np.ndarray, below: np.ndarray
 ) -> np.ndarray:
-    """Probability (n,) that all of (T, n) powers lie below a threshold: who misses one may hear another.
+    """Return the probability (n,) that all of (T, n) powers lie below a threshold:
+    who misses one may hear another.
 
     Errors are normal; given the strongest's level its rivals are independent, and what is unknown counts as
     below, as in `server_chance`.
@@ -244,7 +245,8 @@ def sinr(
 
 
 def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
-    """Stations (n,) within `OVERLAP_DB` of the strongest of (T, n) powers [dB], itself too, on its carrier.
+    """Count stations (n,) within `OVERLAP_DB` of the strongest of (T, n) powers [dB], itself too,
+    on its carrier.
 
     Returns:
         NaN where no power is known.
@@ -258,7 +260,7 @@ def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
 def read_loads(
     load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str], labels: Sequence[str] = ()
 ) -> np.ndarray:
-    """Loads (T,) in [0, 1] of one number, one per station, or by name or label (the others 1).
+    """Return loads (T,) in [0, 1] of one number, one per station, or by name or label (the others 1).
 
     Raises:
         DataError: another number of them, an unknown name, or no share.

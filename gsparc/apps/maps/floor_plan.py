@@ -35,7 +35,7 @@ class FloorPlan:
     shift: complex
 
     def corners(self) -> np.ndarray:
-        """World places (4, 2) [m] of the corners, in turn from the upper left."""
+        """Return world places (4, 2) [m] of the corners, in turn from the upper left."""
         height, width = self.image.shape[:2]
         pixel = np.array([0, width, width - 1j * height, -1j * height])
         world = self.scale * pixel + self.shift

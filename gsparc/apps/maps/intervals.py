@@ -51,7 +51,7 @@ class Evidence:
         return len(self.level_db)
 
     def subset(self, rows: np.ndarray) -> Evidence:
-        """Some of them."""
+        """Return some of them."""
         return Evidence(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property
@@ -87,7 +87,10 @@ class Calibration:
     def half_and_error(
         self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Half the interval and the root mean square error (n,) [dB] of stations (n,); NaN out of reach."""
+        """Return half the interval and the root mean square error (n,) [dB] of stations (n,).
+
+        NaN out of reach.
+        """
         own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
         scaled = np.where(distance <= self.reach, own * np.maximum(spread_db, self.least), np.nan)
         half, rms = (scaled * np.interp(distance, self.distance, factor) for factor in (self.half, self.rms))
@@ -96,7 +99,7 @@ class Calibration:
     def probability_below(
         self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray
     ) -> np.ndarray:
-        """Probability (n,) that a measurement lies below a level; NaN where it is not known."""
+        """Return the probability (n,) that a measurement lies below a level; NaN where it is not known."""
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
             return norm.cdf(standard)
@@ -145,7 +148,8 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
 
 
 def error_distribution(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (m,) in deviations and their masses, those of censored rows spread over the errors they allow.
+    """Return errors (m,) in deviations and their masses, those of censored rows spread over the errors they
+    allow.
 
     The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row that allows
     no measured error counts as the least that its own can be in size.

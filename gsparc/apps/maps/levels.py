@@ -13,7 +13,7 @@ MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 
 
 def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Level and its standard deviation (B,) float64 [dB]; NaN where no power is predicted.
+    """Return the level and its standard deviation (B,) float64 [dB]; NaN where no power is predicted.
 
     The power of a channel is its mean over antennas and subcarriers, expected: |mean|^2 + error variance.
     Its deviation takes the error for one complex normal variable shared by all entries, which overstates it.
@@ -45,7 +45,9 @@ def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> 
 
 
 def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and which side they are censored on."""
+    """Return the level (n,) [dB] of rows (n,), NaN where nothing was measured,
+    and which side they are censored on.
+    """
     target = np.abs(data.target[rows].reshape(len(rows), -1)).astype(np.float64) * data.site.target_scale
     power = target if data.site.kind == "rssi" else target**2
     side = data.censored_side(rows)
@@ -61,7 +63,8 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
 
 
 def joint_levels(predictor: Predictor, places: np.ndarray, stations: np.ndarray) -> np.ndarray | None:
-    """Levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places (n, 3) [m].
+    """Return levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places (n,
+    3) [m].
 
     Args:
         predictor: see `Predictor.joint`.

@@ -153,7 +153,7 @@ def predict_map(
 
 
 def uncalibrated(share: float) -> Calibration:
-    """Intervals and errors as the model states them, everywhere."""
+    """Return intervals and errors as the model states them, everywhere."""
     half = np.array([norm.ppf((1 + share) / 2)])
     return Calibration(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
 
@@ -162,7 +162,7 @@ def choose_stations(
     predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None,
     key: str = "stations",
 ) -> tuple[list[str], list[str]]:  # fmt: skip
-    """Names of the stations that are mapped, and notes on the others.
+    """Return names of the stations that are mapped, and notes on the others.
 
     Those are stations that the model does not answer for, and, where something is promised, stations that it
     never heard: what was held out tells nothing of them. `key` is the setting that `wanted` comes from.
@@ -235,7 +235,10 @@ def predict_levels(
     predictor: Predictor, places: np.ndarray, other_end: Sequence[float] | None = None,
     station: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Level and its deviation (n,) [dB] at world places (n, 3); see `predicted_levels` and `query_ends`."""
+    """Return the level and its deviation (n,) [dB] at world places (n, 3).
+
+    See `predicted_levels` and `query_ends`.
+    """
     parts = []
     for part in _chunks(places, CHUNK):
         ends = query_ends(predictor.site, part, other_end, station)

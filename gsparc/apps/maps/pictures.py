@@ -45,7 +45,7 @@ class Legend:
     colours: str = "viridis"
 
     def to_colours(self, values: np.ndarray) -> np.ndarray:
-        """Colours (..., 3) uint8 of values (...); grey where they are not finite."""
+        """Return colours (..., 3) uint8 of values (...); grey where they are not finite."""
         # Masked: what is infinite is grey, too, instead of the colour of an end.
         share = Normalize(self.low, self.high, clip=True)(np.ma.masked_invalid(values))
         return colormaps[self.colours].with_extremes(bad=GREY)(share, bytes=True)[..., :3]
@@ -80,7 +80,7 @@ class Layer:
     group: np.ndarray | None = None
 
     def table(self) -> np.ndarray:
-        """Colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
+        """Return colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
         if not self.words:
             return colormaps[self.legend.colours](np.linspace(0, 1, 256))
         every = np.arange(len(self.words)) if self.group is None else self.group
@@ -105,7 +105,9 @@ class Layer:
 
 
 def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
-    """Numbers (count,) below `MOST_COLOURS`, different for classes (ny, nx) that lie beside each other."""
+    """Return numbers (count,) below `MOST_COLOURS`, different for classes (ny,
+    nx) that lie beside each other.
+    """
     if count <= MOST_COLOURS:
         return np.arange(count)
     number = np.where(np.isfinite(classes), classes, count).astype(int)
@@ -126,7 +128,7 @@ def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
 
 
 def label_places(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
-    """Row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
+    """Return row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
     # Deeper than a letter at the picture's size, or the name hides its area.
     least = max(DEEP * max(classes.shape), 1.5)
     for number in np.unique(classes[np.isfinite(classes)]).astype(int):
@@ -139,7 +141,7 @@ def label_places(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[
 
 
 def list_layers(field: FieldMap) -> Iterator[Layer]:
-    """Every layer of a map that says something; of several stations, also the power of each."""
+    """List every layer of a map that says something; of several stations, also the power of each."""
     several, unit = len(field.stations) > 1, field.unit
     of = " of the strongest station" if several else ""
     layer = field.layer("power_db")
@@ -257,7 +259,7 @@ def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
 
 
 def draw_measured_places(axis: Any, field: FieldMap) -> None:
-    """Measured points and stations; those outside the map are left out."""
+    """Mark measured points and stations; those outside the map are left out."""
     left, right, low, high = field.grid.extent
     from_above.draw_measured(axis, field.places)
     known = field.station_place
@@ -275,7 +277,7 @@ def draw_measured_places(axis: Any, field: FieldMap) -> None:
 def draw_measurement_plan(
     batch: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
 ) -> None:
-    """Expected error before and after, the chosen places, and how it falls."""
+    """Draw the expected error before and after, the chosen places, and how it falls."""
     left, right, low, high = batch.grid.extent
     wide, tall = np.array([right - left, high - low]) / max(right - left, high - low)
     figure, ((before, after, curve),) = panels(

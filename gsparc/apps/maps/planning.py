@@ -200,7 +200,7 @@ def choose_greedily(
     unknown: list[ErrorCovariance], first: int, wanted: np.ndarray, count: int, least_gain_db: float,
     tour: Tour, error: float,
 ) -> tuple[list[int], list[float], str]:  # fmt: skip
-    """Chosen candidates, expected error after each, and why it stopped early.
+    """Return chosen candidates, expected error after each, and why it stopped early.
 
     Candidates are the places from `first` on, by whose numbers they are in `tour`; `error` is that before.
     """

@@ -149,7 +149,10 @@ def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.
 
 
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level and deviation (n,) [dB] that `method` predicts for rows (n,); NaN where it has no answer."""
+    """Return the level and deviation (n,) [dB] that `method` predicts for rows (n,).
+
+    NaN where it has no answer.
+    """
     mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
         mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
@@ -157,5 +160,5 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[
 
 
 def station_numbers(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Numbers (n,) int64; 0 where there is one."""
+    """Return numbers (n,) int64; 0 where there is one."""
     return np.zeros(len(rows), np.int64) if data.station is None else data.station[rows].astype(np.int64)

@@ -13,7 +13,7 @@ LEAST_NODES = 16  # along a side
 
 
 def sample_adaptively(ask: Ask, inside: np.ndarray, stride: int, tolerance: float) -> tuple[np.ndarray, int]:
-    """Values (C, ny, nx) float32 of cells, NaN outside, and how many were asked about.
+    """Return values (C, ny, nx) float32 of cells, NaN outside, and how many were asked about.
 
     A lattice is asked about, and every cell near which interpolation from it and from every second of its
     nodes differ by more than linear interpolation within the tolerance allows.

@@ -93,7 +93,7 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
 
 
 def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
-    """Paths as they are shown; those that several searches found alike are one, of their summed gain.
+    """Return paths as they are shown; those that several searches found alike are one, of their summed gain.
 
     Args:
         gain: (A, N) complex, with their phases.

@@ -37,7 +37,7 @@ VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "r
 
 
 def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None) -> Scene:
-    """Everything that stands still, with the measurements and the Gaussians of one station."""
+    """Build everything that stands still, with the measurements and the Gaussians of one station."""
     stands = {name: at for name in viewed.stations if (at := viewed.static_place(name)) is not None}
     points = [viewed.box(), *(at[None] for at in stands.values())]
     if viewed.site.static_end is None:
@@ -91,7 +91,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
 
 
 def model_gaussians(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
-    """Gaussians that are rendered, in world coordinates; None: of a model without."""
+    """Return Gaussians that are rendered, in world coordinates; None: of a model without."""
     low, high = viewed.box()
     places = np.random.default_rng(0).uniform(low, high, (QUERIES, 3))
     if measured is not None:
@@ -149,12 +149,13 @@ class Sphere:
         return cls(row, column, offsets, radius * 2.2 * np.sqrt(np.pi / max(len(row), 1)) * 1.2)
 
     def colours(self, spectrum: np.ndarray) -> np.ndarray:
-        """(n, 3) uint8 of a spectrum (H, W) in [0, 1]."""
+        """Return (n, 3) uint8 of a spectrum (H, W) in [0, 1]."""
         return Legend("", 0.0, 1.0, "inferno").to_colours(spectrum[self.rows, self.columns])
 
 
 def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
-    """Paths as lines from the receiver towards where they come from, as long as their delays, and the sources
+    """Draw paths as lines from the receiver towards where they come from, as long as their delays,
+    and the sources
     at the ends of those that are drawn whole.
 
     A line is straight where the path has bounced: its end is the image of the transmitter.
@@ -171,7 +172,9 @@ def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
 
 
 def start_place(viewed: Viewed, measured: Measured | None) -> np.ndarray:
-    """World place (3,) [m] where the moving end first stands: the measured one nearest to their median."""
+    """Return the world place (3,) [m] where the moving end first stands:
+    the measured one nearest to their median.
+    """
     if measured is None:
         return viewed.box().mean(axis=0)
     middle = np.median(measured.places, axis=0)

@@ -18,7 +18,10 @@ FLOOR_DB = -60.0  # below the largest entry of a channel, where its response end
 
 
 def response_db(response: np.ndarray) -> np.ndarray:
-    """Lines [dB] of a channel (A, K): of at most `MOST_LINES` antennas (a, K); the mean (A,) of one tone."""
+    """Return lines [dB] of a channel (A, K): of at most `MOST_LINES` antennas (a, K).
+
+    The mean (A,) of one tone.
+    """
     power = np.abs(response).astype(np.float64) ** 2
     power = power[:, 0] if power.shape[1] == 1 else power[evenly_spaced(len(power), MOST_LINES)]
     return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))

@@ -39,7 +39,7 @@ class Plane:
 def refine_plane(
     predictor: Predictor, grid: Grid, other_end: Sequence[float] | None = None
 ) -> Iterator[Plane | None]:
-    """Planes of ever smaller strides; None between them, about every `STEP_S`.
+    """Return planes of ever smaller strides; None between them, about every `STEP_S`.
 
     `other_end` (3,) is the transmitter's world place [m] where both ends move.
     """
@@ -79,7 +79,8 @@ def plane_sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, benea
 
 
 def weakest_place(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
-    """World place (3,) [m] of the cell of least power, `APART` of the plane's width from places `seen` (3,).
+    """Return the world place (3,) [m] of the cell of least power,
+    `APART` of the plane's width from places `seen` (3,).
 
     None where there is none.
     """

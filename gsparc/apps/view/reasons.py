@@ -18,7 +18,7 @@ PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spo
 
 
 def explain_level(answer: Answer, moving: str, tree: cKDTree | None) -> list[str]:
-    """Why the level is what it is, one line each.
+    """Say why the level is what it is, one line each.
 
     Args:
         answer: a prediction.
@@ -56,7 +56,7 @@ def _paths(answer: Answer) -> list[str]:
 
 
 def summarise_answer(answer: Answer, unit: str = "dB") -> str:
-    """Level and confidence in one line."""
+    """Say level and confidence in one line."""
     sure = "no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}"
     if answer.level_db is None:
         return sure

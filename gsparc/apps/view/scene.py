@@ -35,7 +35,10 @@ class Frame:
         return cls((low + high) / 2, EXTENT / max(float((high - low).max()), 1e-3))
 
     def to_drawn(self, places: np.ndarray) -> np.ndarray:
-        """World places (..., 3) [m] as float32 in drawn units; float64 until the middle is taken away."""
+        """Return world places (..., 3) [m] as float32 in drawn units.
+
+        Float64 until the middle is taken away.
+        """
         # Float32 of UTM metres moves in steps of half a metre.
         return np.asarray((places - self.middle) * self.scale, np.float32)
 

@@ -88,16 +88,16 @@ class SiteView:
         return StationView(scene, measured, tree, power)
 
     def extent(self, name: str | None) -> float:
-        """Width of the site [m]."""
+        """Return the width of the site [m]."""
         return EXTENT / self.station(name).scene.frame.scale
 
     def sphere(self, name: str | None) -> Sphere | None:
-        """Directions of a spectrum; None of other kinds."""
+        """Return directions of a spectrum; None of other kinds."""
         site = self.viewed.site
         return Sphere.from_site(site, self.extent(name)) if site.kind == "spectrum" and site.grid else None
 
     def initial_places(self, name: str | None) -> dict[str, np.ndarray]:
-        """World places (3,) where the ends that move first stand."""
+        """Return world places (3,) where the ends that move first stand."""
         viewed, first = self.viewed, self.viewed.moving[-1]
         at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
         places: dict[str, np.ndarray] = {first: at}
@@ -109,7 +109,9 @@ class SiteView:
         return places
 
     def plane(self, name: str | None, grid: Grid) -> Plane:
-        """Power over all of some cells, the transmitter where it first stands if both ends move."""
+        """Return the power over all of some cells, the transmitter where it first stands if both ends
+        move.
+        """
         other = None if self.viewed.site.static_end is not None else self.initial_places(name)["tx"].tolist()
         *_, plane = refine_plane(self.viewed.predictor_of(name), grid, other)
         assert plane is not None
@@ -117,7 +119,7 @@ class SiteView:
 
 
 def lay_power_plane(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
-    """Cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
+    """Return cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
     if viewed.site.kind not in MAPPED:
         return None
     return lay_grid(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)

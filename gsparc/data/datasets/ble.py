@@ -83,7 +83,10 @@ def read_sensor_places(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_mean_level(path: Path) -> float:
-    """Mean level [dBm] of the packets of one sensor at one place; DataError where a line is no packet."""
+    """Return the mean level [dBm] of the packets of one sensor at one place.
+
+    DataError where a line is no packet.
+    """
     lines = read_text(path, "missing").splitlines()
     levels = _numbers([line.rpartition(",")[2] for line in lines])
     if not lines or len(levels) != len(lines) or any(line.count(",") != 3 for line in lines):

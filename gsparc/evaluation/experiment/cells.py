@@ -45,7 +45,7 @@ class Contender:
         return kind and needs and self.networks >= problem.network
 
     def overrides(self, budget_s: float | None) -> list[str]:
-        """Overrides of train.yaml, but for the seed."""
+        """Return overrides of train.yaml, but for the seed."""
         timed = [] if budget_s is None else [text.format(budget_s=f"{budget_s:g}") for text in self.budget]
         return [*(self.choose or (f"model={self.name}",)), *timed]
 
@@ -72,7 +72,7 @@ class Cell:
 
 
 def plugin_contenders() -> dict[str, Contender]:
-    """Methods that are plugins; a class may name the `kinds` of data that it serves."""
+    """Return methods that are plugins; a class may name the `kinds` of data that it serves."""
     found = {}
     for name, path in plugins("model").items():
         kind = import_target(path)
@@ -101,7 +101,7 @@ def plan_cells(
     problems: Sequence[Problem], methods: Mapping[str, Contender], budgets: Sequence[Budget],
     only: Sequence[str] = (),
 ) -> list[tuple[Problem, Cell]]:  # fmt: skip
-    """All cells, the most useful first: every problem's table before further seeds and longer budgets.
+    """List all cells, the most useful first: every problem's table before further seeds and longer budgets.
 
     Args:
         problems: the most wanted first; one of several draws of a split gives a method its seed.

@@ -60,7 +60,7 @@ def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def build_callbacks(nodes: Mapping[str, Any] | None) -> list[Callback]:
-    """Every callback of the group `callbacks` that was not set to null."""
+    """Build every callback of the group `callbacks` that was not set to null."""
     return [instantiate(node) for node in (nodes or {}).values() if node is not None]
 
 

@@ -49,7 +49,7 @@ class Latency:
 
 
 def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, Latency]:
-    """One row per method, from the first of its checkpoints."""
+    """Return one row per method, from the first of its checkpoints."""
     data, split = problem.data, problem.folds
     methods: dict[str, Method] = {}
     for one in filled:

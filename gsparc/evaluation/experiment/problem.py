@@ -164,7 +164,8 @@ def _composed(overrides: tuple[str, ...]) -> DictConfig:
 
 
 def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
-    """Every dataset under every split that is meant for it, first draws first: the best-known come first.
+    """Load every dataset under every split that is meant for it, first draws first:
+    the best-known come first.
 
     Raises:
         ValueError: no dataset has a path, or none of those that have one is wanted.

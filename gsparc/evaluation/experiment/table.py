@@ -59,7 +59,7 @@ CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spr
 
 
 def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
-    """Every cell, columns `CELL` (those of `cells.csv`) first; others are as in `average_cells`."""
+    """Return every cell, columns `CELL` (those of `cells.csv`) first; others are as in `average_cells`."""
     rows = []
     for one in filled:
         own = one.row
@@ -172,7 +172,7 @@ def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def title_of(block: pd.DataFrame) -> str:
-    """Names and budget of a block, and how often its split was drawn."""
+    """Return names and budget of a block, and how often its split was drawn."""
     budget = block.budget_s.max()
     timed = "" if np.isnan(budget) else f", a budget of {budget:g} processor seconds per model"
     draws = int(block.seeds.max()) if block.draws.any() else 0
@@ -265,7 +265,7 @@ def _score(row: Mapping[str, Any]) -> Interval:
 
 
 def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
-    """All blocks as one page, each with what it shows."""
+    """Return all blocks as one page, each with what it shows."""
     return "\n".join(
         "\n".join([table_of(block, ours).markdown(), *(f"- {r}" for r in remarks(block, ours)), ""])
         for block in blocks
@@ -273,6 +273,6 @@ def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
 
 
 def methods_by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
-    """Methods, the least behind first: mean over the splits that each is possible on."""
+    """Return methods, the least behind first: mean over the splits that each is possible on."""
     behind = rows.assign(behind_db=rows.behind_db.fillna(0.0)).groupby("method", sort=False).behind_db.mean()
     return list(behind.sort_values(kind="stable").index)

@@ -167,7 +167,7 @@ def draw_front(
 
 
 def fit_others(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, FittedBaseline]:
-    """Baselines whose deciding figure is defined, fitted."""
+    """Fit baselines whose deciding figure is defined."""
     fitted = {name: fit_baseline(name, run.data, run.split, eval_on) for name in baselines}
     figure = DECIDING[run.data.site.scored]
     return {name: one for name, one in fitted.items() if one.scores.figures()[figure] is not None}
@@ -197,7 +197,7 @@ def _cell(value: Any) -> Any:
 def facts_of(
     points: list[Point], best: list[Point], figure: str, others: dict[str, Point], copy_ms: float
 ) -> dict[str, Any]:
-    """`tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
+    """Return `tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),

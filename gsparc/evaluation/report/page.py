@@ -54,7 +54,10 @@ class Section:
 def make_sections(
     runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()
 ) -> list[Section]:
-    """Everything there is to show, study by study; `fronts`: names of datasets, `tradeoff.csv` by column."""
+    """Return everything there is to show, study by study.
+
+    `fronts`: names of datasets, `tradeoff.csv` by column.
+    """
     return [
         _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
         for (dataset, split), group in group_by_study(runs).items()

@@ -84,7 +84,7 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
 
 
 def draw_accuracy_cdf(runs: Sequence[Run]) -> Figure:
-    """Share of test samples that are at most so good, per setting, with 95 % bands."""
+    """Draw the share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].row["kind"]], _axes()
     _cdfs(axes, runs, name)
     beside = [base["run"].samples for base in _rivals(runs) if base["method"] == "gp"]
@@ -178,7 +178,7 @@ def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
 
 
 def shorten_setting(text: str, most: int = 32) -> str:
-    """Overrides by the last part of their names, then cut to `most` characters."""
+    """Return overrides by the last part of their names, then cut to `most` characters."""
     words = [word.partition("=") for word in text.split()]
     text = " ".join(
         (key.rpartition(".")[2] if equals else key) + equals + value for key, equals, value in words

@@ -108,7 +108,7 @@ class Run:
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Run]:
-    """Training runs in and below directories, in the order given.
+    """Return training runs in and below directories, in the order given.
 
     Raises:
         ValueError: a directory that does not exist or holds no run; it is named.
@@ -140,12 +140,12 @@ def group_in_order(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any,
 
 
 def group_by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
-    """Runs whose figures can be compared, by dataset and split, in order of appearance."""
+    """Return runs whose figures can be compared, by dataset and split, in order of appearance."""
     return group_in_order(runs, lambda run: run.study)
 
 
 def distinct_baselines(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Rows of the baselines of each split of the rows, of its first run."""
+    """Return rows of the baselines of each split of the rows, of its first run."""
     every: dict[tuple[str, str], dict[str, Any]] = {}
     for base in (base for run in runs for base in run.baselines):
         every.setdefault((base["rows"], base["setting"]), base)

@@ -73,7 +73,9 @@ class SweepReport(Callback):
 
 
 def report_sweep(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
-    """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
+    """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
+    and its table.
+    """
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import write_report
     from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again

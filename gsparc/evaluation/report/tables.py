@@ -32,7 +32,7 @@ SIZE = Column("Gaussians", "d", of="gaussians")
 def bootstrap_interval(
     values: np.ndarray, weights: np.ndarray | None = None, seed: int = 0
 ) -> tuple[float, float]:
-    """Ends of the 95 % interval of a mean (n,), or of sum(values) / sum(weights), resampling samples.
+    """Return ends of the 95 % interval of a mean (n,), or of sum(values) / sum(weights), resampling samples.
 
     Samples are taken as independent; neighbours under `split=grouped` are not, so it is a lower bound.
     """
@@ -106,7 +106,7 @@ def _figures(row: Row) -> list[str]:
 
 
 def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Runs that differ by their seed only, by setting, in order of appearance."""
+    """Return runs that differ by their seed only, by setting, in order of appearance."""
     return group_in_order(runs, lambda run: run.setting)
 
 
@@ -115,7 +115,9 @@ def _run_columns(runs: Sequence[Run]) -> list[Column]:
 
 
 def table_of_results(runs: Sequence[Run]) -> Table:
-    """Every run and every baseline of one study: accuracy, what it cost, memory, size, effects, origin."""
+    """Return every run and every baseline of one study: accuracy, what it cost, memory, size, effects,
+    origin.
+    """
     note = "95 % interval: bootstrap over test samples"
     columns = [
         *_run_columns(runs), *(accuracy_column(f, note) for f in _figures(runs[0].row)),
@@ -134,7 +136,9 @@ def table_of_results(runs: Sequence[Run]) -> Table:
 
 
 def table_of_seeds(runs: Sequence[Run]) -> Table:
-    """Settings and baselines side by side, their spread over seeds or draws of the split, and their cost."""
+    """Return settings and baselines side by side, their spread over seeds or draws of the split,
+    and their cost.
+    """
     differs, several, spread = differing_settings(runs), has_draws(runs), _spread_columns(runs)
     also = [Column("differs, too", "")] if any(differs.values()) else []
     every = [*(run.row for run in runs), *distinct_baselines(runs)]

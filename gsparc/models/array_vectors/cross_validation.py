@@ -122,12 +122,15 @@ class _Samples:
     def predict(
         self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior variance (g, c) and spectra (g, c, P) of held-out samples; NaN where no other is left."""
+        """Return the posterior variance (g, c) and spectra (g, c, P) of held-out samples.
+
+        NaN where no other is left.
+        """
         mean, variance = means_and_variances(inverse, vectors, self.distance, self.centres, self.gaps)
         unknown = np.clip(variance - kernel.noise, 0.0, 1.0)
         power = np.abs(mean @ self.matrix) ** 2 + unknown[..., None] * self.background
         return unknown, np.sqrt(power)
 
     def squared_errors(self, predicted: np.ndarray) -> np.ndarray:
-        """(g, c) mean squared."""
+        """Return (g, c) mean squared."""
         return ((predicted - self.images[self.centres]) ** 2).mean(-1)

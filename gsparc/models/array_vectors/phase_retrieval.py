@@ -168,14 +168,14 @@ class _Problem:
         return len(self.forms) + (1 if self.offsets else 0)
 
     def draw_flat_starts(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
-        """Starting points (len(rows) * starts, unknowns) of about the spectra's power."""
+        """Return starting points (len(rows) * starts, unknowns) of about the spectra's power."""
         start = torch.randn(len(rows), starts, self.dimension, generator=generator, dtype=torch.float64)
         # z2[0] is the mean square of the image up to sign: the first whitened column is the constant.
         start *= (self.z2[rows, :1].abs() / len(self.forms)).sqrt()[:, :, None]
         return start.flatten(0, 1)
 
     def errors_and_slopes(self, state: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Errors (B, K) and their slopes (B, K, unknowns)."""
+        """Return errors (B, K) and their slopes (B, K, unknowns)."""
         v = state[:, : len(self.forms)]
         half = (v @ self.forms).view(len(v), -1, v.shape[1])
         error = torch.bmm(half, v[:, :, None]).squeeze(2) - self.z2[rows]

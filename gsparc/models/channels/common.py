@@ -53,7 +53,9 @@ class SharedGains:
         return SharedGains(gain * reliability, explained, sum(levels) / count)
 
     def predict(self, prior: ChannelPrior, at: SlotPlaces) -> Moments:
-        """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
+        """Return the mean (n,) complex128 of a slot's entries, their variance (n,),
+        and that before learning.
+        """
         before = self.level / _distance_to_middle(prior, at.slot) ** 2 * prior.variance(at)
         waves, _, away = _waves_and_powers(prior, at)
         waves = waves / away[:, None]

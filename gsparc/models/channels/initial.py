@@ -115,7 +115,7 @@ class Candidate:
     errors: np.ndarray
 
     def beats(self, other: Candidate) -> bool:
-        """Whether likelihood and left-out places prefer this one."""
+        """Tell whether likelihood and left-out places prefer this one."""
         ratio = self.errors / other.errors
         return self.nll < other.nll and bool(np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE)
 

@@ -55,7 +55,7 @@ class _Searcher:
         planes: Tensor,
         precision: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
     ) -> Tensor:
-        """Rise of the log likelihood (W, levels) of each plane alone."""
+        """Return the rise of the log likelihood (W, levels) of each plane alone."""
 
         def image_waves(probe: Probe, chunk: Tensor) -> Tensor:
             return Images.from_planes(self.frame, planes[chunk]).waves(probe.group)
@@ -63,7 +63,7 @@ class _Searcher:
         return likelihood_gains(probes, len(planes), image_waves, LEVELS, precision)
 
     def add_plane(self, plane: Tensor, level: float, gain: float) -> None:
-        """One more plane (4,)."""
+        """Return one more plane (4,)."""
         self.planes, self.risen = torch.cat([self.planes, plane[None]]), self.risen + gain
         image = Images.from_planes(self.frame, plane[None])
         self.rough, self.probes = (
@@ -72,7 +72,7 @@ class _Searcher:
         )
 
     def separate_planes(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
-        """The best planes whose images of the ends are apart."""
+        """Return the best planes whose images of the ends are apart."""
         chosen: list[Tensor] = []
         for number in scores.argsort(descending=True).tolist():
             tried = Images.from_planes(self.frame, torch.stack([*chosen, grid[number]]))
@@ -85,7 +85,7 @@ class _Searcher:
         return chosen
 
     def refine_plane(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
-        """A plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
+        """Return a plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
         middle, shift = self.frame.middle, STEP * self.wavelength / 2
         normal, away = plane[:-1], plane[-1]
         across = torch.linalg.cross(normal, UP)

@@ -73,17 +73,17 @@ def run_searches(
     stopped = threading.Event()
 
     def is_share_spent(share: float) -> Callable[[], bool]:
-        """Whether so much of a search's effort, from now, or all of the seconds are spent."""
+        """Tell whether so much of a search's effort, from now, or all of the seconds are spent."""
         counted = step_limit(round(share * budget.effort.evaluations))
         return lambda: counted() or budget.is_spent()
 
     def is_unwanted(number: int) -> bool:
-        """Whether those before it are all that is wanted."""
+        """Tell whether those before it are all that is wanted."""
         before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
         return stopped.is_set() or reached_noise_floor(before, noise_floor)
 
     def run_search(number: int) -> Member:
-        """Sources, their phases, and the clutter that the noise does not hide."""
+        """Return sources, their phases, and the clutter that the noise does not hide."""
         rows, ended = row_sets[number], is_share_spent(ROUNDS_SHARE)
 
         def look_then_has_ended() -> bool:
@@ -147,10 +147,10 @@ def left_out_nmse(rows: Rows, scene: Scene) -> float:
 
 
 def occludes_antennas_alike(rows: Rows) -> bool:
-    """Whether the static end's antennas are near enough to be occluded alike."""
+    """Tell whether the static end's antennas are near enough to be occluded alike."""
     return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
 
 
 def reached_noise_floor(left_out: Sequence[float], noise_floor: float, count: int = 2) -> bool:
-    """Whether `count` searches have reached the noise floor."""
+    """Tell whether `count` searches have reached the noise floor."""
     return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= count

@@ -125,7 +125,8 @@ def best_weights(gram: np.ndarray) -> np.ndarray:
 
 
 def mean_and_error(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
-    """Mean of differences (n,) and its standard error, rows of one unit (n,) not being independent.
+    """Return the mean of differences (n,) and its standard error,
+    rows of one unit (n,) not being independent.
 
     Of few units it is larger, so that as many normal means lie within it (Student's t). It is infinite where
     all rows are of one unit: then nothing tells how far to trust the mean.

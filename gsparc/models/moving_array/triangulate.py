@@ -109,7 +109,7 @@ def find_sources(
     known = receivers[:0] if first is None else first[None].float()
 
     def residual_lags(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
-        """Residual lags (n, Q) of sources of the best powers."""
+        """Return residual lags (n, Q) of sources of the best powers."""
         atoms = space.plane_wave_lags(bearings(sources, receivers, rotation))
         return lags - sum_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 

@@ -72,7 +72,7 @@ class MarchedField(Network):
         return smooth_root(wave.sum(1).abs().square())
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Mean squared error () of rays drawn at random."""
+        """Return the mean squared error () of rays drawn at random."""
         sample = torch.randint(len(batch), (self.rays,), generator=generator)
         pixel = torch.randint(len(self.directions), (self.rays,), generator=generator)
         origin, heading = self._origins_and_directions(batch.rx, sample, pixel)

@@ -98,7 +98,7 @@ class DirectedRays(Network):
         return self.march(places, *self.transmitters_and_likely(places, False), None).view(-1, 1, 1)
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Mean squared error along measured directions."""
+        """Return the mean squared error along measured directions."""
         places = torch.atleast_2d(batch.rx.position)
         seen = self.march(places, *self.transmitters_and_likely(places, True), generator).view(-1, 1, 1)
         return (seen - batch.target).abs().square().mean()

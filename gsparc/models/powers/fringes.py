@@ -124,7 +124,7 @@ class Fringes(Stored):
 
 
 def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
-    """Whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
+    """Tell whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
     if wavelength is None or has_both_ends(places):
         return False
     unique = np.unique(places, axis=0)

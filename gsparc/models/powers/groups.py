@@ -29,7 +29,7 @@ class ErrorGain:
     others: float
 
     def exceeds(self, errors: float) -> bool:
-        """Whether it is more than so many standard errors."""
+        """Tell whether it is more than so many standard errors."""
         return self.squares > errors * self.error
 
 

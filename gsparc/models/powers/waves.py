@@ -117,7 +117,7 @@ class _Misfit:
         return cls(weights, field, power, error, value + ALIKE * float((np.abs(weights) ** 2).sum()))
 
     def error_scale(self) -> float:
-        """Of the errors [dB], by a few steps of expectation maximisation."""
+        """Return that of the errors [dB], by a few steps of expectation maximisation."""
         result = SCALE_DB
         for _ in range(5):
             share = (DEGREES + 1) / (DEGREES + (self.error / result) ** 2)

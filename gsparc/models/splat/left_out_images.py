@@ -74,7 +74,7 @@ class LeftOut(Stored):
 def means_and_variances(
     inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of each sample given all others outside a gap around it.
+    """Return the mean and variance of each sample given all others outside a gap around it.
 
     Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
     `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
@@ -103,6 +103,6 @@ def means_and_variances(
 
 
 def mean_log_error(error: np.ndarray) -> float:
-    """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
+    """Return the mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
     usable = ~np.isnan(error).all(1)
     return float(np.nanmean(np.log(error[usable] + LEAST), axis=1).mean()) if usable.any() else 0.0

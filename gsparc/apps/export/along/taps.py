@@ -37,11 +37,14 @@ class Trajectory:
             raise ValueError("a trajectory needs two rows or more, each later than the one before (time_s)")
 
     def places_at(self, time_s: np.ndarray) -> np.ndarray:
-        """Places (m, 3) at times (m,)."""
+        """Return places (m, 3) at times (m,)."""
         return np.stack([np.interp(time_s, self.time_s, axis) for axis in self.place.T], 1)
 
     def instants(self, wavelength: float) -> np.ndarray:
-        """Times (T,), a part of a wavelength apart, at which a channel is to be known; four or more."""
+        """Return times (T,), a part of a wavelength apart, at which a channel is to be known.
+
+        Four or more.
+        """
         fastest = float((np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max())
         longest = float(self.time_s[-1] - self.time_s[0]) * fastest / wavelength  # were it always that fast
         # Four at least: a cubic spline needs them.
@@ -76,7 +79,9 @@ class TappedDelayLine:
     worst: float
 
     def doppler_hz(self) -> np.ndarray:
-        """Mean Doppler shift (A, L) float64 [Hz] of each tap: the phase it gains from instant to instant."""
+        """Return the mean Doppler shift (A, L) float64 [Hz] of each tap:
+        the phase it gains from instant to instant.
+        """
         # The mean of products weighs each step by its power: a fade's phase is noise.
         turned = (self.gain[1:] * self.gain[:-1].conj()).sum(0, dtype=np.complex128)
         return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
@@ -113,7 +118,7 @@ def write_taps(predictor: Predictor, way: Trajectory, how: Mapping[str, Any], fi
 def fit_taps(
     predictor: Predictor, way: Trajectory, taps: int, rate_hz: float | None = None, antennas: int = 1
 ) -> TappedDelayLine:
-    """Taps of a model's channels along a trajectory, by least squares over the band.
+    """Fit taps of a model's channels along a trajectory, by least squares over the band.
 
     Over the measured tones. The taps stand side by side, where most power arrives.
 

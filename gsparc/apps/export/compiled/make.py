@@ -192,13 +192,17 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
 
 
 def random_places(site: Site, count: int, seed: int) -> np.ndarray:
-    """Local places (count, 3) of what moves, (count, 6) of both ends [m], in the box of the measured."""
+    """Return local places (count, 3) of what moves, (count, 6) of both ends [m],
+    in the box of the measured.
+    """
     low, high = site.moving_box
     return np.random.default_rng(seed).uniform(low, high, (count, len(low))).astype(np.float32)
 
 
 def near_places(site: Site, count: int, seed: int) -> np.ndarray:
-    """Like `random_places`, the last end nearer to the other, evenly in the logarithm of how much."""
+    """Return places like `random_places`, the last end nearer to the other,
+    evenly in the logarithm of how much.
+    """
     places, (low, high) = random_places(site, count, seed), site.moving_box
     other = places[:, :3] if site.static_end is None else site.static_position
     if other is None:  # nobody knows where
@@ -210,7 +214,7 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
 
 
 def split_ends(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
-    """Local places (B, 3) float64 [m] of the ends that move, from (B, 3) or (B, 6)."""
+    """Return local places (B, 3) float64 [m] of the ends that move, from (B, 3) or (B, 6)."""
     places = places.astype(np.float64)
     return {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
 
@@ -224,7 +228,7 @@ def ask_model(predictor: Predictor, places: np.ndarray) -> np.ndarray:
 
 
 def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:
-    """Measurements whose targets are the model's answers at local places [m]."""
+    """Return measurements whose targets are the model's answers at local places [m]."""
     site, count = predictor.site, len(places)
     still = np.zeros(3) if site.static_position is None else site.static_position
     ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | split_ends(site, places)

@@ -14,7 +14,7 @@ ASIDE = 0.15  # how far east of the site it looks, where a panel covers what lie
 
 
 def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Everything, in place of the nodes `before`; returns the nodes by name."""
+    """Draw everything, in place of the nodes `before`; returns the nodes by name."""
     for node in before.values():
         node.remove()
     return {part.name: part.draw(api, scene.frame) for part in scene.parts}

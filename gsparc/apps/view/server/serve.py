@@ -69,7 +69,7 @@ class Server:
         log.info("client %d left, %d in all", client.client_id, len(self.sessions))
 
     def run(self) -> None:
-        """Until Ctrl-C."""
+        """Serve until Ctrl-C."""
         try:
             while True:
                 time.sleep(0.5)

@@ -81,7 +81,7 @@ class SmallMirror:
     score: float
 
     def overlaps(self, other: SmallMirror, max_gap: float) -> bool:
-        """Whether both are parallel, closer than `max_gap` [m] and overlap."""
+        """Tell whether both are parallel, closer than `max_gap` [m] and overlap."""
         (normal, offset), (normal2, offset2) = map(hesse_form, (self.plane, other.plane))
         if (normal @ normal2).abs() < PARALLEL or (offset - offset2).abs() > max_gap:
             return False

@@ -115,7 +115,7 @@ class Mirrors:
             return ((),)
 
         def evaluate_parts(evaluate: Callable[..., Tensor], numbers: Tensor) -> Tensor:
-            """What is said of some sequences."""
+            """Return what is said of some sequences."""
             parts = ([sequences[i] for i in part.tolist()] for part in numbers.split(AT_ONCE))
             return torch.cat([evaluate(part, transmitter, places, hidden) for part in parts])
 
