@@ -54,6 +54,7 @@ LITTLE = 0.1  # usual noise and deviations by bearing, of the variance; usual le
 BOUND = 5.0  # deviations of what sectors share, beyond which it is not looked for
 CONTRADICTED_DEG, ROUND_DEG = 30.0, 360.0
 SURE = 10.0, 0.1  # nats, and nats a row, by which another azimuth must be likelier
+SUREST, TURNED = 0.75, 8  # of the largest gain, that are turned at a time; times
 TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
 GAINS = torch.arange(-12.0, 12.5, 2.0)  # [dB]
 ROUGH_LOOKS = 150  # evaluations, each of a sum over rows
@@ -141,9 +142,15 @@ def learn_network(
     quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side))
     with nullcontext() if budget is None else end_when(budget.is_spent):
         rough, gains, scale = _fit_rough(quiet, start)
-        turned, notes = _correct_azimuths(quiet, rough, gains, scale, names)
-        if notes or piles:
-            rough, gains, scale = _fit_rough(few, turned)
+        # A wrong azimuth bends what all sectors share, by which right ones are doubted: the surest first.
+        for _ in range(TURNED):
+            turned = _correct_azimuths(quiet, rough, gains, scale)
+            if torch.equal(turned.table, rough.table):
+                break
+            rough, gains, scale = _fit_rough(quiet, turned)
+        notes = _note_turned(network.table[:, 0], rough.table[:, 0], names)
+        if piles:
+            rough, gains, scale = _fit_rough(few, rough)
         trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
     shadowing = cast(SectorShadowing, kernel.terms[0])
     variances = (kernel.amplitude * float(part) for part in (*shadowing.shares, kernel.noise))
@@ -202,11 +209,9 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
 
 
 @torch.no_grad()
-def _correct_azimuths(
-    rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
-) -> tuple[Sectors, list[str]]:
-    """Azimuths that rows contradict turned to where they fit, and a note that names all."""
-    table, notes = trend.table.clone(), list[str]()
+def _correct_azimuths(rows: StationRows, trend: Sectors, gains: Tensor, scale: float) -> Sectors:
+    """Those azimuths that rows contradict most turned to where they fit."""
+    table, gained = trend.table.clone(), torch.zeros(len(trend.table))
     for t in range(len(table)):
         part = rows.subset(np.flatnonzero(sector_of(rows.places) == t))
         if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
@@ -218,13 +223,22 @@ def _correct_azimuths(
         likely = _misfits(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
         likely = (likely + 0.5 * (levels[:, 0] / GAIN_DB).square()).amin(1)
         best = int(likely.argmin())
-        gained, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
-        if abs(said) >= CONTRADICTED_DEG and gained > SURE[0] + SURE[1] * len(part.index):
-            found = float((table[t, 0] + said) % ROUND_DEG)
-            notes.append(f"{names[t]} ({float(table[t, 0]):.0f} deg: levels fit {found:.0f})")
-            table[t, 0] = found
-    every = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(notes)}"
-    return replace(trend, table=table), [Caution(every)] if notes else []
+        nats, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
+        if abs(said) >= CONTRADICTED_DEG and nats > SURE[0] + SURE[1] * len(part.index):
+            gained[t], table[t, 0] = nats, (table[t, 0] + said) % ROUND_DEG
+    surest = gained >= SUREST * gained.max()
+    return replace(trend, table=torch.where(surest[:, None], table, trend.table))
+
+
+def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
+    """A note of azimuths (T,) [deg] that were turned by enough to matter, which names all."""
+    off = torch.remainder(found - given + ROUND_DEG / 2, ROUND_DEG) - ROUND_DEG / 2
+    said = [
+        f"{names[t]} ({given[t]:.0f} deg: levels fit {found[t]:.0f})"
+        for t in torch.nonzero(off.abs() >= CONTRADICTED_DEG)[:, 0].tolist()
+    ]
+    every = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(said)}"
+    return [Caution(every)] if said else []
 
 
 def _fit_by_evidence(
