@@ -139,6 +139,9 @@ def test_a_long_log_was_refused_though_it_has_times(roofs, tmp_path, caplog):
     with caplog.at_level("INFO"):
         found = located(tmp_path / "run", *timed)[1]
     assert "20 snapshots in 59 rows" in caplog.text
+    # Of one column of times, which was read as x.
+    stamped = log("stamped", "Timestamp,cell,rssi", lambda i, a, b: f"2026-11-27 10:00:{i:02d},{a},{b}")
+    assert located(tmp_path / "stamped", *stamped)[1] == found
     assert [[row[axis] for axis in "xy"] for row in found] == [[row[axis] for axis in "xy"] for row in wide]
     for name, columns, line, said in (
         ("scan", "scan,cell,rssi", lambda i, a, b: f"{i},{a},{b}", "expected a column of times, or one row"),

@@ -304,7 +304,7 @@ class LinkLevels:
         names: (T,) of the stations, for people.
         keys: (T,) as settings take them.
         station_position: (T, 3), in the world [m]; None where it is not known.
-        limited: stations with rows below a level of hearing that the file states.
+        limited: stations with rows below a level of hearing that the file states, or that lists leave out.
     """
 
     position: np.ndarray
@@ -343,7 +343,10 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     link, called = which.reshape(-1) * count + station, data.row_names
     side = data.censored_side(np.arange(len(data)))
     rows = np.flatnonzero(side <= 0)
-    limited = frozenset(station[side > 0].tolist() if "sensitivity_db" in data.provenance else ())
+    # Lists end at their weakest, of several levels: what piles up there is no receiver's noise.
+    floors = np.unique(np.stack([station, level], 1)[side > 0], axis=0)
+    floor_known = "sensitivity_db" in data.provenance or len(floors) > len(np.unique(floors[:, 0]))
+    limited = frozenset(floors[:, 0].astype(int).tolist() if floor_known else ())
     absent = np.zeros(0, np.int64)
     # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
     # with a station for each place has no empty cells.

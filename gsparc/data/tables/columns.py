@@ -237,11 +237,11 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
         hint = suggest_name(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
         return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
+    if text.startswith(BY_ROW):  # before heads, whose words alone are compared
+        return (Column(role, text.removeprefix(BY_ROW)),)
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
-    if text.startswith(BY_ROW):
-        return (Column(role, text.removeprefix(BY_ROW)),)
     # A factor, as in `pathloss*-1`, is looked for after the head as it is: heads may hold a `*`.
     times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text)
     head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None

@@ -1,11 +1,13 @@
 """Lists of the strongest: recognised, what they leave out, and levels of single rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from networks import network
 from releases import real
 
-from gsparc.data.checks.plausibility import link_levels, sanity_warnings
+from gsparc.data.checks.plausibility import floor_warnings, link_levels, sanity_warnings
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.errors import DataError, Severe
 from gsparc.data.links.strongest import number_lists
@@ -130,6 +132,15 @@ def test_noise_in_lists_of_the_strongest_was_refused():
     assert (data.censored == 0).sum() == (one.measured[listed] >= floor).sum()
     levels = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
     assert levels.min() > floor - 1e-3
+
+
+def test_the_weak_end_of_lists_was_called_a_receivers_noise():
+    """Whoever set the `sensitivity_db` that was advised lost a quarter of good levels."""
+    levels = link_levels(from_arrays(network(0).arrays(6)))
+    pile = np.r_[np.linspace(-118, -113, 60), np.linspace(-100, -80, 40)]
+    piled = replace(levels, station=np.zeros(len(pile), int), level_db=pile)
+    assert floor_warnings(replace(piled, limited=frozenset()))
+    assert not floor_warnings(piled)
 
 
 @pytest.mark.parametrize("absent", ["auto", "silent"])
