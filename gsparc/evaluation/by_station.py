@@ -86,7 +86,8 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     if len(rows) < 2:
         return []
     better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
-    note = f"{method} is better {', '.join(better)} of {len(rows)} stations" if names else ""
+    compared = f"{len(rows)} stations of {FEW} rows or more"
+    note = f"{method} is better {', '.join(better)} of {compared}" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
     return [Table.from_rows(title, shown, named[:WORST].to_dict("records"), note=note)]
