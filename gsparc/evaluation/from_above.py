@@ -36,8 +36,8 @@ def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, *
 
 
 def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (2,) of a map: the known ones of places (n,
-    2) and a share of their extent around them.
+    """Return corners (2,) of a map: the known ones of places
+    (n, 2) and a share of their extent around them.
     """
     known = places[np.isfinite(places).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)

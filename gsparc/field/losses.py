@@ -148,8 +148,8 @@ def task_loss(prediction: Tensor, batch: Batch, settings: LossSettings) -> Tenso
 def channel_loss(
     prediction: Tensor, target: Tensor, mask: Tensor | None = None, snapshot: Snapshot = "none"
 ) -> Tensor:
-    """Return the mean squared error of complex channels scaled to unit power (paper, eq. 5): (B,
-    ...) -> (B,).
+    """Return the mean squared error of complex channels scaled to unit power (paper, eq. 5):
+    (B, ...) -> (B,).
 
     Args:
         prediction, target: alike; (B, A, K) complex where snapshots have offsets.

@@ -48,7 +48,7 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
     """Return the level (n,) [dB] of rows (n,), NaN where nothing was measured,
     and which side they are censored on.
     """
-    target = np.abs(data.target[rows].reshape(len(rows), -1)).astype(np.float64) * data.site.target_scale
+    target = np.abs(data.target.reshape(len(data), -1)[rows]).astype(np.float64) * data.site.target_scale
     power = target if data.site.kind == "rssi" else target**2
     side = data.censored_side(rows)
     if data.mask is not None:
@@ -63,8 +63,8 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
 
 
 def joint_levels(predictor: Predictor, places: np.ndarray, stations: np.ndarray) -> np.ndarray | None:
-    """Return levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places (n,
-    3) [m].
+    """Return levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places
+    (n, 3) [m].
 
     Args:
         predictor: see `Predictor.joint`.

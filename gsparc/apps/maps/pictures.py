@@ -105,8 +105,8 @@ class Layer:
 
 
 def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
-    """Return numbers (count,) below `MOST_COLOURS`, different for classes (ny,
-    nx) that lie beside each other.
+    """Return numbers (count,) below `MOST_COLOURS`, different for classes
+    (ny, nx) that lie beside each other.
     """
     if count <= MOST_COLOURS:
         return np.arange(count)

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import cholesky
 from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.promise import PromiseSettings, gather_promise, predict_rows
+from gsparc.apps.maps.promise import PromiseSettings, gather_promise, held_out_evidence, predict_rows
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
@@ -64,3 +64,12 @@ def test_a_map_of_sixty_rows_was_refused():
     method.fit(data, fold, context)
     promise = gather_promise(Learned(method, GaussianProcess, data, fold, context), PromiseSettings())
     assert len(promise.evidence) >= 100 and promise.coverage(SHARE).share > 0.8
+
+
+def test_a_fold_without_test_rows_ended_in_a_reshape():
+    """`cannot reshape array of size 0`: a promise of a table of few rows."""
+    data, _, _ = drawn(0)
+    every, method = np.arange(ROWS), GaussianProcess()
+    fold = Fold(every, every[:0], every[:0])
+    method.fit(data, fold, FitContext())
+    assert len(held_out_evidence(method, data, fold, every[:0])) == 0
