@@ -63,7 +63,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         interval += f"{100 * high[0]:.1f} points, not told apart from {alike} of {len(low) - 1} others"
     lines = [
         placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
-        f"now {found.before:.1%} of the area with {level:g} {unit} or more"
+        f"now {found.before:.1%} of the area, {found.grid.step:.3g} m squares, with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
         told.format(**best) + f"{100 * found.gain[0]:.1f} points", interval.format(**best),
     ]  # fmt: skip
