@@ -231,11 +231,10 @@ def _correct_azimuths(rows: StationRows, trend: Sectors, gains: Tensor, scale: f
 
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
-    """A note of azimuths (T,) [deg] that were turned by enough to matter, which names all."""
-    off = torch.remainder(found - given + ROUND_DEG / 2, ROUND_DEG) - ROUND_DEG / 2
+    """A note that names all azimuths (T,) [deg] that were turned, also by less in several steps."""
     said = [
         f"{names[t]} ({given[t]:.0f} deg: levels fit {found[t]:.0f})"
-        for t in torch.nonzero(off.abs() >= CONTRADICTED_DEG)[:, 0].tolist()
+        for t in torch.nonzero(found != given)[:, 0].tolist()
     ]
     every = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(said)}"
     return [Caution(every)] if said else []
