@@ -85,13 +85,13 @@ def measure_points(
         ways.append({**pool_figures(one.scores, data, split), **way})
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
-    calls = {i: Predictor(way["method"], data.site).cycle_places(places) for i, way in enumerate(ways)}
+    calls = {str(i): Predictor(way["method"], data.site).cycle_places(places) for i, way in enumerate(ways)}
     # A copy of memory, the unit of the others' times, is made by one thread.
-    using = {COPY: 1, **{i: way["threads"] for i, way in enumerate(ways)}}
+    using = {COPY: 1} | {name: way["threads"] for name, way in zip(calls, ways, strict=True)}
     times = time_interleaved({COPY: reference_copy(), **calls}, clock, using)
     figure = deciding_figure(ways[0], data.site.scored)
     rows = pd.DataFrame(ways, dtype=object).assign(figure=figure)
-    rows[TIMES] = [p50_p95(times[i]) for i in calls]
+    rows[TIMES] = [p50_p95(times[name]) for name in calls]
     rows["ratio_to_copy"] = rows.render_ms_p50 / np.median(times[COPY])
     rows["value"] = [defined_figure(way, figure) for way in ways]
     rows["score"] = [score_of(figure, value) for value in rows.value]

@@ -18,7 +18,7 @@ from PIL import Image
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
-from gsparc.evaluation.metric_formats import LISTED, judged_by
+from gsparc.evaluation.metric_formats import LISTED, PER_SAMPLE, judged_by
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
@@ -72,7 +72,8 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         study.tables.append(tables.table_of_seeds(runs))
     kinds = tables.table_of_leads, tables.table_of_results, tables.table_of_worst
     study.tables += [table for table in (kind(runs) for kind in kinds) if table.rows]
-    study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
+    of_sample = PER_SAMPLE[runs[0].row["kind"]]
+    study.figures = [plots.draw_pareto(runs, fronts), plots.draw_distributions(runs, [of_sample])]
     study.plots = [
         # Ids of several drawings on one page must differ: matplotlib repeats them.
         (str(figure.get_label()), re.sub(IDS, rf"\g<1>p{number}-", plots.to_svg(figure)))
