@@ -11,7 +11,7 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.models.method import Method, predict_in_batches
+from gsparc.models.method import Method, predict_rows
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
 SPECTRA = 4  # test rows drawn
@@ -23,19 +23,15 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     # Spread over the fold: rows beside each other in a file were measured beside each other.
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
-    told = list(predict_in_batches(method, data, rows))
-    # `predict_in_batches` goes station by station: back in the order of rows.
-    back = np.argsort(np.concatenate([chosen for chosen, _, _ in told]))
-    true = np.concatenate([batch.target.numpy() for _, batch, _ in told])[back]
-    predicted = np.concatenate([said.mean.numpy() for _, _, said in told])[back]
+    said, true = predict_rows(method, data, rows), data.targets(rows).numpy()
+    predicted = said.mean.numpy()
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         measured = data.censored_side(rows) == 0  # of a silent row the target is its level
         return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
     assert data.site.grid is not None
-    known = [said.confidence.numpy() for _, _, said in told if said.confidence is not None]
-    confidence = np.concatenate(known)[back] if known else None
+    confidence = None if said.confidence is None else said.confidence.numpy()
     return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
 
 
