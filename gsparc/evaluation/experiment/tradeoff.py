@@ -13,19 +13,18 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import FittedBaseline, fit_baseline
-from gsparc.evaluation.drawing import panels, set_log_axis, style_of
+from gsparc.evaluation.drawing import panels, set_latency_axes, style_of
 from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import DECIDING, axis_of, deciding_figure, lower_is_better, score_of
+from gsparc.evaluation.metric_formats import DECIDING, deciding_figure, score_of
 from gsparc.evaluation.open_runs import Opened
 from gsparc.evaluation.scores import rows_to_score, score_methods
 from gsparc.evaluation.table import Column, Row
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
-from gsparc.models.reduced import Settings, View
+from gsparc.models.reduced import Settings
 from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import COPY, ClockSettings, p50_p95, reference_copy, time_interleaved
@@ -69,9 +68,9 @@ def measure_points(
     ways: list[dict[str, Any]] = []
     whole = None
     for number, (settings, method) in enumerate(candidates):
-        recorded = RecordingView(method)
-        own = pool_figures(score_methods([recorded], data, split, eval_on), data, split)
-        answers = torch.cat(recorded.means)
+        means: list[Tensor] = []
+        own = pool_figures(score_methods([method], data, split, eval_on, means=means), data, split)
+        answers = torch.cat(means)
         whole = answers if whole is None else whole
         own |= {"closeness_db": closeness_db(answers, whole), "num_gaussians": method.count_components()}
         for count in threads:
@@ -102,24 +101,6 @@ def measure_points(
     return points.sort_values("render_ms_p50", kind="stable"), beside
 
 
-class RecordingView(View):
-    """A method whose answers are kept while it is scored.
-
-    Attributes:
-        means: of every batch that was asked.
-    """
-
-    def __init__(self, inner: Method) -> None:
-        super().__init__(inner)
-        self.means: list[Tensor] = []
-
-    def predict(self, query: Query) -> Prediction:
-        """See `Method.predict`."""
-        prediction = self.inner.predict(query)
-        self.means.append(prediction.mean)
-        return prediction
-
-
 def closeness_db(answers: Tensor, whole: Tensor) -> float:
     """Return how near answers (n, ...) are to the full model's [dB], which takes no measurement."""
     # 1e-30: two equal answers, or two of nothing, have no ratio.
@@ -136,44 +117,15 @@ def find_better(point: Row, others: pd.DataFrame) -> str | None:
 def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: str) -> Figure:
     """Draw the points of a method beside others, see `measure_points`."""
     best, beaten = points[points.front == 1], points[points.front == 0]
-    figure_name = best.figure.iloc[0]
-    lines = 0.16 * (len(best) + 1)  # inches of the legend
-    figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
+    figure, ((axes,),) = panels(7.5, 4.2)
     axes.scatter(beaten.render_ms_p50, beaten.value, s=9, c="0.75", label="beaten")
     reach = [np.zeros(len(best)), best.render_ms_p95 - best.render_ms_p50]
-    own, label = style_of(method).colour, "not beaten (to 95th percentile)"
-    how = {"fmt": "o-", "color": own, "capsize": 2, "lw": 1, "ms": 4, "label": label}
-    axes.errorbar(best.render_ms_p50, best.value, xerr=reach, **how)
-    text = ["       median  accuracy  settings"]
-    for number, row in enumerate(best.to_dict("records"), 1):
-        above = (-9, 5 if number % 2 else -13)  # or below: near points would cover each other's numbers
-        place = row["render_ms_p50"], row["value"]
-        axes.annotate(str(number), place, above, textcoords="offset points", color=own, fontsize=9)
-        winner = find_better(row, others)
-        text.append(
-            f"{number:2d}  {place[0]:7.3g} ms  {place[1]:7.4g}  {row['label']}"
-            + (f" ({winner} is better)" if winner else "")
-        )
-    for other in others.itertuples():
-        look, place = style_of(other.label), (other.render_ms_p50, other.value)
-        axes.plot(*place, ms=6, **look.marked)
-        axes.annotate(other.label, place, (6, -4), textcoords="offset points", color=look.colour)
-    set_log_axis(axes)
-    if lower_is_better(figure_name):
-        axes.set_yscale("log")
-        axes.invert_yaxis()
-    else:
-        low, high = best.value.min(), best.value.max()  # far-off others would flatten the front
-        axes.set_ylim(low - 0.4 * (high - low) - 0.5, high + 0.15 * (high - low) + 0.1)
-        below = others.label[others.value < axes.get_ylim()[0]]
-        if len(below):
-            axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
-    axes.set(xlabel="one query end to end, median [ms]", ylabel=axis_of(figure_name))
-    axes.grid(alpha=0.3)
+    how: dict[str, Any] = {"fmt": "o-", "color": style_of(method).colour, "capsize": 2, "lw": 1, "ms": 4}
+    axes.errorbar(best.render_ms_p50, best.value, xerr=reach, label="not beaten", **how)
+    beside = zip(others.label, others.render_ms_p50, others.value, strict=True)
+    set_latency_axes(axes, best.figure.iloc[0], best.value, beside)
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
-    legend.axis("off")
-    legend.text(0, 1, "\n".join(text), va="top", family="monospace", fontsize=7.5)
     return figure
 
 

@@ -14,8 +14,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis, style_of
-from gsparc.evaluation.metric_formats import heading_of, lower_is_better, score_of
+from gsparc.evaluation.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
+from gsparc.evaluation.metric_formats import heading_of, score_of
 from gsparc.evaluation.report.runs import Run, distinct_baselines, error_sizes
 from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
 from gsparc.prediction.pareto import pareto_front
@@ -56,13 +56,9 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
                 fmt="o", ms=4, lw=0.7, color=style["color"], label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, estimate.value))
-    for base in _rivals(runs):
-        value, ms, look_of = base["value"], base["query_ms"], style_of(base["method"])
-        if ms is not None:
-            axes.plot([ms], [value], **look_of.marked, ms=4)
-            how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
-            axes.annotate(base["method"], (ms, value), (4, -3), **how)
-            points.append((ms, value))
+    others = [(base["method"], base["query_ms"], base["value"]) for base in _rivals(runs)]
+    others = [other for other in others if other[1] is not None]
+    points += [other[1:] for other in others]
     for columns in fronts:
         if name in columns:
             x, y = (columns[key][columns["front"] == 1] for key in ("render_ms_p50", name))
@@ -70,16 +66,7 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
     best = pareto_front([x for x, _ in points], [score_of(name, y) for _, y in points])
     x, y = [points[i][0] for i in best], [points[i][1] for i in best]
     axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
-    set_log_axis(axes)
-    axes.set_ylabel(heading_of(name))
-    # Errors span decades; minposy is infinite where none is above 0.
-    if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
-        axes.set_yscale("log")
-    if name == "psnr_db" and len(points) > 1:  # a black image at 6 dB would flatten everything above 25
-        values = [value for _, value in points]
-        middle, best_value = float(np.median(values)), max(values)
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best_value - middle), 5.0)))
-    axes.set_xlabel("one query [ms], median; whisker to the 95th percentile")
+    set_latency_axes(axes, name, [value for _, value in points], others)
     handles, labels = axes.get_legend_handles_labels()
     axes.legend(handles, [shorten_setting(label, 44) for label in labels], fontsize=6.5)
     figure.set_label("Accuracy against latency (95 % intervals)")
