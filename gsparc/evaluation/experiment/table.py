@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.experiment.latency import Latency
+from gsparc.evaluation.experiment.latency import SPEED, TIMED
 from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
@@ -79,13 +79,12 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
-def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
         filled: cells.
-        timed: latencies by dataset and method, of the dataset's first split and shown there alone: models
-            of fewer measurements answer faster.
+        timed: of `time_by_dataset`; None: nothing was timed.
 
     Returns:
         Columns `ROW` (see `columns_of_csv`), and `results`, a row of each seed or draw; NaN where something
@@ -123,17 +122,10 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())
-    problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
-    # Reversed, so that of a dataset's splits the first remains.
-    first = dict(reversed(problems))  # split of each dataset
-    times = [
-        timed.get(row.dataset, {}).get(row.method) if row.split == first[row.dataset] else None
-        for row in rows.itertuples()
-    ]
-    for name, field in (("query_ms", "p50_ms"), ("query_p95_ms", "p95_ms"), ("to_copy", "to_copy")):
-        rows[name] = [getattr(one, field, np.nan) for one in times]
-    order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
-    rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
+    timed = pd.DataFrame(columns=TIMED) if timed is None else timed
+    rows = rows.merge(timed, "left").astype(dict.fromkeys(SPEED, float))
+    rows["order"] = rows.groupby(PROBLEM, sort=False).ngroup()
+    rows = rows.sort_values(["order", "budget_s", "method"], na_position="first")
     return rows[[*ROW, "results"]].reset_index(drop=True)
 
 
