@@ -33,15 +33,14 @@ SECOND: dict[Scored, str] = {
 }  # fmt: skip
 # Plain methods that a reader could have without gsparc; remarks say where one of them wins.
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
-BESIDE = {  # figures beside the score, by their columns
-    "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
-    "chi2": CALIBRATION,
+BESIDE = {  # figures beside the score, and their headings, by their columns
+    "coverage": ("interval/coverage_90", Column("in 90 % interval", ".2f", of="coverage")),
+    "outage": ("outage/brier", Column("outage, Brier score", ".4f", of="outage")),
+    "after_constant": (
+        "rmse_db_after_constant", Column("after a constant, dB", ".2f", of="after_constant"),
+    ),
+    "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
 }  # fmt: skip
-BESIDE_COLUMNS = (
-    Column("after a constant, dB", ".2f", of="after_constant"),
-    Column("in 90 % interval", ".2f", of="coverage"), Column("outage, Brier score", ".4f", of="outage"),
-    Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2"),
-)  # fmt: skip
 OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
 LITTLE = 2 / 3  # share of a budget below which a longer one is proposed
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
@@ -68,7 +67,7 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         rows.append({
             **own, **asdict(one.cell), "result": own, "draws": one.drawn, "score_db": score_db(own),
             "second_figure": second, "second_value": own.get(second),
-            **{name: own.get(key) for name, key in BESIDE.items()},
+            **{name: own.get(key) for name, (key, _) in BESIDE.items()},
             "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
     if not rows:
@@ -235,7 +234,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second_figure.iloc[0], of="second_value")),
-        *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
+        *((block[name].notna().any(), column) for name, (_, column) in BESIDE.items()),
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
