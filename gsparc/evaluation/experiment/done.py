@@ -87,20 +87,12 @@ class State:
         names = set(asdict(self)) - ({"program"} if reuse else set())
         return all(record.get(name) == getattr(self, name) for name in names)
 
-    def changes(self, record: Mapping[str, Any]) -> str:
-        """Return in what a record is of another state: `settings changed (effort); program changed`."""
-        said = []
-        for name, value in asdict(self).items():
-            before = record.get(name)
-            if before == value:
-                continue
-            names = []
-            if isinstance(value, dict) and isinstance(before, dict):
-                names = [key for key in {**before, **value} if before.get(key) != value.get(key)]
-            elif name == "program":
-                names = _edited_since(float(record.get("began", math.inf)))
-            said.append(f"{name} changed" + (f" ({list_first(names, 3)})" if names else ""))
-        return "; ".join(said)
+    def changes(self, record: Mapping[str, Any]) -> list[str]:
+        """Return in what a record is of another state: `settings.effort`, `program` and its newer files."""
+        own = asdict(self)
+        now, before = (dict(dotted_settings({name: of.get(name) for name in own})) for of in (own, record))
+        names = [name for name in before | now if before.get(name) != now.get(name)]
+        return names + (_edited_since(record.get("began", math.inf)) if "program" in names else [])
 
 
 def measurements_hash(data: Measurements) -> str:
@@ -170,7 +162,7 @@ def recorded(folder: Path, state: State, unread: State | None = None) -> Iterato
     left = None
     if record is None or record.get("ended") or not state.same(record):
         if record is not None and not state.same(record):
-            log.info("%s: begun anew: %s", folder, state.changes(record))
+            log.info("%s: begun anew, as these changed: %s", folder, list_first(state.changes(record)))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "unread": unread and asdict(unread), "began": time.time(), "ended": False}
         write_whole(folder / RECORD, json.dumps(record, indent=1))
