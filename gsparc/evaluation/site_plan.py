@@ -96,10 +96,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
 
 
 def draw_site(
-    data: Measurements,
-    path: Path,
-    levels: LinkLevels | None = None,
-    steps: Sequence[tuple[int, LevelStep]] = (),
+    data: Measurements, path: Path, levels: LinkLevels | None, steps: Sequence[tuple[int, LevelStep]] = ()
 ) -> None:
     """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
