@@ -25,14 +25,7 @@ from gsparc.evaluation.summary import write_samples
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.prediction import timing
-from gsparc.prediction.timing import (
-    COPY,
-    ClockSettings,
-    cycle_queries,
-    draw_queries,
-    p50_p95,
-    time_interleaved,
-)
+from gsparc.prediction.timing import COPY, ClockSettings, p50_p95, query_calls, time_interleaved
 
 log = logging.getLogger(__name__)
 
@@ -171,12 +164,12 @@ def time_methods(
     Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
     clock = clock or ClockSettings()
-    singles = cycle_queries(methods, draw_queries(data, rows, 1))
+    singles = query_calls(methods, data, rows)
     one = time_interleaved({**singles, COPY: timing.reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
     # A median: one interruption by another process moves a mean of few rounds.
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
-    many = time_interleaved(cycle_queries(quick, draw_queries(data, rows, BATCH)), fewer)
+    many = time_interleaved(query_calls(quick, data, rows, BATCH), fewer)
     copy_ms = float(np.median(one[COPY]))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {

@@ -16,9 +16,8 @@ from gsparc.models.method import Method
 from gsparc.prediction.timing import (
     COPY,
     ClockSettings,
-    cycle_queries,
-    draw_queries,
     p50_p95,
+    query_calls,
     reference_copy,
     time_interleaved,
 )
@@ -39,13 +38,12 @@ TIMED = ["dataset", "split", "method", *SPEED]
 
 def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, dict[str, float]]:
     """Return `SPEED` and the number of `rounds` by method, of the first of its checkpoints."""
-    data, split = problem.data, problem.folds
     methods: dict[str, Method] = {}
     for one in filled:
         if one.cell.method not in methods:
             # The first of a method's cells stands for all of its budgets and seeds.
             methods[one.cell.method] = loading.load(one.checkpoint)[0]
-    calls = cycle_queries(methods, draw_queries(data, split.folds[0].test))
+    calls = query_calls(methods, problem.data, problem.folds.folds[0].test)
     found: dict[str, dict[str, float]] = {}
 
     def timed(names: Iterable[str], clock: ClockSettings) -> None:

@@ -25,7 +25,7 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import move_rows
 from gsparc.prediction.pareto import defined_figure
-from gsparc.prediction.timing import ClockSettings, cycle_queries, draw_queries, p50_p95, time_interleaved
+from gsparc.prediction.timing import ClockSettings, p50_p95, query_calls, time_interleaved
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -201,7 +201,7 @@ class Study:
             file: loading.rebuild_method(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
-        times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
+        times = time_interleaved(query_calls(methods, data, split.folds[0].test), self.clock)
         rows[["query_ms", "query_p95_ms"]] = [p50_p95(times[file]) for file in rows.model]
         return rows[list(ROW)]
 
