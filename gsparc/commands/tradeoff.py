@@ -53,10 +53,9 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, with_reduction(method, some, inputs)) for some in settings]
-    others = tradeoff.fit_others(run, config.baselines, config.eval_on)
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
     how = data, run.split, config.eval_on, clock
-    points, beside = tradeoff.measure_points(candidates, threads, others, *how)
+    points, beside = tradeoff.measure_points(candidates, threads, config.baselines, *how)
     kept = points[points.kept_with_model == 1]
     if config.store:
         operating_point.store_points(Path(config.ckpt), kept.to_dict("records"), inputs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,10 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.baselines import FittedBaseline, fit_baseline
+from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.drawing import panels, set_latency_axes, style_of
 from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import DECIDING, deciding_figure, score_of
-from gsparc.evaluation.open_runs import Opened
+from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.scores import rows_to_score, score_methods
 from gsparc.evaluation.table import Column, Row
 from gsparc.models.method import Method
@@ -42,22 +41,21 @@ CLOSEST_DB = 100.0  # the precision of float32
 
 
 def measure_points(
-    candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int],
-    others: Mapping[str, FittedBaseline], data: Measurements, split: Split, eval_on: str,
-    clock: ClockSettings,
+    candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int], baselines: Sequence[str],
+    data: Measurements, split: Split, eval_on: str, clock: ClockSettings,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:  # fmt: skip
     """Score and time ways of answering; the first is the full model, which the others are compared with.
 
     Args:
         candidates: what a method is reduced by, and the method that answers so.
         threads: CPU threads that each is timed with.
-        others: fitted methods by name, which are timed beside them.
+        baselines: names of others beside them; those whose deciding figure is not defined are left out.
         data, split: as the model was trained with, its fold.
         eval_on: rows whose figures are shown.
         clock: how long to measure.
 
     Returns:
-        A row per candidate and number of threads, and one per other, each the fastest first. Columns are the
+        A row per candidate and number of threads, the fastest first, and one per other. Columns are the
         figures, `FIRST` and `LAST` (see `tradeoff.csv`), `settings`, and of the deciding figure its name
         `figure`, `value` and `score`, larger is better. `front` marks those that no candidate beats,
         `kept_with_model` those by their closeness to the full model, which takes no measurement.
@@ -73,28 +71,30 @@ def measure_points(
         answers = torch.cat(means)
         whole = answers if whole is None else whole
         own |= {"closeness_db": closeness_db(answers, whole), "num_gaussians": method.count_components()}
-        for count in threads:
-            label = f"{describe_point(settings)}, {count} thread{'s' * (count > 1)}"
-            way = {"label": label, "threads": count, "method": method, "settings": settings}
+        for used in threads:
+            label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
+            way = {"label": label, "threads": used, "method": method, "settings": settings}
             ways.append({**own, **way, **{f"set/{knob}": _cell(value) for knob, value in settings.items()}})
         if number % 10 == 9:
             log.info("%d of %d faster variants scored", number + 1, len(candidates))
-    for name, one in others.items():
-        way = {"label": name, "threads": 1, "method": one.methods[0]}
-        ways.append({**pool_figures(one.scores, data, split), **way})
+    figure, count = deciding_figure(ways[0], data.site.scored), len(ways)
+    for name in baselines:
+        fitted = fit_baseline(name, data, split, eval_on)
+        own = pool_figures(fitted.scores, data, split)
+        if own[figure] is not None:
+            ways.append({**own, "label": name, "threads": 1, "method": fitted.methods[0]})
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
     calls = {str(i): Predictor(way["method"], data.site).cycle_places(places) for i, way in enumerate(ways)}
     # A copy of memory, the unit of the others' times, is made by one thread.
     using = {COPY: 1} | {name: way["threads"] for name, way in zip(calls, ways, strict=True)}
     times = time_interleaved({COPY: reference_copy(), **calls}, clock, using)
-    figure = deciding_figure(ways[0], data.site.scored)
     rows = pd.DataFrame(ways, dtype=object).assign(figure=figure)
     rows[TIMES] = [p50_p95(times[name]) for name in calls]
     rows["ratio_to_copy"] = rows.render_ms_p50 / np.median(times[COPY])
     rows["value"] = [defined_figure(way, figure) for way in ways]
     rows["score"] = [score_of(figure, value) for value in rows.value]
-    points, beside = rows[: -len(others) or None].copy(), rows[len(rows) - len(others) :]
+    points, beside = rows[:count].copy(), rows[count:]
     for column, by in (("front", points.score), ("kept_with_model", points.closeness_db)):
         best = pareto_front(points.render_ms_p50.to_list(), by.to_list())
         points[column] = points.index.isin(best).astype(int)
@@ -127,13 +127,6 @@ def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: s
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
     return figure
-
-
-def fit_others(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, FittedBaseline]:
-    """Fit baselines whose deciding figure is defined."""
-    fitted = {name: fit_baseline(name, run.data, run.split, eval_on) for name in baselines}
-    figure = DECIDING[run.data.site.scored]
-    return {name: one for name, one in fitted.items() if one.scores.figures()[figure] is not None}
 
 
 def columns_of_csv(points: pd.DataFrame) -> dict[str, list[Any]]:
