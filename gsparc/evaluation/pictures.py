@@ -11,7 +11,8 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.models.method import Method, Prediction, predict_rows
+from gsparc.models.method import Method, Prediction
+from gsparc.prediction.confidence import predict_rows
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
 SPECTRA = 4  # test rows drawn

@@ -234,12 +234,6 @@ class Method(MethodFactory):
         }
 
 
-def predict_rows(method: Method, data: Measurements, rows: np.ndarray, size: int = 64) -> Prediction:
-    """Return what a method says of rows (n,), in their order; see `predict_in_batches`."""
-    order, _, said = zip(*predict_in_batches(method, data, rows, size), strict=True)
-    return Prediction.joined(said, torch.from_numpy(np.argsort(np.concatenate(order))))
-
-
 def predict_in_batches(
     method: Method, data: Measurements, rows: np.ndarray, size: int = 64
 ) -> Iterator[tuple[np.ndarray, Batch, Prediction]]:

@@ -17,7 +17,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
-from gsparc.models.method import Method, Prediction, predict_rows, predict_with_threads
+from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold
@@ -27,6 +27,12 @@ from gsparc.processes.stored import Stored, from_plain, to_plain
 
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
+
+
+def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Prediction:
+    """Return what a method says of rows (n,), in their order; see `predict_in_batches`."""
+    order, _, said = zip(*predict_in_batches(method, data, rows), strict=True)
+    return Prediction.joined(said, torch.from_numpy(np.argsort(np.concatenate(order))))
 
 
 def gather_evidence(
