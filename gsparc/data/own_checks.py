@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems, suggest_name
 from gsparc.data.raw import Raw
-from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
+from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, TrainTest
 from gsparc.ops import SphereGrid
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
@@ -105,15 +105,15 @@ class Checker:
             self.row_names = [str(name) for name in names]
         return self.row_names
 
-    def read_array(self, name: str, *shapes: Shape, kinds: str | None = None) -> np.ndarray | None:
-        """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
-        array, kinds = self.raw.arrays.get(name), kinds or KINDS.get(name, REAL)
+    def read_array(self, name: str, *shapes: Shape, holds: str = "") -> np.ndarray | None:
+        """Return array `name` if it `holds` what it should and fits one of `shapes` (None: any length)."""
+        array, holds = self.raw.arrays.get(name), holds or FIELDS[name].holds
         if array is None:
             return None
         # Images of uint16 hold no stated largest value; of uint8 it is 255.
-        wide = kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
-        if array.dtype.kind not in kinds or wide:
-            return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
+        wide = holds == POWER and array.dtype.kind == "u" and array.itemsize > 1
+        if array.dtype.kind not in HOLDS[holds] or wide:
+            return self.refuse(name, f"expected {holds}, found dtype {array.dtype}")
         return array if self.has_shape(name, array, *shapes) else None
 
     def read_real(self, name: str, *shapes: Shape) -> np.ndarray | None:

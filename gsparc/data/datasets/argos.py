@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import centre_positions, rounded_rms
-from gsparc.data.datasets.campaign import Expected, Release, StandIn, check_layout, load_stand_in, read_split
+from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
 from gsparc.data.errors import DataError, Problems, readable
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
+from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
@@ -143,9 +144,11 @@ def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
 def _places(root: Path, of: str, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
     if of == "true":
         path = root / "positions.npy"
-        known = Raw({"rx_position": _loaded(path, "true positions exist in the stand-in only")})
-        layout = {"rx_position": Expected((len(up), 3), place=True)}
-        return check_layout(known, path, layout)["rx_position"].astype(np.float64)
+        stored = _loaded(path, "true positions exist in the stand-in only")
+        check = Checker(Raw({"rx_position": np.atleast_2d(stored)}), str(path))
+        places = check.read_positions("rx_position", len(up))
+        check.problems.raise_if_any()
+        return np.asarray(places)
     if of != "encoder":
         raise DataError(f"dataset.positions={of!r}: expected encoder or true")
     # The encoder sees training rows alone: uplinks of test rows must not shape its codes.

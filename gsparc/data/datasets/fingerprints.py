@@ -13,10 +13,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Expected, check_layout
+from gsparc.data.datasets.campaign import check_layout
 from gsparc.data.errors import DataError, list_first, readable, suggest_name
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables import is_table
 
@@ -26,14 +25,6 @@ LOUDEST, FAINTEST = 20.0, -160.0  # levels of no receiver lie beyond [dBm]
 STOREY_M = 3.7  # between floors of a table, which has no heights
 NUMBERS = {"floor": "floor", "building": "building", "walk": "walk", "month": "campaign", "round": "campaign"}
 COLUMNS = {"FLOOR": "floor", "BUILDINGID": "building", "TIMESTAMP": "time_s"}
-LAYOUT = {
-    "rss_dbm": Expected(("S", "P")),
-    "position": Expected(("S", "D"), place=True),
-    "access_point": Expected(("P",), LABELS, optional=True),
-    "test": Expected(("S",), FLAGS, optional=True),
-    "time_s": Expected(("S",), optional=True),
-}
-UNPLACED = LAYOUT | {"position": Expected(("S", "D"))}  # NaN where nobody knows
 
 
 @dataclass(frozen=True)
@@ -88,7 +79,7 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
     raw = _of_table(path, placed) if is_table(path) else read_raw(path)
     if not placed:
         raw.arrays.setdefault("position", np.full((len(raw.arrays.get("rss_dbm", ())), 3), np.nan))
-    checked = check_layout(raw, path, LAYOUT if placed else UNPLACED)
+    checked = check_layout(raw, path, "fingerprints", places=["position"] * placed)
     level, position = checked["rss_dbm"].astype(np.float32), checked["position"].astype(np.float64)
     count, dimensions = position.shape
     if dimensions not in (2, 3):

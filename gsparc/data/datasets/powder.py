@@ -32,11 +32,6 @@ NO_VALUE_DB = -101.0
 WALKER_M, STATION_M = 1.5, 10.0
 STATIONS = "location_coordinates.json"
 LATITUDE, LONGITUDE, TIME = "tx_x_coord", "tx_y_coord", "timestamp"
-NPZ = {
-    **{"mobile_position": "tx_position", "station_position": "station_position", "rssi_db": "rssi_db"},
-    **{"latitude": "latitude", "longitude": "longitude"},
-    **{"station": "station_name", "frequency_hz": "carrier_hz"},
-}
 
 
 def read_powder(
@@ -80,7 +75,7 @@ def read_powder(
 
 
 def _of_npz(path: Path) -> Raw:
-    raw = read_converted(path, NPZ)
+    raw = read_converted(path, "powder npz")
     places, stations = raw.arrays.pop("tx_position"), raw.arrays.pop("station_position")
     degrees = np.stack([raw.arrays["latitude"], raw.arrays["longitude"]], axis=1)
     # Rows are known in degrees and in metres: over a campus an affine map is good to centimetres.
