@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsparc.data.limits import Checked, choice, setting, whole
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
@@ -14,7 +15,7 @@ from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 
 @dataclass(frozen=True)
-class Campaign:
+class Campaign(Checked):
     """One dataset.
 
     Attributes:
@@ -32,9 +33,9 @@ class Campaign:
     sampling: Sampling = field(default_factory=Sampling)
     spectrum: SpectrumSettings = field(default_factory=SpectrumSettings)
     csi: ArraySettings = field(default_factory=ArraySettings)
-    shard: int = 400
-    check: int = 128
-    measurement: str = "spectrum"
+    shard: int = setting(400, whole(1))
+    check: int = setting(128, whole(0))
+    measurement: str = setting("spectrum", choice("spectrum", "csi"))
 
     def inputs(self) -> dict[str, str]:
         """Return the SHA-256 of the files that a scene and its receivers are read from."""
@@ -45,9 +46,3 @@ class Campaign:
             for file in files
             if file is not None and Path(file).is_file()
         }
-
-    def __post_init__(self) -> None:
-        if self.measurement not in ("spectrum", "csi"):
-            raise ValueError(f"measurement={self.measurement}: expected spectrum or csi")
-        if self.shard < 1 or self.check < 0:
-            raise ValueError("shard is at least 1, check at least 0")

@@ -81,7 +81,7 @@ def test_words_become_a_deliverable(text, kind, tolerance):
     {"deliverable": "csi -20 dB please"}, {"rays": 0}, {"rays": 2}, {"confidence": 1.0}, {"probes": 3},
 ])  # fmt: skip
 def test_bad_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"effects\." + next(iter(wrong))):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         AutoSettings(**wrong)
 
 

@@ -419,9 +419,9 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
     ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
     ({"transmitter_m": (9.0, 1.0)}, "three finite numbers"),
     ({"transmitters": [{"position_m": [1, 1, 1]}]}, "not both"),
-    ({"transmitter_m": None, "transmitters": []}, "empty list"),
+    ({"transmitter_m": None, "transmitters": []}, "one transmitter or more"),
     ({"transmitter_m": None, "transmitters": [{"position_m": [1, 1, 1], "sectors": 3}]}, "isotropic"),
-    ({"over": "sea"}, "expected one of zero"),
+    ({"over": "sea"}, "over='sea': one of zero"),
     ({"receivers": {"knd": "grid"}}, "no such setting"),
 ])  # fmt: skip
 def test_bad_scenes_are_refused(tmp_path, changes, words):

@@ -61,8 +61,8 @@ def test_a_third_coordinate_beside_degrees_was_ignored():
     ({"position_m": [0, 0, 1], "position_deg": [1, 2]}, "give position_m"),
     ({"position_m": [0, 0]}, "height_m"),
     ({"position_m": [0, float("nan"), 1]}, "finite"),
-    ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn: expected one of iso"),
-    ({"position_m": [0, 0, 1], "sectors": 0}, "1 to 12"),
+    ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn': one of iso"),
+    ({"position_m": [0, 0, 1], "sectors": 0}, "at most 12"),
     ({"position_deg": [95.0, 0.0], "height_m": 2}, "outside -90 to 90"),
     ({"name": "a", "position_m": [0, 0, 1]}, "'a' twice"),
 ])  # fmt: skip
@@ -111,9 +111,9 @@ def test_bad_times_are_refused(cell, words, tmp_path):
 
 
 @pytest.mark.parametrize("settings, words", [
-    ({"kind": "circle"}, "expected one of area"),
-    ({"inside": "maybe"}, "drop or refuse"),
-    ({"kind": "grid", "spacing_m": 0.0}, "positive"),
+    ({"kind": "circle"}, "circle': one of area"),
+    ({"inside": "maybe"}, "one of drop, refuse"),
+    ({"kind": "grid", "spacing_m": 0.0}, "spacing_m=0.0: a number above 0"),
     ({"kind": "grid", "spacing_m": 1e-4}, "places"),
     ({"kind": "streets"}, "no streets"),
     ({"kind": "file"}, "file is missing"),

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsparc.data import limits
 from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import finite_array
+from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
@@ -26,7 +27,8 @@ log = logging.getLogger(__name__)
 
 BUILDERS = {"conference_room": conference_room}
 SOURCES = ("builder", "builtin", "xml", "file", "room")
-OVER = ("zero", "ground", "roofs")
+PLACE = limits.Limit("three finite numbers [m]", lambda value: limits.finite_array(value).shape == (3,))
+SEVERAL = limits.Limit("a list of one transmitter or more", bool)
 MIN_RECEIVERS = 20
 SAME_PLACE_M = 0.01  # a station nearer to a transmitter of the scene is that transmitter
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
@@ -36,7 +38,7 @@ CEILING = 0.85  # and its share of the height of a closed room
 
 
 @dataclass(frozen=True)
-class SceneSettings:
+class SceneSettings(Checked):
     """One scene, chosen by exactly one of `SOURCES`.
 
     Attributes:
@@ -64,16 +66,16 @@ class SceneSettings:
 
     name: str
     num_receivers: int
-    carrier_hz: float
-    bandwidth_hz: float
-    subcarriers: int
-    transmitter_m: tuple[float, float, float] | None = None
-    transmitters: Sequence[Mapping[str, Any]] | None = None
+    carrier_hz: float = setting(MISSING, limits.POSITIVE)
+    bandwidth_hz: float = setting(MISSING, limits.number(0))
+    subcarriers: int = setting(MISSING, whole(1))
+    transmitter_m: tuple[float, float, float] | None = setting(None, or_null(PLACE))
+    transmitters: Sequence[Mapping[str, Any]] | None = setting(None, or_null(SEVERAL))
     area_m: tuple[tuple[float, float], tuple[float, float]] | None = None
     height_m: tuple[float, float] = (1.2, 1.8)
-    over: str = "zero"
+    over: str = setting("zero", choice("zero", "ground", "roofs"))
     receivers: Mapping[str, Any] | None = None
-    test_share: float = 0.3
+    test_share: float = setting(0.3, limits.SHARE)
     builder: str | None = None
     builtin: str | None = None
     xml: str | None = None
@@ -84,24 +86,15 @@ class SceneSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         sources = [k for k in SOURCES if getattr(self, k) is not None]
         if len(sources) != 1:
             names = ", ".join(sources) or "none"
             raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {names}")
         if self.transmitter_m is not None and self.transmitters is not None:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
-        if self.transmitters is not None and not self.transmitters:
-            raise ValueError("scene.transmitters: an empty list; expected a transmitter or more")
-        if self.transmitter_m is not None and finite_array(self.transmitter_m).shape != (3,):
-            raise ValueError(f"scene.transmitter_m={self.transmitter_m}: expected three finite numbers [m]")
-        if self.over not in OVER:
-            raise ValueError(f"scene.over={self.over}: expected one of {', '.join(OVER)}")
         if layout_from_config(self.receivers).kind == "area" and self.num_receivers < MIN_RECEIVERS:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
-        if not (self.carrier_hz > 0 and self.bandwidth_hz >= 0 and self.subcarriers >= 1):
-            raise ValueError("scene: carrier_hz is positive, bandwidth_hz at least 0, subcarriers at least 1")
-        if not 0 < self.test_share < 1:
-            raise ValueError(f"scene.test_share={self.test_share}: expected a share between 0 and 1")
 
     @property
     def frequency_hz(self) -> np.ndarray:

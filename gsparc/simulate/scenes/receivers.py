@@ -12,14 +12,13 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import from_settings
+from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.query_places import read_query_places, read_times
 from gsparc.simulate.scenes.solid import Solid
 
 log = logging.getLogger(__name__)
 
-KINDS = ("area", "grid", "streets", "file")
-INSIDE = ("drop", "refuse")
 MOST = 1_000_000  # places
 
 
@@ -39,7 +38,7 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Layout:
+class Layout(Checked):
     """The settings `scene.receivers`.
 
     Attributes:
@@ -50,18 +49,10 @@ class Layout:
             None: an error out of a file, else left out.
     """
 
-    kind: str = "area"
-    spacing_m: float = 5.0
+    kind: str = setting("area", choice("area", "grid", "streets", "file"))
+    spacing_m: float = setting(5.0, POSITIVE)
     file: str | None = None
-    inside: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"scene.receivers.kind={self.kind}: expected one of {', '.join(KINDS)}")
-        if self.inside not in (None, *INSIDE):
-            raise ValueError(f"scene.receivers.inside={self.inside}: expected {' or '.join(INSIDE)}")
-        if not 0 < self.spacing_m < np.inf:
-            raise ValueError(f"scene.receivers.spacing_m={self.spacing_m}: expected a positive number")
+    inside: str | None = setting(None, or_null(choice("drop", "refuse")))
 
 
 class Placed(NamedTuple):

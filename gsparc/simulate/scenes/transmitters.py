@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import from_settings
+from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
 
 PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1
@@ -48,7 +49,7 @@ class Transmitter:
 
 
 @dataclass(frozen=True)
-class Mast:
+class Mast(Checked):
     """An entry of `scene.transmitters`.
 
     Attributes:
@@ -65,10 +66,10 @@ class Mast:
     position_m: Sequence[float] | None = None
     position_deg: Sequence[float] | None = None
     height_m: float | None = None
-    pattern: str | None = None
+    pattern: str | None = setting(None, or_null(choice(*PATTERNS)))
     azimuth_deg: float = 0.0
     downtilt_deg: float = 0.0
-    sectors: int = 1
+    sectors: int = setting(1, whole(1, 12))
 
 
 def place_transmitters(
@@ -90,12 +91,8 @@ def place_transmitters(
     for number, entry in enumerate(entries):
         where = f"scene.transmitters[{number}]"
         mast = from_settings(Mast, entry, where)
-        if not 1 <= mast.sectors <= 12:
-            raise ValueError(f"{where}.sectors={mast.sectors}: expected 1 to 12")
         # Isotropic sectors of a mast would all be the same station.
         pattern = mast.pattern or ("tr38901" if mast.sectors > 1 else "iso")
-        if pattern not in PATTERNS:
-            raise ValueError(f"{where}.pattern={pattern}: expected one of {', '.join(PATTERNS)}")
         position = _position(mast, where, surface, georeference)
         name = mast.name or f"tx{number}"
         for sector in range(mast.sectors):
