@@ -64,8 +64,10 @@ class Checker:
         Raises:
             DataError: arrays of another type or number of axes than the schema's: nobody else looks at these.
         """
-        sound = True
-        for name in self.raw.arrays:
+        sound, arrays = True, self.raw.arrays
+        # What is ignored must not be taken for an array of the same name that is made of others.
+        self.raw = replace(self.raw, arrays={name: arrays[name] for name in arrays if name in FIELDS})
+        for name in arrays:
             if name in FIELDS:
                 unit = self.raw.units.get(name, FIELDS[name].unit)
                 if unit != FIELDS[name].unit:
@@ -76,7 +78,7 @@ class Checker:
                 sound &= self.read_array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
-            if hint := suggest_name(name, [known for known in FIELDS if known not in self.raw.arrays], 0.6):
+            if hint := suggest_name(name, [known for known in FIELDS if known not in arrays], 0.6):
                 self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")

@@ -88,29 +88,22 @@ class Links:
     Attributes:
         static_end: which end the stations, or the one static end, are; None where both move.
         stations: in world coordinates; None where there is one static end, or none.
-        station, place: (S,) int64, see `Measurements`; None without stations.
-        censored: (S,) int8, see `Measurements`; None where nothing is.
-        run: (S,) int64; None without runs.
         unknown_transmitter: powers of a transmitter whose place nobody gave.
         georeference: of the world's origin, where places came in degrees.
     """
 
     static_end: End | None
     stations: Stations | None = None
-    station: np.ndarray | None = None
-    place: np.ndarray | None = None
-    censored: np.ndarray | None = None
-    run: np.ndarray | None = None
     unknown_transmitter: bool = False
     georeference: Georeference | None = None
 
-    def name_rows(self, rows: list[str]) -> list[str]:
-        """Return names (S,) of rows, with their stations."""
-        if self.stations is None or self.station is None:
+    def name_rows(self, rows: list[str], station: np.ndarray | None) -> list[str]:
+        """Return names (S,) of rows, with the stations (S,) that they are of."""
+        if self.stations is None or station is None:
             # A row of a file of links is a place and a station; the place alone would name several rows.
             return rows
         names = self.stations.shown
-        return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
+        return [f"{row}, station {names[t]}" for row, t in zip(rows, station, strict=True)]
 
 
 @dataclass(frozen=True)
