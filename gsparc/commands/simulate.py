@@ -71,8 +71,8 @@ def task(config: DictConfig) -> Outcome | None:
     # The exact shoebox has walls, but no triangles.
     if len(triangles):
         write_walls(triangles, run_dir / "walls.yaml")
-    if outcome.choice is not None:
-        console.print(choice_table(outcome.choice))
+    if outcome.decision is not None:
+        console.print(choice_table(outcome.decision.choice))
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     facts = {
         **summary_facts(outcome),

@@ -23,7 +23,8 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
 
     Of several transmitters, the strongest at each place.
     """
-    changed, survey = outcome.changed, outcome.survey
+    decision, survey = outcome.decision, outcome.survey
+    changed = None if decision is None else decision.changed
     count = 2 if changed is None else 3
     places, by_station = survey.places, outcome.dataset.power.reshape(len(survey.engines), -1)
     # Rows are stations x places: the row of the strongest station at each place.
@@ -42,7 +43,7 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
         label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
         # Errors of spectra have no decibels.
-        if outcome.choice is not None and not outcome.choice.deliverable.startswith("spectrum"):
+        if decision is not None and not decision.choice.deliverable.startswith("spectrum"):
             label += " [dB]"
         _map(axes[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
     for axis in axes:

@@ -63,8 +63,8 @@ def summary_facts(outcome: Outcome) -> dict[str, Any]:
     if outcome.convergence is not None:
         facts["dataset/convergence_error"] = outcome.convergence.nmse
         facts |= {f"dataset/{k}": v for k, v in outcome.convergence.attributes().items()}
-    choice = outcome.choice
-    if choice is not None:
+    if outcome.decision is not None:
+        choice = outcome.decision.choice
         facts |= {f"auto/{k}": getattr(choice, k) for k in STATED}
         for row in choice.table:
             name = row.effect.replace(" > ", "_over_")

@@ -20,7 +20,7 @@ class Campaign(Checked):
 
     Attributes:
         scene: where.
-        effects: what is simulated, or how `auto` decides.
+        effects: what is simulated; until that is decided, how `auto` does.
         sampling: how hard the ray tracer works.
         spectrum, csi: what is stored.
         shard: receivers per shard.
@@ -36,6 +36,12 @@ class Campaign(Checked):
     shard: int = setting(400, whole(1))
     check: int = setting(128, whole(0))
     measurement: str = setting("spectrum", choice("spectrum", "csi"))
+
+    @property
+    def decided(self) -> Effects:
+        """What is simulated, once `auto` has decided where it is to."""
+        assert isinstance(self.effects, Effects)
+        return self.effects
 
     def inputs(self) -> dict[str, str]:
         """Return the SHA-256 of the files that a scene and its receivers are read from."""

@@ -176,4 +176,4 @@ def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
 
 def test_decision_survives_its_file():
     decision = Decision(decided("coverage +-1 dB"), FULL, 300)
-    assert Decision.from_dict(json.loads(json.dumps(decision.to_dict()))) == decision
+    assert Decision.from_dict(json.loads(json.dumps(dataclasses.asdict(decision)))) == decision

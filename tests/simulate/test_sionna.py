@@ -239,7 +239,7 @@ def test_auto_in_the_conference_room(tmp_path):
     asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
     plan = Campaign(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
     outcome = simulate(plan, tmp_path / "room.h5")
-    assert outcome.choice is not None and outcome.choice.verdict is not None
+    assert outcome.decision is not None and outcome.decision.choice.verdict is not None
     assert outcome.effects.line_of_sight and outcome.effects.specular
     assert outcome.convergence is not None and 0 < outcome.convergence.nmse < 0.5
     with h5py.File(tmp_path / "room.h5") as file:
