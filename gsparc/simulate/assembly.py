@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,24 +22,6 @@ from gsparc.simulate.survey import Engine, Survey
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are not listed in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
-
-
-@dataclass(frozen=True)
-class Assembled:
-    """A finished file and facts about it.
-
-    Attributes:
-        data: as `load_own` reads the file.
-        power: (S,) sum of path powers.
-        delay_spread: (S,) [s].
-        facts: numbers that decide what the data can be used for, as `below_horizon`, the share of power that
-            an upper hemisphere cannot show.
-    """
-
-    data: Measurements
-    power: np.ndarray
-    delay_spread: np.ndarray
-    facts: dict[str, float]
 
 
 def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
@@ -70,8 +52,11 @@ def assemble_dataset(
     seconds: float,
     shards: Shards,
     rows: Rows,
-) -> Assembled:
-    """Write the file from what the shards hold (`join_shards`), drop the shards.
+) -> tuple[Measurements, dict[str, float]]:
+    """Write the file from what the shards hold (`join_shards`), drop the shards; as `load_own` reads it.
+
+    Facts beside it decide what the data can be used for, as `below_horizon`, the share of power that an upper
+    hemisphere cannot show.
 
     `seconds` [s] were spent on anything but the shards, which know their own; both are the file's
     `simulate_s`.
@@ -104,7 +89,7 @@ def assemble_dataset(
     data = write_own(shards.out, arrays, {**about, **shards.signature, "simulate_s": seconds})
     # Not before: until the file is there, the shards are all that there is.
     shards.remove()
-    return Assembled(data, power, whole["delay_spread"], facts)
+    return data, facts
 
 
 class Rows(NamedTuple):

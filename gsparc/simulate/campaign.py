@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.executor import run_each
+from gsparc.data.schema import Measurements
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import SECONDS, Assembled, assemble_dataset, join_shards, shard_arrays
+from gsparc.simulate.assembly import SECONDS, Rows, assemble_dataset, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.convergence import Convergence, measure_convergence
 from gsparc.simulate.deciding import Decision
@@ -33,13 +34,17 @@ class Outcome:
     """A finished dataset and what it cost.
 
     Attributes:
-        dataset, survey, effects: the file, its rows, and what was simulated.
+        data, facts: the file, and numbers about it, see `assemble_dataset`.
+        rows: what it was made of, in its order.
+        survey, effects: its rows, and what was simulated.
         decision: of `auto`; else None.
         convergence: between two seeds; None where there are no rays.
         seconds: by stage [s].
     """
 
-    dataset: Assembled
+    data: Measurements
+    facts: dict[str, float]
+    rows: Rows
     survey: Survey
     effects: Effects
     decision: Decision | None
@@ -79,10 +84,10 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     # Seconds of all but the shards, which keep their own over interruptions.
     other_s = laps[1] - laps[0] + laps[4] - laps[3]
     choice = None if decision is None else decision.choice
-    dataset = assemble_dataset(campaign, survey, choice, error, other_s, shards, rows)
+    data, facts = assemble_dataset(campaign, survey, choice, error, other_s, shards, rows)
     laps.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
-    return Outcome(dataset, survey, campaign.decided, decision, error, seconds)
+    return Outcome(data, facts, rows, survey, campaign.decided, decision, error, seconds)
 
 
 def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:

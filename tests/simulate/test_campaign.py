@@ -97,7 +97,7 @@ def test_file_equals_the_exact_room_and_its_paths_make_the_channel(tmp_path):
     assert json.loads(about["effects_json"])["depth"] == 3
     assert load_own(tmp_path / "box.h5").site.kind == "spectrum"
     assert check([str(tmp_path / "box.h5")]) == 0
-    assert outcome.convergence is None and outcome.dataset.facts["paths_per_receiver"] > 5
+    assert outcome.convergence is None and outcome.facts["paths_per_receiver"] > 5
     assert 0 < about["simulate_s"] <= sum(outcome.seconds.values())
     paths = stored["path_offsets"]
     assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
@@ -124,14 +124,15 @@ def test_file_is_read_as_powers(tmp_path):
     """Sums of path powers; where no path arrives, a power is below the weakest that was heard."""
     blocked = replace(SCENE, room={**SCENE.room, "boxes_m": [[[2.6, 0, 0], [3.0, 4.0, 3]]]})
     direct = replace(MIRROR, specular=False, depth=0)
-    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").dataset
+    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").rows.arrays
     data = read(tmp_path / "box.h5", "rssi")
-    heard = made.power > 0
+    power = made["received_power"]
+    heard = power > 0
     assert data.site.kind == "rssi" and 0 < heard.sum() < 60 and data.site.convergence_error is None
     np.testing.assert_array_equal(data.censored, ~heard)
     powers = data.target[:, 0] * data.site.target_scale
-    np.testing.assert_allclose(powers[heard], made.power[heard], rtol=1e-4)
-    np.testing.assert_allclose(powers[~heard], made.power[heard].min(), rtol=1e-4)
+    np.testing.assert_allclose(powers[heard], power[heard], rtol=1e-4)
+    np.testing.assert_allclose(powers[~heard], power[heard].min(), rtol=1e-4)
 
 
 def test_outlier_does_not_set_the_sensitivity():

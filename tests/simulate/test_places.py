@@ -33,7 +33,10 @@ class Hut:
 
 
 def laid(georeference=None, streets=(), **settings):
-    return place_receivers(Layout(**settings), 30, AREA, (1.0, 2.0), 0, Hut(), streets, georeference)
+    asked = {"num_receivers": 30, "height_m": (1.0, 2.0), "seed": 0}
+    on_map = georeference is not None or len(streets)
+    town = SimpleNamespace(georeference=georeference, streets=streets) if on_map else None
+    return place_receivers(SimpleNamespace(layout=Layout(**settings), **asked), AREA, Hut(), town)
 
 
 def test_sectors_are_stations_at_equal_angles():

@@ -210,7 +210,7 @@ def test_town_with_sectors_in_degrees(tmp_path):
     )  # fmt: skip
     plan = Campaign(town, PLAIN, sampling=QUICK, check=0, spectrum=SpectrumSettings(height=18, width=36))
     outcome = simulate(plan, tmp_path / "town.h5")
-    power, places = outcome.dataset.power.reshape(3, -1), outcome.survey.places
+    power, places = outcome.rows.arrays["received_power"].reshape(3, -1), outcome.survey.places
     east = (places[:, 0] > 30) & (np.abs(places[:, 1] - 11) < 5)  # on High Street, where the first looks
     assert east.sum() >= 3 and (power[0, east] > 3 * power[1:, east].max(0)).all()
     read = load({"name": "sionna", "file": str(tmp_path / "town.h5"), "target": "csi"})

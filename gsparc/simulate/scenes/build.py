@@ -18,7 +18,7 @@ from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.receivers import Ground, layout_from_config, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.receivers import Ground, Layout, place_receivers, stands_clear_of
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.survey import Engine, Survey
@@ -93,8 +93,13 @@ class SceneSettings(Checked):
             raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {names}")
         if self.transmitter_m is not None and self.transmitters is not None:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
-        if layout_from_config(self.receivers).kind == "area" and self.num_receivers < MIN_RECEIVERS:
+        if self.layout.kind == "area" and self.num_receivers < MIN_RECEIVERS:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
+
+    @property
+    def layout(self) -> Layout:
+        """Where receivers are."""
+        return from_settings(Layout, self.receivers or {}, "scene.receivers")
 
     @property
     def frequency_hz(self) -> np.ndarray:
@@ -127,13 +132,10 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
         log.info("%s: %s", scene.file, note)
     area = _area(scene, tracer.bounding_box()[:, :2] if town is None else town.box)
     ground = _around(scene, tracer, area) if allowed is None else Ground(allowed)
-    georeference, streets = (None, ()) if town is None else (town.georeference, town.streets)
+    georeference = None if town is None else town.georeference
     # Heights of masts count from the highest surface, a roof where there is one.
     masts = _stated(scene, tracer.surface_height, georeference) or [_in_the_middle(tracer, ground, area)]
-    placed = place_receivers(
-        layout_from_config(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed,
-        ground, streets, georeference,
-    )  # fmt: skip
+    placed = place_receivers(scene, area, ground, town)
     # Copies that share the scene, which is loaded once.
     engines = [tracer.with_transmitter(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
@@ -204,14 +206,7 @@ def _shoebox(scene: SceneSettings) -> Survey:
     if any(mast.antenna.pattern != "iso" for mast in masts):
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
     engines: list[Engine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
-    placed = place_receivers(
-        layout_from_config(scene.receivers),
-        scene.num_receivers,
-        area,
-        scene.height_m,
-        scene.seed,
-        Ground(room.contains),
-    )
+    placed = place_receivers(scene, area, Ground(room.contains))
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 
 
