@@ -29,11 +29,6 @@ from gsparc.data.units import LINEAR, PowerUnit
 log = logging.getLogger(__name__)
 
 SSIM_WINDOW = 11  # pixels along each side; as in losses and metrics, which data do not import
-SHAPES: dict[str, tuple[tuple[None, ...], ...]] = {
-    "spectrum": ((None, None, None),),
-    "csi": ((None,), (None, None), (None, None, None)),
-    "rssi": ((None,),),
-}
 Arrays = Mapping[str, np.ndarray]
 OF_ROWS = ("station", "place", "censored", "run")  # of `Measurements`, as `expand_links` leaves them
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
@@ -139,8 +134,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     assert values is not None
     rows = len(values)
     of_rows = {name: raw.arrays.get(name) for name in OF_ROWS}
-    row_names = links.name_rows(check.name_rows(rows), of_rows["station"])
-    check.row_names = row_names
+    row_names = check.name_rows(rows, links.stations)
     ends = {end: check.read_positions(f"{end}_position", rows) for end in ("rx", "tx")}
     rotation = check.read_rotation(rows)
     given_mask = check.read_mask(raw.arrays[measured].shape, of_rows["censored"])
@@ -240,7 +234,7 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
 def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
     kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    array = check.read_array(name, *SHAPES[kind])
+    array = check.read_array(name, *([(None,)] if kind == "rssi" else FIELDS[name].shapes))
     if array is None:
         return None, kind
     if kind == "csi" and array.size:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems, suggest_name
 from gsparc.data.raw import Raw
-from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, TrainTest
+from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
 from gsparc.ops import SphereGrid
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
@@ -99,13 +99,16 @@ class Checker:
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
         return self.problems.add(self.source, f"{wanted}; found {names}")
 
-    def name_rows(self, rows: int) -> list[str]:
-        """Return what messages call each row: `row_name`, or its number."""
-        names = self.raw.arrays.get("row_name")
-        self.row_names = [f"row {i}" for i in range(rows)]
-        if names is not None and self.has_shape("row_name", names, (rows,)):
-            self.row_names = [str(name) for name in names]
-        return self.row_names
+    def name_rows(self, rows: int, stations: Stations | None) -> list[str]:
+        """Return what messages call each row: `row_name`, or its number, with its station."""
+        arrays, named = self.raw.arrays, [f"row {i}" for i in range(rows)]
+        if "row_name" in arrays and self.has_shape("row_name", arrays["row_name"], (rows,)):
+            named = [str(name) for name in arrays["row_name"]]
+        if stations is not None:  # a place alone would name several rows
+            shown, pairs = stations.shown, zip(named, arrays["station"], strict=True)
+            named = [f"{row}, station {shown[t]}" for row, t in pairs]
+        self.row_names = named
+        return named
 
     def read_array(self, name: str, *shapes: Shape, holds: str = "") -> np.ndarray | None:
         """Return array `name` if it `holds` what it should and fits one of `shapes` (None: any length)."""

@@ -97,14 +97,6 @@ class Links:
     unknown_transmitter: bool = False
     georeference: Georeference | None = None
 
-    def name_rows(self, rows: list[str], station: np.ndarray | None) -> list[str]:
-        """Return names (S,) of rows, with the stations (S,) that they are of."""
-        if self.stations is None or station is None:
-            # A row of a file of links is a place and a station; the place alone would name several rows.
-            return rows
-        names = self.stations.shown
-        return [f"{row}, station {names[t]}" for row, t in zip(rows, station, strict=True)]
-
 
 @dataclass(frozen=True)
 class Site:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -81,6 +81,13 @@ class Selection(Checked):
 
 
 WHOLE = Selection()
+
+
+def take_selection(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of `Selection` out of all of a dataset, which then lack them."""
+    return {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
+
+
 Part = tuple[Arrays, Stations | None, list[str]]
 
 

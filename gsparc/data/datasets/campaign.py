@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -23,7 +23,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.data.raw import Raw, numbered_rows, read_raw, rename_arrays
 from gsparc.data.schema import Field, Measurements, TrainTest
-from gsparc.data.selection import Selection
+from gsparc.data.selection import Selection, take_selection
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +57,7 @@ class Campaign(DataModule):
         if not isinstance(file, str | Path):
             raise SettingError(f"dataset.file={[*map(str, file)]}: expected one file; join tables first")
         self.file = Path(file)
-        part = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
-        self.settings, self.selection = settings, Selection(**part)
+        self.settings, self.selection = settings, Selection(**take_selection(settings))
 
     def raw(self) -> Raw:
         """Read the file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""

@@ -21,13 +21,14 @@ from measured import (
 )
 from releases import real
 
-from gsparc.data.datasets.own import LOADERS, read_any
+from gsparc.data.datasets.own import CAMPAIGNS, read_any
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.raw import Raw, read_raw, write_raw
 
+LOADERS = {kind.choice: kind.reader for kind in CAMPAIGNS}
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
 
