@@ -15,8 +15,7 @@ import numpy as np
 
 from gsparc.data.blocks import take
 from gsparc.data.errors import DataError, list_first, suggest_name
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
+from gsparc.data.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 
@@ -178,10 +177,9 @@ def _of_runs(arrays: Arrays, runs: Sequence[str | int], source: str) -> np.ndarr
     if "run" not in arrays:
         raise DataError(f"dataset.runs: {source} names no runs; expected an array run")
     of_row = arrays["run"].astype(str)
-    known, wanted = np.unique(of_row).tolist(), [str(run) for run in runs]
-    if unknown := sorted({*wanted} - {*known}):
-        hint = suggest_or_list(unknown[0], known)
-        raise DataError(f"dataset.runs={unknown[0]}: no such run in {source}{hint}")
+    wanted, of_file = [str(run) for run in runs], choice(*np.unique(of_row).tolist())
+    for run in wanted:
+        of_file.check("dataset.runs", run)
     return np.isin(of_row, wanted)
 
 

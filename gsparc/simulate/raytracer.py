@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
@@ -424,9 +425,7 @@ def _load_file(source: str | Path) -> Any:
         except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
             first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
             raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
-    known = list_shipped_scenes()
-    if source not in known:
-        raise ValueError(f"scene.builtin={source}: Sionna has no such scene; there are {', '.join(known)}")
+    choice(*list_shipped_scenes()).check("scene.builtin", source)
     return rt.load_scene(getattr(rt.scene, str(source)))
 
 

@@ -411,7 +411,7 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("changes, words", [
-    ({"builder": "x"}, "exactly one of"),
+    ({"builder": "conference_room"}, "exactly one of"),
     ({"num_receivers": 3}, "at least 20"),
     ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
     ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),

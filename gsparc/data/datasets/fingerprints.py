@@ -14,7 +14,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from gsparc.data.datasets.campaign import check_layout
-from gsparc.data.errors import DataError, list_first, readable, suggest_name
+from gsparc.data.errors import DataError, list_first, readable
+from gsparc.data.limits import choice
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables import is_table
@@ -146,9 +147,7 @@ def split_fingerprints(
     Raises:
         DataError: there is no such split, or one part of it is empty.
     """
-    if how not in get_args(How):
-        hint = suggest_name(str(how), get_args(How))
-        raise DataError(f"split: {how!r} is none of {', '.join(get_args(How))}{hint}")
+    choice(*get_args(How)).check("split", how)
     if how in ("released", "later"):
         test = rows.test if how == "released" else rows.campaign > rows.campaign.min()
         if test.all() or not test.any():

@@ -21,8 +21,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, Problems, shorten
 from gsparc.data.files import read_text
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import finite_array, number
+from gsparc.data.limits import choice, finite_array, number
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.raw import Raw
 
@@ -67,8 +66,8 @@ def read_powder(
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
     if sensitivity_db:
         names = raw.arrays["station_name"].tolist()
-        if wrong := sorted(sensitivity_db.keys() - {*names}):
-            raise DataError(f"dataset.sensitivity_db: no {wrong[0]}{suggest_or_list(wrong[0], names)}")
+        for name in sensitivity_db:
+            choice(*names).check("dataset.sensitivity_db", name)
         heights["sensitivity_db"] = np.array([sensitivity_db.get(name, np.nan) for name in names], float)
     about = {"name": "powder", **raw.attributes, "layout": "powder"}
     return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)

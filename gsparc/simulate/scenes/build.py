@@ -15,6 +15,7 @@ from gsparc.data import limits
 from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
+from gsparc.data.walls import RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
@@ -76,7 +77,7 @@ class SceneSettings(Checked):
     over: str = setting("zero", choice("zero", "ground", "roofs"))
     receivers: Mapping[str, Any] | None = None
     test_share: float = setting(0.3, limits.SHARE)
-    builder: str | None = None
+    builder: str | None = setting(None, or_null(choice(*BUILDERS)))
     builtin: str | None = None
     xml: str | None = None
     file: str | None = None
@@ -196,12 +197,11 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
 
 def _shoebox(scene: SceneSettings) -> Survey:
     """Our own exact image sources, whose transmitters are isotropic."""
-    assert scene.room is not None
-    boxes = np.array(scene.room.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
-    reflection = np.array(scene.room.get("reflection", -0.7), dtype=np.complex128)
-    room = Room.from_size(scene.room["size_m"], reflection, occluders=boxes)
-    area = _area(scene, np.stack([np.zeros(2), np.array(scene.room["size_m"][:2], dtype=np.float64)]))
-    middle = np.append(area.mean(0), CEILING * float(scene.room["size_m"][2]))
+    stated = from_settings(RoomSettings, scene.room or {}, "scene.room")
+    size, reflection = np.array(stated.size_m, float), np.array(stated.reflection, complex)
+    room = Room.from_size(size, reflection, occluders=stated.boxes)
+    area = _area(scene, np.stack([room.lower, room.upper])[:, :2])
+    middle = np.append(area.mean(0), CEILING * room.upper[2])
     masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
     if any(mast.antenna.pattern != "iso" for mast in masts):
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
@@ -220,8 +220,6 @@ def _load(
         town = read_town(scene.file, scene.carrier_hz)
         source = town.solids
     elif scene.builder is not None:
-        if scene.builder not in BUILDERS:
-            raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")
         source = BUILDERS[scene.builder](scene.seed)
         # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
         allowed = stands_clear_of(source)

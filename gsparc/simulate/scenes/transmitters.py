@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import Checked, choice, or_null, setting, whole
+from gsparc.data.limits import Checked, Limit, choice, finite_array, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
 
+NUMBERS = Limit("a list of two or three finite numbers", lambda v: finite_array(v).shape in ((2,), (3,)))
 PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1
 
 
@@ -63,8 +64,8 @@ class Mast(Checked):
     """
 
     name: str | None = None
-    position_m: Sequence[float] | None = None
-    position_deg: Sequence[float] | None = None
+    position_m: Sequence[float] | None = setting(None, or_null(NUMBERS))
+    position_deg: Sequence[float] | None = setting(None, or_null(NUMBERS))
     height_m: float | None = None
     pattern: str | None = setting(None, or_null(choice(*PATTERNS)))
     azimuth_deg: float = 0.0
@@ -118,8 +119,6 @@ def _position(
     if len(names) != 1:
         raise ValueError(f"{where}: give position_m=[x,y,z] or position_deg=[latitude,longitude]")
     values = np.array(getattr(mast, names[0]), dtype=np.float64)
-    if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
-        raise ValueError(f"{where}.{names[0]}={values.tolist()}: expected two or three finite numbers")
     if names[0] == "position_deg":
         if georeference is None:
             raise ValueError(f"{where}.position_deg: this scene is nowhere on Earth; give position_m")

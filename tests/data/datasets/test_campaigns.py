@@ -156,7 +156,7 @@ def test_noise_of_powder_receivers_could_not_be_told_from_levels(tmp_path, refus
     side = after.censored_side(np.arange(len(after)))
     assert before.censored is None and set(after.station[side > 0]) == {0}
     assert ((side == 0) & (after.station == 0)).sum() == np.isfinite(level[5:]).sum()
-    refused("sensitivity_db: no ebc", lambda _: load({**own, "sensitivity_db": {"ebc": -90}}), tmp_path)
+    refused("sensitivity_db='ebc': one of", lambda _: load({**own, "sensitivity_db": {"ebc": -90}}), tmp_path)
 
 
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")

@@ -96,7 +96,7 @@ def test_splits_hold_out_whole_units():
     for how in ("released", "later"):
         with pytest.raises(DataError, match="names no such rows"):
             split_fingerprints(rows, how)
-    with pytest.raises(DataError, match=r"'walk' is none of .*did you mean 'walks'"):
+    with pytest.raises(DataError, match=r"split='walk': one of .*did you mean 'walks'"):
         split_fingerprints(rows, "walk")
 
 
