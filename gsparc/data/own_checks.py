@@ -135,7 +135,7 @@ class Checker:
         turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
         here = " or ".join(map(str, wanted))
         here = f", here {here}" if any(wanted) and "None" not in here else ""
-        known = FIELDS[name].shape if name in FIELDS else str(shapes[0]).replace("'", "")
+        known = FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
         fault = f"found {array.shape}{'; transposed?' if turned else ''}"
         self.refuse(name, f"expected shape {known}{here}, {fault}")
         return False

@@ -412,5 +412,5 @@ def list_arrays_with_axis(letter: str) -> dict[str, set[int]]:
     >>> list_arrays_with_axis("T")["carrier_hz"]  # a frequency for each station
     {1}
     """
-    shapes = {name: re.findall(rf"\({letter}(,[^)]*)\)", field.shape) for name, field in FIELDS.items()}
-    return {name: {1 + len(re.findall(r"\w+", s)) for s in rest} for name, rest in shapes.items() if rest}
+    axes = {n: {len(s) for s in field.shapes if s[:1] == (letter,)} for n, field in FIELDS.items()}
+    return {name: counts for name, counts in axes.items() if counts}

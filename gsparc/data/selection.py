@@ -6,7 +6,6 @@ Rows are links by then: arrays named as in docs/reference/schema.md, `station` a
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -25,8 +24,8 @@ SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample or path, and how many axes they then have.
 ROW_AXES, PATH_AXES = list_arrays_with_axis("S"), list_arrays_with_axis("P")
 # Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
-ALWAYS = ("mask", "place", "file_row",
-          *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))  # fmt: skip
+OF_ROWS = {name for name, field in FIELDS.items() if all(shape[:1] == ("S",) for shape in field.shapes)}
+ALWAYS = {"place", "file_row", *OF_ROWS}
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
 

@@ -240,7 +240,8 @@ def check_layout(
     for name, field in fields.items():
         array = check.read_array(name, *field.shapes, holds=field.holds)
         if array is not None:
-            letters = zip(field.shapes[0], array.shape, strict=True)
+            shape = next(shape for shape in field.shapes if len(shape) == array.ndim)
+            letters = zip(shape, array.shape, strict=True)
             check.sizes |= {letter: size for letter, size in letters if isinstance(letter, str)}
             if name in places:
                 rows = [*numbered_rows(len(array))]

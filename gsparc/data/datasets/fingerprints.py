@@ -93,11 +93,8 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         what = f"{level[row, column]:g} in row {row}, column {column}; NaN stands for not heard"
         raise DataError(f"{path}, rss_dbm: expected {FAINTEST:g} to {LOUDEST:g} dBm, found {what}")
     numbers = {field: np.zeros(count, np.int64) for field in NUMBERS.values()}
-    for name in NUMBERS.keys() & raw.arrays:
-        array = raw.arrays[name]
-        if array.dtype.kind not in "iu" or array.shape not in ((), (count,)):
-            raise DataError(f"{path}, {name}: expected {count} whole numbers, found {array.dtype}")
-        numbers[NUMBERS[name]] = np.broadcast_to(array, count).astype(np.int64)
+    for name in NUMBERS.keys() & checked:
+        numbers[NUMBERS[name]] = np.broadcast_to(checked[name], count).astype(np.int64)
     names = checked.get("access_point", np.arange(level.shape[1])).astype(str)
     if len(np.unique(names)) < len(names):
         raise DataError(

@@ -115,24 +115,19 @@ def dataset_by_path(path: Path) -> type[Campaign] | None:
     return None
 
 
-def read_any(
-    path: str | Path,
-    columns: Mapping[str, object] | None = None,
-    stations_file: str | Path | None = None,
-    **settings: Any,
-) -> Reading:
+def read_any(path: str | Path, **settings: Any) -> Reading:
     """Read a folder or file of a release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
-        columns, stations_file: of a table, see `read_own`.
-        **settings: see `apply_settings`, and of `Selection`.
+        **settings: of `read_own` and of `Selection`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
     part = from_settings(Selection, take_selection(settings), "dataset")
+    table = {name: settings.pop(name, None) for name in ("columns", "stations_file")}
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
@@ -145,7 +140,7 @@ def read_any(
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, said = read_file_or_table(path, columns, stations_file), ""
+        raw, said = read_file_or_table(path, **table), ""
         if (campaign := dataset_by_arrays(raw)) is not None:
             raw, said = campaign.reader(path), f"this is a file of dataset={campaign.choice}"
     raw = replace(raw, notes=(*filter(None, [said]), *raw.notes))
