@@ -6,6 +6,7 @@ import inspect
 import logging
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
@@ -15,7 +16,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data import spacing
+from gsparc.data import spacing, splits
 from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError, suggest_name
@@ -104,7 +105,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     if isinstance(settings, FileSettings):
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
-        return remove_rows(split, absent) if len(absent) else split
+        return _answerable(remove_rows(split, absent) if len(absent) else split, data)
     unit = data.run if settings.name == "runs" else data.station
     place = spacing.group_visits(data.moving, data.place)
     if place is not None and place is not data.place:
@@ -112,7 +113,29 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         log.info(text, len(data), len(np.unique(place)))
     # From the lowest place on: where stations stand moves local coordinates, and would move squares.
     where = data.moving - data.moving.min(axis=0)
-    return make_split(where, settings, data.release_split, wrong, place, unit)
+    return _answerable(make_split(where, settings, data.release_split, wrong, place, unit), data)
+
+
+def _answerable(split: Split, data: Measurements) -> Split:
+    """The same folds without test rows of stations at unknown places with next to no training rows.
+
+    Folds that hold out such stations alone stay as they are: methods refuse them.
+    """
+    stations, station = data.site.stations, data.station
+    if stations is None or station is None:
+        return split
+    lost, folds = np.isnan(stations.position).any(1), list[splits.Fold]()
+    for fold in split.folds:
+        heard = fold.train[data.censored_side(fold.train) <= 0]
+        few = lost & (np.bincount(station[heard], minlength=len(lost)) < splits.LEAST_ROWS)
+        asked = fold.test[~few[station[fold.test]]]
+        folds.append(replace(fold, test=asked) if len(asked) else fold)
+    left = sum(len(one.test) - len(other.test) for one, other in zip(split.folds, folds, strict=True))
+    if not left:
+        return split
+    text = "split: %d test rows of stations at unknown places, with under %d training rows, are not asked"
+    log.warning(text, left, splits.LEAST_ROWS)
+    return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
