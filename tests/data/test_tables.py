@@ -125,9 +125,13 @@ def test_many_transmitters_did_not_become_one_without_a_word(write):
 def test_beams_antennas_and_devices_became_one_without_a_word(write, head):
     rows = "".join(f"{i % 3},{i // 3},{i},2,-{60 + i % 7}\n" for i in range(24))
     notes = parse_table(write(f"{head},x,y,z,rssi\n{rows}")).notes
-    said = f"column '{head}' speaks of an antenna or a device and is not used: dataset.columns.station={head} "
+    said = (
+        f"column '{head}' speaks of an antenna or a device and is not used: dataset.columns.station={head} "
+    )
     assert sum(note.startswith(said) for note in notes) == 1
-    one = parse_table(write(f"{head},x,y,z,rssi\n" + rows.replace("\n1,", "\n0,").replace("\n2,", "\n0,"))).notes
+    one = parse_table(
+        write(f"{head},x,y,z,rssi\n" + rows.replace("\n1,", "\n0,").replace("\n2,", "\n0,"))
+    ).notes
     assert not any("speaks of" in note for note in one)
 
 
