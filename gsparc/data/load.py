@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from importlib.resources import files
@@ -22,13 +21,14 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import (
     accepted_arguments,
+    cause_of,
     from_settings,
     import_target,
     iterate_targets,
     refuse_foreign,
     suggest_or_list,
 )
-from gsparc.data.limits import SettingError, choice
+from gsparc.data.limits import choice
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
 from gsparc.data.splits import FileSettings, Split, SplitSettings, make_split, remove_rows, rows_to_leave_out
@@ -73,12 +73,7 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     try:  # under its key, which errors then name
         module = instantiate({"dataset": settings}, _convert_="all")["dataset"]
     except InstantiationException as error:
-        where = re.search(r"full_key: (\S+)", str(error))
-        if isinstance(error.__cause__, SettingError) and where:
-            raise SettingError(f"{where[1]}.{error.__cause__}") from None
-        if isinstance(error.__cause__, ValueError):
-            raise error.__cause__ from None
-        raise
+        raise cause_of(error) from None
     if not isinstance(module, DataModule):
         raise DataError(f"dataset._target_={target} makes no gsparc.data.datamodule.DataModule")
     module.free = free
@@ -105,7 +100,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     if isinstance(settings, FileSettings):
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
-        return _answerable(remove_rows(split, absent) if len(absent) else split, data)
+        return answerable(remove_rows(split, absent) if len(absent) else split, data)
     unit = data.run if settings.name == "runs" else data.station
     place = spacing.group_visits(data.moving, data.place)
     if place is not None and place is not data.place:
@@ -113,27 +108,33 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         log.info(text, len(data), len(np.unique(place)))
     # From the lowest place on: where stations stand moves local coordinates, and would move squares.
     where = data.moving - data.moving.min(axis=0)
-    return _answerable(make_split(where, settings, data.release_split, wrong, place, unit), data)
+    return answerable(make_split(where, settings, data.release_split, wrong, place, unit), data)
 
 
-def _answerable(split: Split, data: Measurements) -> Split:
-    """The same folds without test rows of stations at unknown places with next to no training rows.
+def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Split] | None = None) -> Split:
+    """Return the same folds without test rows that plain methods cannot answer.
 
-    Folds that hold out such stations alone stay as they are: methods refuse them.
+    Those are of stations with next to no training rows, at unknown places or, of `learned`, not expected
+    there. Folds that test such stations alone stay as they are: methods refuse them.
+
+    Args:
+        split, data: what is tested.
+        learned: what was learned from, and its folds, where it is other data with the same stations.
     """
-    stations, station = data.site.stations, data.station
-    if stations is None or station is None:
+    own, before = learned or (data, split)
+    if data.site.stations is None or data.station is None or own.station is None:
         return split
-    lost, folds = np.isnan(stations.position).any(1), list[splits.Fold]()
-    for fold in split.folds:
-        heard = fold.train[data.censored_side(fold.train) <= 0]
-        few = lost & (np.bincount(station[heard], minlength=len(lost)) < splits.LEAST_ROWS)
-        asked = fold.test[~few[station[fold.test]]]
-        folds.append(replace(fold, test=asked) if len(asked) else fold)
+    places, folds = data.site.stations.position, list[splits.Fold]()
+    for fold, old in zip(split.folds, before.folds, strict=True):
+        heard = old.train[own.censored_side(old.train) <= 0]
+        told, asked = (np.bincount(own.station[rows], minlength=len(places)) for rows in (heard, old.test))
+        known = (told >= splits.LEAST_ROWS) | ((asked > 0) & np.isfinite(places).all(1))
+        kept = fold.test[known[data.station[fold.test]]]
+        folds.append(replace(fold, test=kept) if len(kept) else fold)
     left = sum(len(one.test) - len(other.test) for one, other in zip(split.folds, folds, strict=True))
     if not left:
         return split
-    text = "split: %d test rows of stations at unknown places, with under %d training rows, are not asked"
+    text = "split: %d test rows are not asked: they are of stations with under %d training rows"
     log.warning(text, left, splits.LEAST_ROWS)
     return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
 
