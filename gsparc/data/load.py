@@ -131,11 +131,8 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
         known = (told >= splits.LEAST_ROWS) | ((asked > 0) & np.isfinite(places).all(1))
         kept = fold.test[known[data.station[fold.test]]]
         folds.append(replace(fold, test=kept) if len(kept) else fold)
-    left = sum(len(one.test) - len(other.test) for one, other in zip(split.folds, folds, strict=True))
-    if not left:
-        return split
-    text = "split: %d test rows are not asked: they are of stations with under %d training rows"
-    log.warning(text, left, splits.LEAST_ROWS)
+    if sum(len(fold.test) for fold in folds) < sum(len(fold.test) for fold in split.folds):
+        log.warning("split: stations of under %d training rows are not asked about", splits.LEAST_ROWS)
     return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
 
 
