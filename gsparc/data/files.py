@@ -158,9 +158,17 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 
 def is_out_of_space(error: BaseException | None) -> bool:
     """Tell whether a full disk, quota or limit is behind an error, or behind what caused it."""
-    while error is not None and not isinstance(error, OSError):
+    full = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+    return any(isinstance(one, OSError) and one.errno in full for one in list_causes(error))
+
+
+def list_causes(error: BaseException | None) -> list[BaseException]:
+    """Return an error, what caused it, and so on; each once, as one raised again may be its own context."""
+    found: list[BaseException] = []
+    while error is not None and error not in found:
+        found.append(error)
         error = error.__cause__ or error.__context__
-    return error is not None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+    return found
 
 
 def set_aside(folder: Path, *patterns: str) -> bool:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, TypeVar
+
+from hydra.errors import InstantiationException
 
 from gsparc.data.errors import DataError, suggest_name
 from gsparc.data.limits import SettingError
@@ -35,6 +38,12 @@ def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun
         return kind(**config)
     except SettingError as error:
         raise SettingError(f"{group}.{error}") from None
+
+
+def cause_of(error: InstantiationException) -> BaseException:
+    """Return what an instantiation failed by, a bad setting under its full key."""
+    cause, key = error.__cause__ or error, re.search(r"full_key: (\S+)", str(error))
+    return SettingError(f"{key[1]}.{cause}") if isinstance(cause, SettingError) and key else cause
 
 
 def iterate_targets(node: Any) -> Iterator[Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import logging
-import re
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
@@ -15,19 +15,20 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data import spacing
+from gsparc.data import spacing, splits
 from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import (
     accepted_arguments,
+    cause_of,
     from_settings,
     import_target,
     iterate_targets,
     refuse_foreign,
     suggest_or_list,
 )
-from gsparc.data.limits import SettingError, choice
+from gsparc.data.limits import choice
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
 from gsparc.data.splits import FileSettings, Split, SplitSettings, make_split, remove_rows, rows_to_leave_out
@@ -72,12 +73,7 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     try:  # under its key, which errors then name
         module = instantiate({"dataset": settings}, _convert_="all")["dataset"]
     except InstantiationException as error:
-        where = re.search(r"full_key: (\S+)", str(error))
-        if isinstance(error.__cause__, SettingError) and where:
-            raise SettingError(f"{where[1]}.{error.__cause__}") from None
-        if isinstance(error.__cause__, ValueError):
-            raise error.__cause__ from None
-        raise
+        raise cause_of(error) from None
     if not isinstance(module, DataModule):
         raise DataError(f"dataset._target_={target} makes no gsparc.data.datamodule.DataModule")
     module.free = free
@@ -104,7 +100,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     if isinstance(settings, FileSettings):
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
-        return remove_rows(split, absent) if len(absent) else split
+        return answerable(remove_rows(split, absent) if len(absent) else split, data)
     unit = data.run if settings.name == "runs" else data.station
     place = spacing.group_visits(data.moving, data.place)
     if place is not None and place is not data.place:
@@ -112,7 +108,32 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         log.info(text, len(data), len(np.unique(place)))
     # From the lowest place on: where stations stand moves local coordinates, and would move squares.
     where = data.moving - data.moving.min(axis=0)
-    return make_split(where, settings, data.release_split, wrong, place, unit)
+    return answerable(make_split(where, settings, data.release_split, wrong, place, unit), data)
+
+
+def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Split] | None = None) -> Split:
+    """Return the same folds without test rows that plain methods cannot answer.
+
+    Those are of stations with next to no training rows, at unknown places or, of `learned`, not expected
+    there. Folds that test such stations alone stay as they are: methods refuse them.
+
+    Args:
+        split, data: what is tested.
+        learned: what was learned from, and its folds, where it is other data with the same stations.
+    """
+    own, before = learned or (data, split)
+    if data.site.stations is None or data.station is None or own.station is None:
+        return split
+    places, folds = data.site.stations.position, list[splits.Fold]()
+    for fold, old in zip(split.folds, before.folds, strict=True):
+        heard = old.train[own.censored_side(old.train) <= 0]
+        told, asked = (np.bincount(own.station[rows], minlength=len(places)) for rows in (heard, old.test))
+        known = (told >= splits.LEAST_ROWS) | ((asked > 0) & np.isfinite(places).all(1))
+        kept = fold.test[known[data.station[fold.test]]]
+        folds.append(replace(fold, test=kept) if len(kept) else fold)
+    if sum(len(fold.test) for fold in folds) < sum(len(fold.test) for fold in split.folds):
+        log.warning("split: stations of under %d training rows are not asked about", splits.LEAST_ROWS)
+    return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:

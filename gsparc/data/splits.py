@@ -297,7 +297,7 @@ def _blocks(
     """Those of `rows` in whole squares of floor, drawn until they are a `share` of `rows` at least."""
     floor = positions[:, :2]
     side = settings.side_m or tenth_of_extent(floor)
-    if not side > 0:
+    if not tenth_of_extent(floor) > 0:
         raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
     square = number_squares(floor[rows], side)
     order = np.random.default_rng(seed).permutation(square.max() + 1)

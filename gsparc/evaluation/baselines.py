@@ -27,11 +27,9 @@ def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     if site.kind == "rssi":
         # Both fit decibels over distance, which only powers have.
         return (*names, "distance_law", "kriging")
-    carrier = site.carrier_hz is not None or (
-        site.stations is not None and site.stations.carrier_hz is not None
-    )
+    carriers = (site.carrier_hz, None if site.stations is None else site.stations.carrier_hz)
     # The kernel of `complex_gp` oscillates with the wavelength: without a carrier it is not defined.
-    if site.kind != "csi" or not carrier:
+    if site.kind != "csi" or all(one is None for one in carriers):
         return names
     folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
     few = (stations_of_fold(method_class("complex_gp")(), data, fold).only_tested.any() for fold in folds)

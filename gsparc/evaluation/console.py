@@ -19,8 +19,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
 from gsparc.data.errors import Severe, warning_kind
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import SettingError
+from gsparc.data.instantiate import cause_of, suggest_or_list
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
@@ -115,10 +114,7 @@ def error_in_one_line(error: BaseException) -> str:
         key = str(error.full_key or str(error).rpartition(" ")[2])
         return f"{key} is not set; give {key}=..."
     if isinstance(error, errors.InstantiationException) and error.__cause__ is not None:
-        where = re.search(r"full_key: (\S+)", str(error))
-        if isinstance(error.__cause__, SettingError) and where:
-            return f"{where[1]}.{error.__cause__}"
-        return error_in_one_line(error.__cause__)
+        return error_in_one_line(cause_of(error))
     if isinstance(error, errors.HydraException):
         return " ".join(str(error).split())
     if isinstance(error, OmegaConfBaseException) and error.full_key:

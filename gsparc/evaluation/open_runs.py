@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import cut_folds
-from gsparc.data.load import datamodule, split_for
+from gsparc.data.load import answerable, datamodule, split_for
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import read_raw
 from gsparc.data.schema import Measurements
@@ -147,6 +147,8 @@ def open_files(
     if foreign is not None:
         level = logging.INFO if learned == 0 else logging.WARNING
         log.log(level, "%s was trained on %s", stored[0].path, foreign)
+    if other and trained is not None:
+        chosen = answerable(chosen, data, trained)
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 

@@ -15,7 +15,7 @@ import yaml
 from torch import Tensor
 
 from gsparc.data.errors import DataError
-from gsparc.data.files import load_yaml, whole_file
+from gsparc.data.files import list_causes, load_yaml, whole_file
 from gsparc.data.raw import verified_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path
@@ -115,14 +115,10 @@ def _write(path: Path, content: dict[str, Any]) -> None:
         with whole_file(path) as partial, partial.open("wb") as file:
             torch.save(content, file)
     except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
-        raise CheckpointError(f"{path}: cannot be written ({_why(error)}); what was there is kept") from error
-
-
-def _why(error: BaseException | None) -> str:
-    """What the system said, under whatever a library wrapped around it."""
-    while error is not None and not isinstance(error, OSError):
-        error = error.__cause__ or error.__context__
-    return (error.strerror if error is not None else None) or "is the disk full?"
+        # What the system said, under whatever a library wrapped around it.
+        said = next((one.strerror for one in list_causes(error) if isinstance(one, OSError)), None)
+        why = said or "is the disk full?"
+        raise CheckpointError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
 def read(path: str | Path) -> Stored:

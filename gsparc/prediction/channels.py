@@ -54,7 +54,8 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     # Tones a step apart tell delays within 1 / step alone from each other.
     window = min(WINDOW_S, 0.8 / step)
     # The mean delay is taken off and put back: the window lies about it.
-    turn = _mean_phase_step(channel) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
+    steps = (channel[..., 1:] * channel[..., :-1].conj()).sum(-1)
+    turn = torch.angle(steps) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
     middle = float(tones_hz.mean())
     straight = channel * torch.polar(
         torch.ones(()), -turn[..., None] * torch.from_numpy((tones_hz - middle) / step).float()
@@ -67,11 +68,6 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
         torch.ones(()), turn[..., None] * torch.from_numpy((wanted_hz - middle) / step).float()
     )
     return (straight @ matrix) * back
-
-
-def _mean_phase_step(channel: Tensor) -> Tensor:
-    """Phase per tone of the mean delay (...)."""
-    return torch.angle((channel[..., 1:] * channel[..., :-1].conj()).sum(-1))
 
 
 def resource_grid(channel: Tensor, symbols: int, moving_end: str) -> Tensor:

@@ -1,5 +1,6 @@
 import json
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from gsparc.data.load import load, split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.spacing import group_visits, path_order
 from gsparc.data.split_files import read_split, write_split
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.splits import SplitSettings, hash_indices, make_split
+from gsparc.models.per_station import wrap_per_station
+from gsparc.models.registry import method_class
+from gsparc.training.context import FitContext
 
 
 def _walk(rows=400, seed=0):
@@ -341,3 +345,35 @@ def test_splits_of_shared_data_keep_their_rows():
     for name, (file, sha256) in known.items():
         found = split_for({"name": "random"}, load({"name": name, "file": str(real(file))})).sha256
         assert found.startswith(sha256)
+
+
+def test_a_survey_whose_transmitters_were_rarely_heard_had_no_table(caplog):
+    """A dozen access points at unknown places, some heard twice: every baseline refused its test rows."""
+    rng, heard = np.random.default_rng(0), [60, 40, 20, 3, 2, 1]
+    spots = rng.uniform(0, 50, (60, 2)).tolist()
+    rows = [(*spots[i], t) for t, count in enumerate(heard) for i in rng.choice(60, count, replace=False)]
+    x, y, station = np.array(rows).T
+    arrays = {
+        "rx_position": np.stack([x, y, np.ones(len(x))], 1), "station": station.astype(int),
+        "station_position": np.full((6, 3), np.nan), "rssi_db": rng.normal(-70, 5, len(x)),
+    }  # fmt: skip
+    data = from_arrays(arrays)
+    split = split_for({"name": "random", "test_fraction": 0.4}, data)
+    (fold,) = split.folds
+    assert set(data.station[fold.test]) == {0, 1, 2} and {3, 4} & set(data.station[fold.train])
+    assert "split: stations of under 4 training rows are not asked about" in caplog.text
+    assert split.sha256 == hash_indices(split.folds)
+    for name in ("zero", "gp", "kriging"):
+        wrap_per_station(method_class(name)(), data).fit(data, fold, FitContext(Path()))
+    placed = from_arrays({**arrays, "station_position": rng.uniform(0, 50, (6, 3))})
+    asked = split_for({"name": "random", "test_fraction": 0.4}, placed).folds[0].test
+    assert len(asked) > len(fold.test)  # at known places they are predicted
+    # Nothing else is asked: methods say that they cannot.
+    assert all(len(one.test) for one in split_for({"name": "stations"}, data).folds)
+
+
+@pytest.mark.parametrize("side_m", [None, 3.0])
+def test_places_of_a_lift_were_told_to_take_smaller_squares(side_m):
+    lift = np.tile([2.5, 4.0, 0.0], (40, 1)) + np.linspace(0, 60, 40)[:, None] * [0, 0, 1]
+    with pytest.raises(DataError, match="all positions are one above the other, there are no squares"):
+        make_split(lift, SplitSettings("blocks", side_m=side_m))

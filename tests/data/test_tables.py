@@ -121,6 +121,28 @@ def test_many_transmitters_did_not_become_one_without_a_word(write):
     assert not any("stations?" in note for note in other)
 
 
+@pytest.mark.parametrize("head", ["beam_index", "antenna", "device", "SSB"])
+def test_beams_antennas_and_devices_became_one_without_a_word(write, head):
+    rows = "".join(f"{i % 3},{i // 3},{i},2,-{60 + i % 7}\n" for i in range(24))
+    notes = parse_table(write(f"{head},x,y,z,rssi\n{rows}")).notes
+    said = (
+        f"column '{head}' speaks of an antenna or a device and is not used: dataset.columns.station={head} "
+    )
+    assert sum(note.startswith(said) for note in notes) == 1
+    one = parse_table(
+        write(f"{head},x,y,z,rssi\n" + rows.replace("\n1,", "\n0,").replace("\n2,", "\n0,"))
+    ).notes
+    assert not any("speaks of" in note for note in one)
+
+
+def test_source_and_destination_were_no_ends_and_tags_had_no_place(write):
+    links = parse_table(write("src_x,src_y,dst_x,dst_y,rssi_dbm\n1,2,3,4,-50\n5,6,7,8,-60\n")).arrays
+    assert links["tx_position"].tolist() == [[1, 2], [5, 6]]
+    assert links["rx_position"].tolist() == [[3, 4], [7, 8]]
+    tags = parse_table(write("tag_x,tag_y,rssi_dbm\n1,2,-50\n5,6,-60\n")).arrays
+    assert tags["rx_position"].tolist() == [[1, 2], [5, 6]]
+
+
 def test_what_is_said_wins_over_guesses(write, refused):
     text = "lat,lon,px,py,RSRP,RSSI\n40,8,1,2,-80,-60\n40,9,3,4,-81,-61\n"
     said = {"rssi_db": "rsrp", "tx_x": "px", "tx_y": "py", "tx_z": 1.5, "rx_x": 0, "rx_y": 0, "rx_z": 2}

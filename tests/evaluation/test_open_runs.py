@@ -8,6 +8,7 @@ import pytest
 
 import gsparc
 from gsparc.data.errors import DataError
+from gsparc.data.load import answerable
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split, SplitSettings, make_split
 from gsparc.data.tables.read import parse_table
@@ -236,3 +237,18 @@ def test_locate_built_whatever_class_a_checkpoint_named():
     run.stored[0].configuration = {}
     with pytest.raises(DataError, match=r"a\.ckpt does not say how it was trained"):
         run.retraining()
+
+
+@pytest.mark.parametrize("placed", [True, False])
+def test_a_second_survey_had_no_table_where_a_station_was_rarely_heard_before(placed, caplog):
+    """`zero: station roof had too few training rows`, after minutes."""
+    before, none, every = LEVELS.copy(), np.arange(0), np.arange(240)
+    before[2:, 2] = np.nan
+    posts = POSTS if placed else np.full_like(POSTS, np.nan)
+    first, second = town(rssi_db=before, station_position=posts), town(station_position=posts)
+    learned = Split("none", (Fold(np.arange(len(first)), none, none),), "")
+    chosen = answerable(Split("whole", (Fold(none, none, every),), ""), second, (first, learned))
+    assert set(second.station[chosen.folds[0].test]) == {0, 1}
+    assert "split: stations of under 4 training rows are not asked about" in caplog.text
+    for name in ("zero", "kriging"):
+        fit_baseline(name, second, chosen, learned=(first, learned))

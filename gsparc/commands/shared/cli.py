@@ -24,7 +24,7 @@ from rich.console import Console
 
 from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release_folders
-from gsparc.data.files import check_yaml
+from gsparc.data.files import check_yaml, list_causes
 from gsparc.data.instantiate import GROUPS, plugins
 from gsparc.evaluation import console
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
@@ -144,13 +144,7 @@ def _in_logging(frame: FrameType | None) -> bool:
 
 def _began_as_interrupt(error: BaseException | None) -> bool:
     """A clean-up that meets what Ctrl-C left half done raises an error of its own over the interrupt."""
-    seen: list[BaseException] = []
-    while error is not None and error not in seen:  # an error raised again may be its own context
-        if isinstance(error, KeyboardInterrupt):
-            return True
-        seen.append(error)
-        error = error.__cause__ or error.__context__
-    return False
+    return any(isinstance(one, KeyboardInterrupt) for one in list_causes(error))
 
 
 def _message_of(error: BaseException) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.linalg import lu_factor, lu_solve
-from scipy.optimize import curve_fit
+from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
@@ -89,8 +89,9 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     low, high = [0, 0, limit * 1e-3], [spread * 3, spread * 10, limit * 10]
     start = [float(gamma[0]) / 2, spread, limit / 5]
     start = [min(max(s, a), b) for s, a, b in zip(start, low, high, strict=True)]
-    result, _ = curve_fit(variogram, distance, gamma, start, 1 / np.sqrt(number[filled]), bounds=(low, high))
-    return Variogram(*(float(v) for v in result))
+    weight = np.sqrt(number[filled])
+    found = least_squares(lambda p: weight * (variogram(distance, *p) - gamma), start, bounds=(low, high))
+    return Variogram(*found.x.tolist())
 
 
 class Kriging(Interpolator):

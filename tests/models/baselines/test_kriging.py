@@ -1,5 +1,7 @@
 """Of many places each query is kriged from its nearest alone, and that is nearly what all of them say."""
 
+import warnings
+
 import numpy as np
 
 from gsparc.models.baselines import kriging
@@ -36,3 +38,12 @@ def test_two_places_have_no_variogram():
     """Their one distance is more than half the extent: no quantile of nothing could be taken."""
     found = kriging.fit_variogram(np.array([[0.0, 0, 0], [3.0, 4, 0]]), np.array([[-60.0], [-70.0]]))
     assert (found.nugget, found.range) == (0.0, 2.5) and found.sill > 0
+
+
+def test_few_places_printed_a_warning_of_a_library():
+    """`OptimizeWarning: Covariance of the parameters could not be estimated`, which nobody had asked for."""
+    rng = np.random.default_rng(0)
+    places, levels = np.c_[rng.uniform(0, 50, (4, 2)), np.zeros(4)], np.round(2 * rng.normal(size=(4, 1)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert kriging.fit_variogram(places, levels).sill >= 0
