@@ -34,7 +34,7 @@ from gsparc.processes.neighbourhood import (
     nearest_distance,
     rows_with_nearest,
 )
-from gsparc.processes.prior import Answer, Posterior, Prior
+from gsparc.processes.prior import Posterior, Prior
 
 COVER = 20_000  # rows that weigh the mean law
 WHITENED = 1_024  # rows at a time that are whitened by their neighbours
@@ -132,7 +132,7 @@ class Nearest(Posterior):
         """See `Posterior`."""
         return torch.from_numpy(self.near.places)
 
-    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
+    def answer(self, queries: Tensor, float64: bool = False) -> MeanVariance:
         """See `Posterior`."""
         return self._answer_blocks(queries, None, float64)
 
@@ -142,25 +142,25 @@ class Nearest(Posterior):
 
     def left_out(self) -> MeanVariance:
         """See `Posterior`."""
-        result = self._answer_blocks(self.places, np.arange(len(self.places)))
-        return MeanVariance(result.mean, result.variance)
+        return self._answer_blocks(self.places, np.arange(len(self.places)))
 
-    def _answer_blocks(self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False) -> Answer:
+    def _answer_blocks(
+        self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False
+    ) -> MeanVariance:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
         parts = (self._answer(queries[b], None if excluded is None else excluded[b], float64) for b in blocks)
         if len(blocks) < 2 or not has_query_kernel(queries):
-            return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
+            return MeanVariance(*(torch.cat(part) for part in zip(*parts, strict=True)))
         first = next(parts)
-        result = Answer(
-            first.mean.new_empty(len(queries), first.mean.shape[1]), queries.new_empty(len(queries))
-        )
+        blank = first.mean.new_empty(len(queries), first.mean.shape[1])
+        result = MeanVariance(blank, queries.new_empty(len(queries)))
         # Parts kept in a list would lie between freed systems in memory, which then is not used again.
         for block, part in zip(blocks, chain([first], parts), strict=True):
             result.mean[block], result.variance[block] = part.mean, part.variance
         return result
 
-    def _answer(self, queries: Tensor, excluded: np.ndarray | None, float64: bool) -> Answer:
+    def _answer(self, queries: Tensor, excluded: np.ndarray | None, float64: bool) -> MeanVariance:
         index = torch.from_numpy(self.near.nearest_rows(to_numpy(queries), excluded, self.most))
         weights, known = self._weigh_neighbours(queries, index)
         rest = self.rest[index]
@@ -174,7 +174,7 @@ class Nearest(Posterior):
             unsure = self.prior.columns(queries) - explained
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
-        return Answer(mean, left.clamp_min(0.0))
+        return MeanVariance(mean, left.clamp_min(0.0))
 
     def _weigh_neighbours(self, queries: Tensor, index: Tensor) -> KrigingWeights:
         """Of rows (B, k), see `neighbour_weights`."""
@@ -288,43 +288,31 @@ def trend_mean_and_covariance(
     return precision.solve(terms.T @ values), precision.inverse
 
 
-@dataclass(frozen=True)
-class NeighbourSample:
-    """Rows with their nearest others.
+class NeighbourSample(NamedTuple):
+    """Rows with their nearest others: each row first, then its neighbours.
 
     Attributes:
-        far, apart: (T, k) and (T, k, k) distances from the near ones, and between these [m].
-        value, near: (T, P) and (T, k, P), less the mean law and its weighed terms; outputs share kernel and
-            amplitude.
-        count, counts: (T,) and (T, k) rows that each value is the mean of.
+        apart: (T, 1 + k, 1 + k) distances between them [m].
+        values: (T, 1 + k, P), less the mean law and its weighed terms; outputs share kernel and amplitude.
+        counts: (T, 1 + k) rows that each value is the mean of.
     """
 
-    far: Tensor
     apart: Tensor
-    value: Tensor
-    near: Tensor
-    count: Tensor
+    values: Tensor
     counts: Tensor
-
-    @classmethod
-    def from_row_then_neighbours(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
-        """Split (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
-        between = distances(places, places)
-        return cls(
-            between[:, 0, 1:], between[:, 1:, 1:], values[:, 0], values[:, 1:], counts[:, 0], counts[:, 1:]
-        )
 
 
 def nearest_density(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Tensor]:
     """Return the negative log density, mean over rows [nats], and the best amplitude."""
-    noise = kernel.noise
-    gram = kernel.correlation(sample.apart) + torch.diag_embed(noise / sample.counts + JITTER)
-    weights, known = kriging_weights(gram, kernel.correlation(sample.far))
-    variance = 1 + noise / sample.count - known
-    squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
+    covariance, noise = kernel.correlation(sample.apart), kernel.noise / sample.counts
+    value, near = sample.values[:, 0], sample.values[:, 1:]
+    gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:] + JITTER)
+    weights, known = kriging_weights(gram, covariance[:, 0, 1:])
+    variance = 1 + noise[:, 0] - known
+    squared = (value - torch.einsum("tk,tkp->tp", weights, near)).square().mean(1)
     amplitude = (squared / variance).mean().clamp_min(TINY)
     # Near rows alone tell no long process of a huge amplitude from one of the values' own.
-    excess = (amplitude / sample.value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
+    excess = (amplitude / value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
     density = 0.5 * (amplitude.log() + variance.log().mean())
     return density + EXCESS * excess.square() / len(variance), amplitude
 
@@ -368,7 +356,8 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         row = covering_rows(values.places[own], LOOKED_AT // len(sets), seed)
         parts.append(own[rows_with_nearest(values.places[own], row, LOOKED_BY)])
     rows = np.concatenate(parts)
-    sample = NeighbourSample.from_row_then_neighbours(every[rows], rest[rows], values.count[rows])
+    near = distances(every[rows], every[rows])
+    sample = NeighbourSample(near, rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
     starts = [Kernel.from_lengths((long * share, long), shares, start.noise) for share in SHORTER]

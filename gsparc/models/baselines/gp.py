@@ -276,9 +276,8 @@ def choose_nearest_kernel(
     row = covering_rows(places, LOOKED_AT, seed)
     rows = rows_with_nearest(places, row)
     strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
-    values = torch.from_numpy(scores[rows][..., strong]).double()
-    once = torch.ones(rows.shape, dtype=torch.float64)
-    sample = NeighbourSample.from_row_then_neighbours(torch.from_numpy(places[rows]), values, once)
+    values, at = torch.from_numpy(scores[rows][..., strong]).double(), torch.from_numpy(places[rows])
+    sample = NeighbourSample(distances(at, at), values, torch.ones(rows.shape, dtype=torch.float64))
     result = fit_kernel_nearest([start], sample, pdist(places[row]))
     share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
     note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
