@@ -156,7 +156,7 @@ def weigh_candidates(
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
             "%d held-out rows: %s has an NMSE of %.3f, weight %.2f", len(rows), name,
-            solution_weights.relative_error(one, target), weight,
+            1 - solution_weights.explained_variance(one, target, False), weight,
         )  # fmt: skip
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
 

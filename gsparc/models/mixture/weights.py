@@ -81,12 +81,6 @@ def share_of_second(parts: Sequence[HeldOutPair]) -> float:
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
 
 
-def relative_error(predicted: Tensor, target: Tensor) -> float:
-    """Return the share of the target's energy that is missed."""
-    missed = (predicted - target).abs().square().sum()
-    return float(missed / target.abs().square().sum().clamp_min(TINY_POWER))
-
-
 def explained_variance(predicted: Tensor, target: Tensor, remove_mean: bool) -> float:
     """Return the share of variance that a prediction explains, of complex targets about 0; at most 1."""
     middle = target.mean(0, keepdim=True) if remove_mean else torch.zeros_like(target[:1])

@@ -188,7 +188,7 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        process, places = self._require_process(), query.places(self.site)
+        process, places = self.require_fitted(self.powers), query.places(self.site)
         parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
         joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
         mean, spread, share, explained = joined
@@ -204,7 +204,7 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        process = self._require_process()
+        process = self.require_fitted(self.powers)
         decibels, spread = process.left_out(self.at)
         if self.fringes is not None:
             posterior = process.posterior
@@ -247,10 +247,5 @@ class PowerField(ClosedForm):
     def _nearest_distance(self, places: Tensor) -> Tensor:
         """From the nearest known row (B,) [m]."""
         if self._tree is None:
-            self._tree = cKDTree(self._require_process().places)
+            self._tree = cKDTree(self.require_fitted(self.powers).places)
         return nearest_distance(self._tree, places)
-
-    def _require_process(self) -> PowerProcess:
-        if self.powers is None:
-            raise ValueError("a field of powers: condition it first")
-        return self.powers
