@@ -17,7 +17,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
@@ -36,9 +35,7 @@ from gsparc.processes.neighbourhood import (
 )
 from gsparc.processes.prior import Posterior, Prior
 
-COVER = 20_000  # rows that weigh the mean law
-WHITENED = 1_024  # rows at a time that are whitened by their neighbours
-FIRST = 256  # rows of an ordering that condition on each other alone
+COVER = 2_000  # rows that weigh the mean law
 ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
@@ -242,8 +239,7 @@ def condition_on_nearest(
         return Nearest(prior, near, every.values, noise, none, none[:, :0], neighbours)
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
-    chosen = covering_rows(every.places, COVER, seed)
-    terms, spread = trend_mean_and_covariance(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
+    terms, spread = trend_mean_and_covariance(prior, every.places, rest, noise, seed)
     return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
@@ -251,38 +247,20 @@ def condition_on_nearest(
 def trend_mean_and_covariance(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms given rows, unit normal before.
-
-    Rows in random order condition on their nearest ones in the half before them: what is left of them is
-    white, and of the terms too.
+    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms, unit normal before, given some rows.
 
     Args:
         prior: see there.
         places, rest, noise: (m, D), (m, P), (m,) as in `Nearest`.
-        seed: of the order.
+        seed: of the rows, which cover the site.
     """
-    order = np.random.default_rng(seed).permutation(len(places))
-    places, noise = places[order], noise[torch.from_numpy(order)]
-    at, kernel = torch.from_numpy(places), prior.kernel
-    # Values and terms side by side: both are whitened by the same weights.
-    both = torch.cat([rest[torch.from_numpy(order)], prior.columns(at)], 1)
-    first = min(FIRST, len(places))
-    gram = kernel.correlations(at[:first], at[:first])
-    gram.diagonal().add_(noise[:first])
-    white = [Factor.from_gram(gram, "raise").whiten(both[:first])]
-    start = first
-    while start < len(places):
-        # The tree of the rows so far serves as many again: few trees for any number of rows.
-        tree, end = cKDTree(places[:start]), min(2 * start, len(places))
-        for a in range(start, end, WHITENED):
-            block = slice(a, min(a + WHITENED, end))
-            row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))[1]
-            shares, known = neighbour_weights(kernel, at[block], at[row], noise[row])
-            left = (1 + noise[block] - known).sqrt()
-            white.append((both[block] - torch.einsum("bk,bkp->bp", shares, both[row])) / left[:, None])
-        start = end
-    flat, outputs = torch.cat(white), rest.shape[1]
-    terms, values = flat[:, outputs:], flat[:, :outputs]
+    few = covering_rows(places, COVER, seed)
+    at, chosen = torch.from_numpy(places[few]), torch.from_numpy(few)
+    gram = prior.kernel.correlations(at, at)
+    gram.diagonal().add_(noise[chosen])
+    columns, outputs = prior.columns(at), rest.shape[1]
+    white = Factor.from_gram(gram, "raise").whiten(torch.cat([rest[chosen], columns], 1))
+    values, terms = white[:, :outputs], white[:, outputs:]
     # Linear regression on white rows, whose weights have unit variance before.
     precision = Factor.from_gram(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
     return precision.solve(terms.T @ values), precision.inverse
@@ -317,18 +295,6 @@ def nearest_density(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Te
     return density + EXCESS * excess.square() / len(variance), amplitude
 
 
-def fit_kernel_nearest(starts: list[Kernel], sample: NeighbourSample, distance: np.ndarray) -> Kernel:
-    """Find the kernel of largest density of rows given their neighbours, from the best of `starts`.
-
-    Args:
-        starts: all of one number of lengths.
-        sample: the rows.
-        distance: between rows of the whole site [m], for bounds of lengths.
-    """
-    bounds = starts[0].bounds(torch.from_numpy(distance))
-    return fit_kernel(lambda one: nearest_density(one, sample), starts, bounds)[1]
-
-
 def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:
     """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
 
@@ -343,11 +309,9 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     count, start = len(values.places), prior.kernel
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
-    chosen = covering_rows(values.places, COVER, seed)
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
-    noise = start.noise / values.count[chosen]
-    about, _ = trend_mean_and_covariance(prior, values.places[chosen], rest[chosen], noise, seed)
+    about, _ = trend_mean_and_covariance(prior, values.places, rest, start.noise / values.count, seed)
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
@@ -364,6 +328,6 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
-    return fit_kernel_nearest(
-        starts, sample, scale
-    ), f"{note} among {' and '.join(str(len(o)) for o in sets)}"
+    among = f"among {' and '.join(str(len(own)) for own in sets)}"
+    bounds = starts[0].bounds(torch.from_numpy(scale))
+    return fit_kernel(lambda one: nearest_density(one, sample), starts, bounds)[1], f"{note} {among}"
