@@ -113,7 +113,7 @@ def learn_vector_process(
     if len(rest):
         log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
         others = recovery.vectors[rest], places[rest]
-        vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner, kernel)
+        vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened_features(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
