@@ -10,10 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, setting, whole
-from gsparc.processes.factor import Factor
-from gsparc.processes.features import Correlation, correlation
+from gsparc.processes.features import Correlation, correlation, whitened_features
 
-JITTER = 1e-5  # relative to the unit variance of the kernel
+JITTER = 1e-5  # relative to the unit variance of the kernel: repeated positions stay invertible
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,10 @@ class PositionEncoding(nn.Module):
             self.length, self.noise, self.kernel = prior.length, prior.noise, prior.kernel
             self.tells_share = prior.whitening is not None
             self.register_buffer("anchors", prior.anchors.float())
-            whitening = _whitening_matrix(prior) if prior.whitening is None else prior.whitening
+            known = prior.anchors.double(), prior.length, JITTER, prior.kernel, len(prior.anchors)
+            whitening = prior.whitening
+            if whitening is None:
+                whitening = whitened_features(*known).whitening.float()
             # What the prior holds is stored with it.
             self.register_buffer("whitening", whitening, persistent=prior.whitening is None)
         elif settings.kind != "raw":
@@ -118,10 +120,3 @@ class PositionEncoding(nn.Module):
 def unknown_share(features: Tensor) -> Tensor:
     """Return posterior over prior variance (B,) in [0, 1] of a process: `1 - |phi|^2` of features (B, E)."""
     return (1 - torch.linalg.vecdot(features, features)).clamp_(0, 1)
-
-
-def _whitening_matrix(prior: Prior) -> Tensor:
-    anchors = prior.anchors.double()
-    gram = correlation(anchors, anchors, prior.length, prior.kernel)
-    gram.diagonal().add_(JITTER)  # repeated positions stay invertible
-    return Factor.from_gram(gram).root.T.float().contiguous()

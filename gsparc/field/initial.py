@@ -92,13 +92,9 @@ class Start:
         prior: features of the encodings, or None.
         solve: sets the parameters of a fresh model, and may return what `left_out` holds; None: they stay
             random.
-        billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
-            the processor [s].
         left_out: training targets that it predicted without their neighbours, for whoever asks; not stored.
     """
 
     prior: Prior | None
     solve: Callable[[GaussianModel], Any] | None = None
-    billed_s: tuple[float, float] = (0.0, 0.0)
-    waited_s: tuple[float, float] = (0.0, 0.0)
     left_out: Any = None

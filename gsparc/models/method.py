@@ -162,9 +162,13 @@ class Method(MethodFactory):
     @property
     def fitted_site(self) -> Site:
         """The site that was learned from; `ValueError` before `fit` or `restore`."""
-        if self.site is None:
-            raise ValueError(f"{self.name}: fit or restore it first")
-        return self.site
+        return self.require_fitted(self.site)
+
+    def require_fitted(self, part: T | None) -> T:
+        """Return what a fit or a checkpoint sets; `ValueError` before."""
+        if part is None:
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return part
 
     @abstractmethod
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:

@@ -17,7 +17,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
@@ -34,11 +33,9 @@ from gsparc.processes.neighbourhood import (
     nearest_distance,
     rows_with_nearest,
 )
-from gsparc.processes.prior import Answer, Posterior, Prior
+from gsparc.processes.prior import Posterior, Prior
 
-COVER = 20_000  # rows that weigh the mean law
-WHITENED = 1_024  # rows at a time that are whitened by their neighbours
-FIRST = 256  # rows of an ordering that condition on each other alone
+COVER = 2_000  # rows that weigh the mean law
 ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
@@ -132,7 +129,7 @@ class Nearest(Posterior):
         """See `Posterior`."""
         return torch.from_numpy(self.near.places)
 
-    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
+    def answer(self, queries: Tensor, float64: bool = False) -> MeanVariance:
         """See `Posterior`."""
         return self._answer_blocks(queries, None, float64)
 
@@ -142,25 +139,25 @@ class Nearest(Posterior):
 
     def left_out(self) -> MeanVariance:
         """See `Posterior`."""
-        result = self._answer_blocks(self.places, np.arange(len(self.places)))
-        return MeanVariance(result.mean, result.variance)
+        return self._answer_blocks(self.places, np.arange(len(self.places)))
 
-    def _answer_blocks(self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False) -> Answer:
+    def _answer_blocks(
+        self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False
+    ) -> MeanVariance:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
         parts = (self._answer(queries[b], None if excluded is None else excluded[b], float64) for b in blocks)
         if len(blocks) < 2 or not has_query_kernel(queries):
-            return Answer(*(torch.cat(part) for part in zip(*(vars(p).values() for p in parts), strict=True)))
+            return MeanVariance(*(torch.cat(part) for part in zip(*parts, strict=True)))
         first = next(parts)
-        result = Answer(
-            first.mean.new_empty(len(queries), first.mean.shape[1]), queries.new_empty(len(queries))
-        )
+        blank = first.mean.new_empty(len(queries), first.mean.shape[1])
+        result = MeanVariance(blank, queries.new_empty(len(queries)))
         # Parts kept in a list would lie between freed systems in memory, which then is not used again.
         for block, part in zip(blocks, chain([first], parts), strict=True):
             result.mean[block], result.variance[block] = part.mean, part.variance
         return result
 
-    def _answer(self, queries: Tensor, excluded: np.ndarray | None, float64: bool) -> Answer:
+    def _answer(self, queries: Tensor, excluded: np.ndarray | None, float64: bool) -> MeanVariance:
         index = torch.from_numpy(self.near.nearest_rows(to_numpy(queries), excluded, self.most))
         weights, known = self._weigh_neighbours(queries, index)
         rest = self.rest[index]
@@ -174,7 +171,7 @@ class Nearest(Posterior):
             unsure = self.prior.columns(queries) - explained
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
             left = left + ((unsure @ self.spread) * unsure).sum(1)
-        return Answer(mean, left.clamp_min(0.0))
+        return MeanVariance(mean, left.clamp_min(0.0))
 
     def _weigh_neighbours(self, queries: Tensor, index: Tensor) -> KrigingWeights:
         """Of rows (B, k), see `neighbour_weights`."""
@@ -242,8 +239,7 @@ def condition_on_nearest(
         return Nearest(prior, near, every.values, noise, none, none[:, :0], neighbours)
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
-    chosen = covering_rows(every.places, COVER, seed)
-    terms, spread = trend_mean_and_covariance(prior, every.places[chosen], rest[chosen], noise[chosen], seed)
+    terms, spread = trend_mean_and_covariance(prior, every.places, rest, noise, seed)
     return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
@@ -251,94 +247,52 @@ def condition_on_nearest(
 def trend_mean_and_covariance(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms given rows, unit normal before.
-
-    Rows in random order condition on their nearest ones in the half before them: what is left of them is
-    white, and of the terms too.
+    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms, unit normal before, given some rows.
 
     Args:
         prior: see there.
         places, rest, noise: (m, D), (m, P), (m,) as in `Nearest`.
-        seed: of the order.
+        seed: of the rows, which cover the site.
     """
-    order = np.random.default_rng(seed).permutation(len(places))
-    places, noise = places[order], noise[torch.from_numpy(order)]
-    at, kernel = torch.from_numpy(places), prior.kernel
-    # Values and terms side by side: both are whitened by the same weights.
-    both = torch.cat([rest[torch.from_numpy(order)], prior.columns(at)], 1)
-    first = min(FIRST, len(places))
-    gram = kernel.correlations(at[:first], at[:first])
-    gram.diagonal().add_(noise[:first])
-    white = [Factor.from_gram(gram, "raise").whiten(both[:first])]
-    start = first
-    while start < len(places):
-        # The tree of the rows so far serves as many again: few trees for any number of rows.
-        tree, end = cKDTree(places[:start]), min(2 * start, len(places))
-        for a in range(start, end, WHITENED):
-            block = slice(a, min(a + WHITENED, end))
-            row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))[1]
-            shares, known = neighbour_weights(kernel, at[block], at[row], noise[row])
-            left = (1 + noise[block] - known).sqrt()
-            white.append((both[block] - torch.einsum("bk,bkp->bp", shares, both[row])) / left[:, None])
-        start = end
-    flat, outputs = torch.cat(white), rest.shape[1]
-    terms, values = flat[:, outputs:], flat[:, :outputs]
+    few = covering_rows(places, COVER, seed)
+    at, chosen = torch.from_numpy(places[few]), torch.from_numpy(few)
+    gram = prior.kernel.correlations(at, at)
+    gram.diagonal().add_(noise[chosen])
+    columns, outputs = prior.columns(at), rest.shape[1]
+    white = Factor.from_gram(gram, "raise").whiten(torch.cat([rest[chosen], columns], 1))
+    values, terms = white[:, :outputs], white[:, outputs:]
     # Linear regression on white rows, whose weights have unit variance before.
     precision = Factor.from_gram(terms.T @ terms + torch.eye(terms.shape[1], dtype=terms.dtype))
     return precision.solve(terms.T @ values), precision.inverse
 
 
-@dataclass(frozen=True)
-class NeighbourSample:
-    """Rows with their nearest others.
+class NeighbourSample(NamedTuple):
+    """Rows with their nearest others: each row first, then its neighbours.
 
     Attributes:
-        far, apart: (T, k) and (T, k, k) distances from the near ones, and between these [m].
-        value, near: (T, P) and (T, k, P), less the mean law and its weighed terms; outputs share kernel and
-            amplitude.
-        count, counts: (T,) and (T, k) rows that each value is the mean of.
+        apart: (T, 1 + k, 1 + k) distances between them [m].
+        values: (T, 1 + k, P), less the mean law and its weighed terms; outputs share kernel and amplitude.
+        counts: (T, 1 + k) rows that each value is the mean of.
     """
 
-    far: Tensor
     apart: Tensor
-    value: Tensor
-    near: Tensor
-    count: Tensor
+    values: Tensor
     counts: Tensor
-
-    @classmethod
-    def from_row_then_neighbours(cls, places: Tensor, values: Tensor, counts: Tensor) -> NeighbourSample:
-        """Split (T, 1 + k, D), (T, 1 + k, P) and (T, 1 + k): each row first, then its neighbours."""
-        between = distances(places, places)
-        return cls(
-            between[:, 0, 1:], between[:, 1:, 1:], values[:, 0], values[:, 1:], counts[:, 0], counts[:, 1:]
-        )
 
 
 def nearest_density(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Tensor]:
     """Return the negative log density, mean over rows [nats], and the best amplitude."""
-    noise = kernel.noise
-    gram = kernel.correlation(sample.apart) + torch.diag_embed(noise / sample.counts + JITTER)
-    weights, known = kriging_weights(gram, kernel.correlation(sample.far))
-    variance = 1 + noise / sample.count - known
-    squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
+    covariance, noise = kernel.correlation(sample.apart), kernel.noise / sample.counts
+    value, near = sample.values[:, 0], sample.values[:, 1:]
+    gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:] + JITTER)
+    weights, known = kriging_weights(gram, covariance[:, 0, 1:])
+    variance = 1 + noise[:, 0] - known
+    squared = (value - torch.einsum("tk,tkp->tp", weights, near)).square().mean(1)
     amplitude = (squared / variance).mean().clamp_min(TINY)
     # Near rows alone tell no long process of a huge amplitude from one of the values' own.
-    excess = (amplitude / sample.value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
+    excess = (amplitude / value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
     density = 0.5 * (amplitude.log() + variance.log().mean())
     return density + EXCESS * excess.square() / len(variance), amplitude
-
-
-def fit_kernel_nearest(starts: list[Kernel], sample: NeighbourSample, distance: np.ndarray) -> Kernel:
-    """Find the kernel of largest density of rows given their neighbours, from the best of `starts`.
-
-    Args:
-        starts: all of one number of lengths.
-        sample: the rows.
-        distance: between rows of the whole site [m], for bounds of lengths.
-    """
-    bounds = starts[0].bounds(torch.from_numpy(distance))
-    return fit_kernel(lambda one: nearest_density(one, sample), starts, bounds)[1]
 
 
 def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:
@@ -355,11 +309,9 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     count, start = len(values.places), prior.kernel
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
-    chosen = covering_rows(values.places, COVER, seed)
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
-    noise = start.noise / values.count[chosen]
-    about, _ = trend_mean_and_covariance(prior, values.places[chosen], rest[chosen], noise, seed)
+    about, _ = trend_mean_and_covariance(prior, values.places, rest, start.noise / values.count, seed)
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
@@ -368,13 +320,14 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         row = covering_rows(values.places[own], LOOKED_AT // len(sets), seed)
         parts.append(own[rows_with_nearest(values.places[own], row, LOOKED_BY)])
     rows = np.concatenate(parts)
-    sample = NeighbourSample.from_row_then_neighbours(every[rows], rest[rows], values.count[rows])
+    near = distances(every[rows], every[rows])
+    sample = NeighbourSample(near, rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
     starts = [Kernel.from_lengths((long * share, long), shares, start.noise) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
-    return fit_kernel_nearest(
-        starts, sample, scale
-    ), f"{note} among {' and '.join(str(len(o)) for o in sets)}"
+    among = f"among {' and '.join(str(len(own)) for own in sets)}"
+    bounds = starts[0].bounds(torch.from_numpy(scale))
+    return fit_kernel(lambda one: nearest_density(one, sample), starts, bounds)[1], f"{note} {among}"

@@ -19,7 +19,7 @@ from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.neighbourhood import Neighbourhood
-from gsparc.processes.prior import Answer, Posterior, Prior
+from gsparc.processes.prior import Posterior, Prior
 
 BLOCK = 64  # rows of a covariance at a time
 MANY, NEAR = 1_000, 64  # rows beyond which the variance is that given so many of the nearest
@@ -71,15 +71,15 @@ class Exact(Posterior):
         """Factor of the rows' covariance."""
         return _factor(self.prior, self.rows, self.extra)
 
-    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
+    def answer(self, queries: Tensor, float64: bool = False) -> MeanVariance:
         """See `Posterior`."""
         own = self.prior.columns(queries)
         cross, prior = self.cross_covariance(queries, own), self.prior.variance(own)
         if self._vecchia is not None:
-            return Answer(self._mean(queries, cross), self._vecchia.answer(queries).variance.minimum(prior))
-        known = self.factor.whiten(cross.T).square().sum(0)
-        # Rounding may leave a variance below 0 at a row's place.
-        return Answer(self._mean(queries, cross), (prior - known).clamp_min(0.0).minimum(prior))
+            left = self._vecchia.answer(queries).variance
+        else:  # rounding may leave a variance below 0 at a row's place
+            left = (prior - self.factor.whiten(cross.T).square().sum(0)).clamp_min(0.0)
+        return MeanVariance(self._mean(queries, cross), left.minimum(prior))
 
     @cached_property
     def _vecchia(self) -> Nearest | None:

@@ -60,19 +60,6 @@ class Prior(Stored):
         return columns.square().sum(1) + (1 + self.kernel.noise)
 
 
-@dataclass(frozen=True)
-class Answer:
-    """What is said of B places.
-
-    Attributes:
-        mean: (B, P) float64 or complex128.
-        left: (B,) variance of a measurement.
-    """
-
-    mean: Tensor
-    variance: Tensor
-
-
 class Posterior(Stored, ABC):
     """See `gsparc.processes.posterior.Exact` and `gsparc.processes.nearest.Nearest`."""
 
@@ -85,8 +72,10 @@ class Posterior(Stored, ABC):
         """Places of the rows (n, D) float64 [m]."""
 
     @abstractmethod
-    def answer(self, queries: Tensor, float64: bool = False) -> Answer:
-        """Answer at places (B, D) float64 [m], with autograd; which rows are nearest has no gradient.
+    def answer(self, queries: Tensor, float64: bool = False) -> MeanVariance:
+        """Return mean (B, P) and variance of a measurement (B,) at places (B, D) float64 [m], with autograd.
+
+        Which rows are nearest has no gradient.
 
         Values of very many rows may be float32, and means with them; `float64`: they are made so.
         """

@@ -23,8 +23,6 @@ class Effort:
         chosen_on: rows that settings are chosen on, of more; each look at them factors a covariance.
         term_rows: rows that powers of the terms of a channel field are learned on.
         evaluations: of a search for sources: factors of covariances and blocks of candidates.
-        station_folds: in which stations are learned each and together, to see which is better.
-        station_rows: that are learned from in each of them.
         fringes: coherent solutions of powers.
         restarts: of spectra that no neighbour solves, times the starts of each.
         steps, steps_after_solving: of gradient, where neither model nor Trainer is given a number; after a
@@ -34,8 +32,6 @@ class Effort:
     chosen_on: int = 1_000
     term_rows: int = 400
     evaluations: int = 3_000
-    station_folds: int = 3
-    station_rows: int = 1_000
     fringes: int = 20
     restarts: int = 100_000
     steps: int = 400
@@ -48,7 +44,7 @@ class Effort:
         return Effort(**{name: max(round(count), 1) for name, count in {**counts, **rows}.items()})
 
 
-ROWS = ("chosen_on", "term_rows", "station_rows")
+ROWS = ("chosen_on", "term_rows")
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ def test_density_of_rows_given_their_neighbours():
     amplitude = np.mean(np.divide(squared, variance))
     excess = max(np.log(amplitude / np.mean(values[:, 0] ** 2)), 0)
     wanted = 0.5 * (np.log(amplitude) + np.mean(np.log(variance))) + EXCESS * excess**2 / 12
-    sample = NeighbourSample.from_row_then_neighbours(*map(torch.from_numpy, (places, values, count)))
+    apart = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1)
+    sample = NeighbourSample(*map(torch.from_numpy, (apart, values, count)))
     parameters = KERNEL.parameters().requires_grad_()
     nats, found = nearest_density(KERNEL.with_values(parameters), sample)
     assert abs(nats.item() - wanted) < 1e-6 and abs(found.item() / amplitude - 1) < 1e-6

@@ -9,7 +9,7 @@ unknown share.
 from __future__ import annotations
 
 import logging
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +33,6 @@ from gsparc.ops import Pose
 from gsparc.physics.array_response import steering_matrix
 from gsparc.processes.features import whitened_features
 from gsparc.processes.neighbourhood import covering_rows
-from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +50,6 @@ class VectorProcess:
         background: (H, W) float32, the mean spectrum.
         error: level and power of the field's `ErrorModel`.
         left_out: training spectra predicted without their neighbours; None for too few.
-        elapsed, training: time of phase retrieval in this run, and when it was computed.
     """
 
     prior: Prior
@@ -59,8 +57,6 @@ class VectorProcess:
     background: Tensor
     error: tuple[float, float]
     left_out: LeftOut | None
-    elapsed: Spent
-    training: Spent
 
 
 def start_from_vectors(task: InitTask) -> Start:
@@ -77,9 +73,8 @@ def start_from_vectors(task: InitTask) -> Start:
         )
     process = learn_vector_process(task.data, task.rows, task.most_anchors, task.seed, task.run_dir)
     return Start(
-        process.prior, partial(set_emissions, process=process, receiver=task.receiver),
-        astuple(process.training), astuple(process.elapsed), process.left_out,
-    )  # fmt: skip
+        process.prior, partial(set_emissions, process=process, receiver=task.receiver), process.left_out
+    )
 
 
 def learn_vector_process(
@@ -102,9 +97,8 @@ def learn_vector_process(
         raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
     if not len(rows):
         raise ValueError("the training set is empty")
-    (array, grid, wavelength), watch = site.array_geometry(), TimeBudget()
-    recovery, training = recover_cached(data, rows, seed)
-    elapsed = watch.by_clock
+    array, grid, wavelength = site.array_geometry()
+    recovery = recover_cached(data, rows, seed)
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         write_recovery_report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering_matrix(array, grid, wavelength).numpy()
@@ -119,7 +113,7 @@ def learn_vector_process(
     if len(rest):
         log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
         others = recovery.vectors[rest], places[rest]
-        vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner, kernel)
+        vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened_features(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
@@ -134,8 +128,6 @@ def learn_vector_process(
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
         fit_level_and_power(tuned.unknown, tuned.error),
         tuned.left_out,
-        elapsed,
-        training,
     )
 
 

@@ -16,7 +16,6 @@ from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.models.array_vectors.phase_retrieval import RecoveredVectors, recover_vectors
 from gsparc.models.target_rows import training_targets
-from gsparc.training.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
 
@@ -25,15 +24,15 @@ AT_ONCE = 1024  # rows solved together, which bounds the memory
 
 @lru_cache(maxsize=1)
 def _solved_rows(key: str) -> dict[int, tuple[Any, ...]]:
-    """By row of the data last asked for what is known of it: its parts of `RecoveredVectors`, and seconds."""
+    """By row of the data last asked for what is known of it: its parts of `RecoveredVectors`."""
     return {}
 
 
 forget_vectors = _solved_rows.cache_clear  # before what is to pay for its own work
 
 
-def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple[RecoveredVectors, Spent]:
-    """Return array vectors of the given rows, and the seconds they took when computed.
+def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> RecoveredVectors:
+    """Return array vectors of the given rows.
 
     Only these rows are read: vectors of a test set are never computed for a training run. Rows that this
     process has solved for the same data, as a refit's are, are not solved again.
@@ -49,13 +48,10 @@ def recover_cached(data: Measurements, rows: np.ndarray, seed: int = 0) -> tuple
     if len(missing) < len(rows):
         log.info("array vectors of %d spectra were computed before", len(rows) - len(missing))
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
-        watch = TimeBudget()
         recovery = recover_vectors(data.site, training_targets(data, part), data.tx[part], seed)
-        spent = np.tile([*vars(watch.by_clock).values()], (len(part), 1)) / len(part)
-        parts = zip(*(getattr(recovery, name) for name in names), spent, strict=True)
+        parts = zip(*(getattr(recovery, name) for name in names), strict=True)
         known.update(zip(part.tolist(), parts, strict=True))
-    *columns, seconds = (np.stack(part) for part in zip(*(known[row] for row in rows.tolist()), strict=True))
-    return RecoveredVectors(*columns), Spent(*seconds.sum(0).tolist())
+    return RecoveredVectors(*map(np.stack, zip(*(known[row] for row in rows.tolist()), strict=True)))
 
 
 def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np.ndarray, path: Path) -> None:

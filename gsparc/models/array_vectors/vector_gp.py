@@ -15,11 +15,9 @@ from scipy.spatial.distance import cdist
 
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.nearest import neighbour_weights
 
 SWEEPS = 30
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
-NEAREST = 30  # aligned vectors that a further one is aligned to
 TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
@@ -111,21 +109,14 @@ def align_by_likelihood(
 
 def align_to_nearest(
     vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
-    partner: np.ndarray | None, kernel: Kernel,
+    partner: np.ndarray | None,
 ) -> np.ndarray:  # fmt: skip
-    """Return vectors (m, M) complex128 of the phases and twins likeliest given the nearest of aligned ones.
+    """Return vectors (m, M) complex128 of the phases and twins that match the nearest of aligned ones.
 
     Args:
         vectors, positions: (m, M) complex and (m, 3) [m], phases and twins unknown.
         known, places: (n, M) complex128 and (n, 3) [m], aligned.
         partner: of `mirror_elements`.
-        kernel: length and noise.
     """
-    aligned, tree = np.array(vectors, dtype=np.complex128), cKDTree(places)
-    near = tree.query(positions, k=np.arange(1, min(NEAREST, len(places)) + 1))[1]
-    around = torch.from_numpy(places[near])
-    noise = torch.full(near.shape, kernel.noise, dtype=torch.float64)
-    weights, _ = neighbour_weights(kernel, torch.from_numpy(positions), around, noise)
-    for i, rows in enumerate(near):
-        aligned[i] = match_phase_and_twin(aligned[i], weights[i].numpy() @ known[rows], partner)
-    return aligned
+    near = known[cKDTree(places).query(positions)[1]]
+    return np.stack([match_phase_and_twin(*pair, partner) for pair in zip(vectors, near, strict=True)])

@@ -11,7 +11,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 from scipy.linalg import eigh
-from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from gsparc.data.blocks import row_blocks
@@ -26,8 +25,8 @@ from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import power_rows, to_entry_variance, to_real
 from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import SHARES, Kernel, distances
-from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, fit_kernel_nearest
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows, rows_with_nearest
+from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
+from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import (
     MOST_ROWS,
@@ -38,7 +37,7 @@ from gsparc.processes.powers import (
 )
 from gsparc.processes.prior import Prior
 
-LOOKED_AT = 600  # rows that settings given the nearest rows are chosen on
+LOOKED_AT = 600  # rows that tell the strongest components
 STRONGEST = 32  # components that they are chosen by
 STARTS = np.array([0.01, 0.05, 0.25])  # lengths that a search starts from, of the extent
 ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
@@ -265,21 +264,18 @@ def project_targets(
 def choose_nearest_kernel(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
-    """Return length and noise likeliest given the nearest rows, by the strongest components, and a note.
+    """Return lengths and noise likeliest given the nearest rows, by the strongest components, and a note.
 
     Args:
         places, scores: (n, D) [m] and (n, P) float32.
         entries: real numbers of a target.
-        start: a kernel of one length, chosen on few rows.
+        start: a kernel chosen on few rows.
         seed: of rows that are drawn.
     """
-    row = covering_rows(places, LOOKED_AT, seed)
-    rows = rows_with_nearest(places, row)
-    strong = np.argsort(-(scores[row].astype(np.float64) ** 2).sum(0), kind="stable")[:STRONGEST]
-    values = torch.from_numpy(scores[rows][..., strong]).double()
-    once = torch.ones(rows.shape, dtype=torch.float64)
-    sample = NeighbourSample.from_row_then_neighbours(torch.from_numpy(places[rows]), values, once)
-    result = fit_kernel_nearest([start], sample, pdist(places[row]))
-    share = float((scores[row] ** 2).sum()) / max(float((scores[row][:, strong] ** 2).sum()), TINY)
-    note = f"settings chosen on {len(row)} of {len(places)} rows, each given its nearest {NEIGHBOURS}"
-    return replace(result, amplitude=result.amplitude * len(strong) / entries * share), note
+    energy = (scores[covering_rows(places, LOOKED_AT, seed)].astype(np.float64) ** 2).sum(0)
+    strong = np.argsort(-energy, kind="stable")[:STRONGEST]
+    once = torch.ones(len(places), dtype=torch.float64)
+    values = PlaceValues(places, torch.from_numpy(scores[:, strong]).double(), once)
+    result, note = choose_kernel_by_nearest(Prior(start), values, seed)
+    share = energy.sum() / max(energy[strong].sum(), TINY)
+    return replace(result, amplitude=result.amplitude * len(strong) / entries * float(share)), note

@@ -74,7 +74,7 @@ class ComplexGP(ClosedForm):
     @property
     def kernel(self) -> Kernel:
         """Its length, noise and power."""
-        return self._posterior().prior.kernel
+        return self.require_fitted(self.posterior).prior.kernel
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
@@ -166,21 +166,20 @@ class ComplexGP(ClosedForm):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        known, dtype = self._posterior(), query.tx.dtype
+        known, dtype = self.require_fitted(self.posterior), query.tx.dtype
         posterior = known.answer(query.places(self.fitted_site), dtype == torch.float64)
         share = posterior.variance / (1 + self.kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
         told = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
         return self.runs.apply_factors(told, query.run)
 
-    def _posterior(self) -> Posterior:
-        if self.posterior is None:
-            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
-        return self.posterior
-
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"posterior": to_plain(self._posterior()), "runs": to_plain(self.runs), "shape": [*self.shape]}
+        return {
+            "posterior": to_plain(self.require_fitted(self.posterior)),
+            "runs": to_plain(self.runs),
+            "shape": [*self.shape],
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

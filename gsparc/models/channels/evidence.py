@@ -18,7 +18,7 @@ from torch import Tensor
 from gsparc.models.channels.columns import Group
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import Isotropic, Noise
-from gsparc.models.channels.terms.compressed import Basis, Cache, change_basis, get_or_make
+from gsparc.models.channels.terms.compressed import Basis, Cache, get_or_make
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
@@ -114,15 +114,6 @@ def compress_groups(
         design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
         parts.append(BasisGroup.from_group(group, basis.columns, pieces, design))
     return tuple(parts)
-
-
-def drop_rows(part: BasisGroup, mask: Tensor) -> BasisGroup:
-    """Return the rows but those of `mask` (n,) bool, from the same matrices."""
-    rest = torch.nonzero(~mask).flatten()
-    # Some rows of orthonormal columns are not orthonormal: made so again, pieces follow by R.
-    basis, mixed = torch.linalg.qr(part.basis[rest])
-    pieces = tuple(change_basis(piece, mixed.T) for piece in part.pieces)
-    return BasisGroup.from_group(part.group.select_rows(rest), basis, pieces, part.design)
 
 
 def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:

@@ -173,7 +173,7 @@ class ChannelField(ClosedForm):
         row was learned of, what ends have in common answers (`SharedGains`).
         """
         # The longest group's covariance with a chunk is the largest matrix of an answer.
-        longest = max(len(each.group) for each in self._require_weights())
+        longest = max(len(each.group) for each in self.require_fitted(self.weights or None))
         ends = query_ends(self.site, query.tx, query.rx)
         if query.station is not None and self.site.stations is not None:
             ends = ends._replace(station=query.station.cpu())
@@ -251,7 +251,7 @@ class ChannelField(ClosedForm):
         """
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
-        for known in self._require_weights():
+        for known in self.require_fitted(self.weights or None):
             group, outputs = known.group, known.group.target.shape[1]
             other = self.prior.disturbance(group).to(torch.complex128)
             residual, error = known.given.left_out_signal(other)
@@ -264,14 +264,9 @@ class ChannelField(ClosedForm):
             entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
         return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())
 
-    def _require_weights(self) -> tuple[Weights, ...]:
-        if not self.weights:
-            raise ValueError("waves: not conditioned yet; call fit or condition first")
-        return self.weights
-
     def state(self) -> dict[str, Any]:
         """See `Method.state`; factors are computed again by `restore`."""
-        groups = [each.group for each in self._require_weights()]
+        groups = [each.group for each in self.require_fitted(self.weights or None)]
         return {
             "prior": self.prior.state(), "channel": list(self.channel), "rows": torch.from_numpy(self.rows),
             "runs": to_plain(self.runs), "groups": [group.state(self.runs.factors) for group in groups],

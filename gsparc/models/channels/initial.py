@@ -3,7 +3,7 @@
 The isotropic process comes first, chosen as `model=complex_gp` chooses. Every further term is kept where the
 marginal likelihood gains more than its parameters are worth (G. Schwarz, "Estimating the dimension of a
 model", Ann. Statist. 6 (1978)) and rows are predicted better without their neighbours: each alone, in 32
-cells of nearby places and in 8. Powers of many directions fit any field: theirs are those of other cells.
+cells of nearby places and in 8.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from gsparc.models.channels.evidence import (
     BasisGroup,
     Grouping,
     compress_groups,
-    drop_rows,
     fit_powers,
     left_out_errors,
     negative_log_evidence,
@@ -57,7 +56,6 @@ ENDS = 64  # of several static ends, those that powers are learned on in the end
 CONCENTRATION = 8.0  # of each direction, that of a von Mises-Fisher density
 SHRINKAGE = 0.5  # of directions' powers towards their mean, in rows of the inverse Gamma prior
 ALIGNED = 1_500  # rows that tell factors of runs: two degrees from those of 2,400, in a third of the time
-FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
 LEAST = 1e-3  # of all powers: sources below are dropped
@@ -211,9 +209,9 @@ def _left_out_groupings(places: Tensor) -> list[Grouping]:
 
 
 def _left_out_squares(part: BasisGroup, prior: ChannelPrior) -> np.ndarray:
-    """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
+    """Mean squared errors (1 + depths,) of rows left out one by one and in cells."""
     errors = left_out_errors(part, part.powers(prior), _left_out_groupings(part.group.places))
-    return np.stack([error.abs().square().mean(1).numpy() for error in errors])
+    return np.stack([error.abs().square().mean().numpy() for error in errors])
 
 
 @dataclass(frozen=True)
@@ -265,7 +263,7 @@ class _Search:
 
     def _measure(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
         """With what left-out rows say."""
-        errors = np.mean([_left_out_squares(part, prior).mean(1) for part in parts], axis=0)
+        errors = np.mean([_left_out_squares(part, prior) for part in parts], axis=0)
         numbers = sum(2 * group.target.numel() for group in self.groups)
         # What the terms beside the isotropic field must gain [nats].
         worth = 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
@@ -328,11 +326,8 @@ class _Search:
     def _add_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
         prior = self._set_directions(before.prior, self.settings.angles, CONCENTRATION)
-        parts = self._compress(prior)
-        errors = self._cross_validate(parts, prior)
-        prior, _ = fit_powers(parts, prior, SHRINKAGE, 2 * SHORT)
-        after = self._refit(_drop_weak_directions(prior))
-        return replace(after, errors=np.maximum(after.errors, errors))
+        prior, _ = fit_powers(self._compress(prior), prior, SHRINKAGE, 2 * SHORT)
+        return self._refit(_drop_weak_directions(prior))
 
     def _refit_on_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
@@ -355,20 +350,6 @@ class _Search:
         towards = torch.zeros(knots, dtype=torch.float64)
         fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
         return prior.with_terms(replace(isotropic, power=SHARED * level), fresh)
-
-    def _cross_validate(self, parts: tuple[BasisGroup, ...], prior: ChannelPrior) -> np.ndarray:
-        """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
-        number = [number_cells_by_bisection(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
-        errors = np.zeros(1 + len(DEPTHS))
-        for fold in range(FOLDS):
-            in_fold = [np.equal(each, fold) for each in number]
-            both = zip(parts, in_fold, strict=True)
-            rest = tuple(drop_rows(part, torch.from_numpy(left)) for part, left in both if not left.all())
-            # Of few rows all may be of one fold: then nothing tells powers.
-            learned = fit_powers(rest, prior, SHRINKAGE, 2 * SHORT)[0] if rest else prior
-            for part, left in zip(parts, in_fold, strict=True):
-                errors += _left_out_squares(part, learned)[:, left].sum(1) / len(left) / len(parts)
-        return errors
 
     def _add_drift(self, before: Candidate, notes: list[str]) -> Candidate:
         groups = drift.sample_stretches(self.every)

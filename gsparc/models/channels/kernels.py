@@ -16,18 +16,13 @@ from torch import Tensor
 
 from gsparc.ops.transforms import needs_reference
 from gsparc.physics.waves import NEAR_M
-from gsparc.processes.kernel import IsotropicWaves, matern32_of_squares
+from gsparc.processes.kernel import IsotropicWaves
 
 SMALL = 1e-12  # z whose sinh(z) / z is 1
 FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
 
 
 GOLDEN = (1 + math.sqrt(5)) / 2
-
-
-def matern_envelope(distance: Tensor, length: Tensor | float) -> Tensor:
-    """Return Matern-3/2 of distances [m]."""
-    return matern32_of_squares((distance / length).square())
 
 
 def squared_exponential(distance: Tensor, length: Tensor | float) -> Tensor:

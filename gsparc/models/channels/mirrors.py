@@ -14,6 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gsparc.models.apart import keep_apart
 from gsparc.models.channels.evidence import BasisGroup
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import Probe, likelihood_gains
@@ -73,16 +74,12 @@ class _Searcher:
 
     def separate_planes(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
         """Return the best planes whose images of the ends are apart."""
-        chosen: list[Tensor] = []
-        for number in scores.argsort(descending=True).tolist():
-            tried = Images.from_planes(self.frame, torch.stack([*chosen, grid[number]]))
-            placed = tried.mirror_ends(self.ends)
-            away = (placed[:, :-1] - placed[:, -1:]).norm(dim=-1).amax(0)
-            if not bool((away < APART * self.wavelength).any()):
-                chosen.append(grid[number])
-            if len(chosen) == STARTS:
-                break
-        return chosen
+        placed, near = Images.from_planes(self.frame, grid).mirror_ends(self.ends), APART * self.wavelength
+
+        def alike(one: int, other: int) -> bool:
+            return bool((placed[:, one] - placed[:, other]).norm(dim=-1).max() < near)
+
+        return [*grid[keep_apart(scores.argsort(descending=True).tolist(), alike, STARTS)]]
 
     def refine_plane(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
         """Return a plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""

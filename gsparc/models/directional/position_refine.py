@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsparc.models.apart import keep_apart
 from gsparc.models.directional.triangulation import SAME_SIGMAS
 from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
@@ -220,12 +221,9 @@ class ConditionalLikelihood:
 
     def select_separated(self, points: Tensor, distance: float) -> Tensor:
         """Return the best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
-        log_posterior = self.log_posterior(points)
-        best: list[Tensor] = []
-        while len(best) < REFINED and float(log_posterior.max()) > -torch.inf:
-            best.append(points[int(log_posterior.argmax())])
-            log_posterior[(points - best[-1]).norm(dim=1) < distance] = -torch.inf
-        return torch.stack(best)
+        order = self.log_posterior(points).argsort(descending=True).tolist()
+        near = torch.cdist(points, points) < distance
+        return points[keep_apart(order, lambda i, j: bool(near[i, j]), REFINED)]
 
     def refine(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return positions (m, 3) after Gauss-Newton steps at the best gain, and covariances (m, 3, 3)."""

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from gsparc.models.apart import keep_apart
 from gsparc.models.image_sources.gp_likelihood import Posterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, spherical_waves
@@ -115,10 +116,5 @@ def select_separated(
     """
     if known is not None:
         scores = scores * (torch.cdist(position, known).amin(1) > min_distance)
-    chosen: list[int] = []
-    for i in scores.argsort(descending=True).tolist():
-        if scores[i] < threshold or len(chosen) == limit:
-            break
-        if all((position[i] - position[j]).norm() > min_distance for j in chosen):
-            chosen.append(i)
-    return chosen
+    order = (i for i in scores.argsort(descending=True).tolist() if scores[i] >= threshold)
+    return keep_apart(order, lambda i, j: bool((position[i] - position[j]).norm() <= min_distance), limit)

@@ -158,9 +158,7 @@ class SourcesInFrame(ClosedForm):
         return merge_equal_paths(QueryPaths(gain, delay, unit, frame.carrier_hz))
 
     def _fitted_frame(self) -> Frame:
-        if self.site is None or not self.count_components():
-            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
-        return self.frame
+        return self.require_fitted(self.frame if self.site and self.count_components() else None)
 
 
 def merge_equal_paths(paths: QueryPaths) -> QueryPaths:

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
@@ -21,7 +22,7 @@ from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import Candidate
-from gsparc.models.mixture.weights import LEAST_HELD, HeldOutPair, in_error_unit
+from gsparc.models.mixture.weights import LEAST_HELD, in_error_unit
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import end_when
@@ -78,7 +79,7 @@ def fit_candidates(
             leave_out = groups if name in OPEN_ENDED else ()  # these predict the groups themselves
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
-            within = replace(within, leave_out=leave_out, race=race, beside=fields)
+            within = replace(within, leave_out=leave_out, race=race)
             with heeded.set_apart() as read[name], end_when(budget.is_spent):
                 field = parts[name](settings, effects.visibility is not False, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
@@ -156,7 +157,7 @@ def weigh_candidates(
     for name, one, weight in zip(solutions, predicted, weights, strict=True):
         log.info(
             "%d held-out rows: %s has an NMSE of %.3f, weight %.2f", len(rows), name,
-            solution_weights.relative_error(one, target), weight,
+            1 - solution_weights.explained_variance(one, target, False), weight,
         )  # fmt: skip
     return {name: (solutions[name], w) for name, w in zip(solutions, weights, strict=True) if w > 0}
 
@@ -211,26 +212,23 @@ def weigh_process(
         few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
         log.info("%s: a Gaussian process alone", few if field.count_components() else "no Gaussians")
         return (process, 1.0), None
-    rows, explained, weight = [], None, 0.0
+    products, explained = [], None
     val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
     if len(val):
         batch = data.batch(val)
         means = (method.predict(batch).mean for method in (field, process))
         own, plain, target = (in_error_unit(values, data.site) for values in (*means, batch.target))
         explained = solution_weights.explained_variance(own, target, data.site.kind != "csi")
-        if spectra:
-            rows.append(
-                HeldOutPair(*(part.detach().double().flatten(1).numpy() for part in (own, plain, target)))
-            )
-        else:
-            weight = solution_weights.stacking_weights([own, plain], target, np.arange(len(val)))[1]
+        products.append(solution_weights.error_products([own, plain], target))
     if left_out is not None:
-        rows.append(_held_out_pair(left_out, distance))
+        own, plain, target = _held_out_images(left_out, distance)
+        products.append(solution_weights.error_products([own, plain], target))
         if explained is None:
-            own, target = (torch.from_numpy(part) for part in (rows[-1].own, rows[-1].target))
             explained = solution_weights.explained_variance(own, target, True)
-    if spectra:
-        weight = solution_weights.share_of_second(rows)
+    gram = np.concatenate(products)
+    # PSNR is a logarithm: a row of spectra counts alike however large its errors are.
+    gram = solution_weights.relative_products(gram) if spectra else gram
+    weight = float(solution_weights.choose_weights(gram, np.arange(len(gram)))[1])
     log.info(
         "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
         len(val), 0 if left_out is None else len(left_out.centres), weight,
@@ -238,8 +236,9 @@ def weigh_process(
     return ((process, weight) if weight > 0 else None), explained
 
 
-def _held_out_pair(left_out: LeftOut, distance: float | None) -> HeldOutPair:
-    """Training rows as far from what is left as held-out rows are, as field and process predict them."""
+def _held_out_images(left_out: LeftOut, distance: float | None) -> tuple[Tensor, ...]:
+    """Images (n, P) as field and process predict them and as measured, as far from others as queries are."""
     gap = left_out.nearest_gap(distance)
     own, target = left_out.predictions_and_targets(gap, left_out.predicted)
-    return HeldOutPair(own, left_out.predictions_and_targets(gap, left_out.predict_by_process())[0], target)
+    plain, _ = left_out.predictions_and_targets(gap, left_out.predict_by_process())
+    return tuple(map(torch.from_numpy, (own, plain, target)))

@@ -214,8 +214,7 @@ class Mixture(LearnsTogether, ClosedForm):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; what members disagree about is added to their variances."""
-        if not self.members:
-            raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
+        self.require_fitted(self.members or None)
         told = Prediction.joined([self._mix_predictions(part) for part in query.split(QUERY_CHUNK)])
         return self.runs.apply_factors(told, query.run)
 

@@ -13,6 +13,7 @@ from torch.nn.functional import normalize
 
 from gsparc.data.limits import internal
 from gsparc.data.schema import Measurements
+from gsparc.models.apart import keep_apart
 from gsparc.models.terms import array_obstacle
 from gsparc.ops import SphereGrid
 from gsparc.physics.draws import draw_in_box
@@ -161,12 +162,10 @@ def _best_separated(
     ranked = candidates[score.argsort(descending=True)[: len(candidates) // BEST_PART]]
     some = receivers[:: max(1, len(receivers) // COMPARED)][:COMPARED]
     seen = bearings(ranked, some, rotation).transpose(0, 1).reshape(len(ranked), -1)
-    chosen: list[int] = []
-    for i in range(len(ranked)):
-        if all(float((seen[i] - seen[j]).abs().mean()) > settings.apart for j in chosen):
-            chosen.append(i)
-        if len(chosen) == settings.per_round:
-            break
+    chosen = keep_apart(
+        range(len(ranked)), lambda i, j: float((seen[i] - seen[j]).abs().mean()) <= settings.apart,
+        settings.per_round,
+    )  # fmt: skip
     return ranked[chosen]
 
 

@@ -145,15 +145,14 @@ class CalibratedRayTracer(Method):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
-        if self.site is None or self.learned is None:
-            raise ValueError(f"{self.name}: fit or restore it first")
-        paths = self._trace(query.places(self.site).detach().numpy())
-        if self.site.kind == "csi":
+        site, learned = self.fitted_site, self.require_fitted(self.learned)
+        paths = self._trace(query.places(site).detach().numpy())
+        if site.kind == "csi":
             return Prediction(torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64)))
         power = paths.received_power()
         # No path is -inf dB, which the silent level replaces.
         with np.errstate(divide="ignore"):
-            level = np.where(power > 0, 10 * np.log10(power) + self.learned.gain_db, self._silent_db)
+            level = np.where(power > 0, 10 * np.log10(power) + learned.gain_db, self._silent_db)
         return Prediction(torch.from_numpy(10 ** (level / 10))[:, None].float())
 
     def _channels(self, paths: Paths) -> np.ndarray:

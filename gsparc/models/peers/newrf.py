@@ -5,7 +5,7 @@ Field Reconstruction and Channel Prediction", ICML 2024.
 
 Kept: training rays along measured directions of arrival, a network of place and direction that says where on
 the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's phase over the marched
-distance; at a query the directions are *searched* (rays of training receivers are intersected, the nearest
+distance; at a query the directions are *searched* (rays of training receivers are triangulated, the nearest
 receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
 a query has (what at least half of the neighbours see is taken); a density per metre (ours is an opacity per
 sample, since half of the samples lie within 10 cm of where the intersection found something, in place of
@@ -21,22 +21,18 @@ from typing import ClassVar
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind, Measurements
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
+from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron
 from gsparc.ops import Pose
-from gsparc.physics.rays import closest_ranges_and_gap
 
 NEAR = 0.1  # [m] from the receiver, where rays begin
 AROUND = 0.1  # [m], half the interval of the fine samples
-MISS = 0.01  # [m], two rays that pass this close to each other meet
-MERGE = 0.05  # [m], meeting points this close are one virtual transmitter
-LEAST = 5  # meeting points of a virtual transmitter: fewer meet by chance
-NEIGHBOURS = 8  # receivers whose rays are intersected with those of one receiver
+LEAST = 5  # receivers of a virtual transmitter: rays of fewer meet by chance
 
 
 class DirectedRays(Network):
@@ -136,65 +132,14 @@ class NeWRF(TrainedPeer):
             raise ValueError(
                 f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
             )
-        places = data.rx_position[rows]
-        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
-        centres, seen = locate_transmitters(places, rays)
-        if not len(centres):
+        places = data.rx_position[rows].astype(np.float64)
+        towards = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
+        rays = Rays.from_receivers(places, towards)
+        meetings = triangulate(rays, self.seed)
+        votes = meetings.seen_points(rays)
+        # Where none has as many, those of the most.
+        virtual = votes.sum(0) >= min(LEAST, votes.sum(0).max(initial=0))
+        if not virtual.any():
             raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
-        found = {"places": torch.from_numpy(places).float(), "virtual": torch.from_numpy(centres).float()}
-        # How many rays of each receiver point at each virtual transmitter.
-        votes = np.stack([np.bincount(one[one >= 0], minlength=len(centres)) for one in seen])
-        return {**found, "votes": torch.from_numpy(votes).float()}
-
-
-def locate_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return points where rays of several receivers meet, and which of them every receiver sees.
-
-    Args:
-        places: (n, 3) [m].
-        rays: n arrays (paths, 3) of unit vectors in the frame of the places.
-
-    Returns:
-        (V, 3) [m], and n arrays of rows of it, one entry per ray (-1: the ray passes none).
-    """
-    near = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[1]
-    points = []
-    for i, row in enumerate(np.atleast_2d(near)):
-        meetings = [np.full((len(rays[i]), 1), np.nan)]
-        for j in row[row != i]:
-            along, _, miss = closest_ranges_and_gap(places[i], rays[i], places[j], rays[j])
-            meetings.append(np.where(miss < MISS, along, np.nan))
-        known = np.ma.masked_invalid(np.concatenate(meetings, 1))
-        distance = np.ma.median(known, axis=1).filled(np.nan)
-        points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
-    flat = np.concatenate([places[:0], *points])
-    centres = _cluster_centres(flat[np.isfinite(flat[:, 0])])
-    return centres, [_nearest_centres(place, own, centres) for place, own in zip(places, rays, strict=True)]
-
-
-def _nearest_centres(place: np.ndarray, rays: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Row (paths,) of the centre that each ray comes nearest to, within the width of a cluster; -1: none."""
-    if not len(centres):
-        return np.full(len(rays), -1)
-    offset = centres - place
-    along = (rays @ offset.T).clip(min=0)
-    miss = np.linalg.norm(offset - along[..., None] * rays[:, None], axis=-1)
-    return np.where(miss.min(1) < 2 * MERGE, miss.argmin(1), -1)
-
-
-def _cluster_centres(points: np.ndarray) -> np.ndarray:
-    """Centres (V, 3) of greedy clusters of radius MERGE, the densest first, of at least LEAST points.
-
-    Where none has as many, of the largest.
-    """
-    if not len(points):
-        return points
-    free = np.full(len(points), True)
-    around = cKDTree(points).query_ball_point(points, MERGE)
-    clusters = []
-    for seed in sorted(range(len(points)), key=lambda k: -len(around[k])):
-        if free[seed]:
-            clusters.append([k for k in around[seed] if free[k]])
-            free[clusters[-1]] = False
-    least = min(LEAST, max(map(len, clusters)))
-    return np.stack([np.median(points[rows], axis=0) for rows in clusters if len(rows) >= least])
+        found = {"places": places, "virtual": meetings.points[virtual], "votes": votes[:, virtual]}
+        return {name: torch.from_numpy(part).float() for name, part in found.items()}

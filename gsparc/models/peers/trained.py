@@ -203,9 +203,7 @@ class TrainedPeer(Method):
 
     def fitted(self) -> Network:
         """Return the network; `ValueError` before `fit` or `restore`."""
-        if self.network is None:
-            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
-        return self.network
+        return self.require_fitted(self.network)
 
     def count_components(self) -> int:
         """Return the number of Gaussians or virtual transmitters; 0 without, and before `fit`."""

@@ -9,7 +9,7 @@ process.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,22 +45,6 @@ from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
-
-
-class DecibelMoments(NamedTuple):
-    """What is said of b places.
-
-    Attributes:
-        mean: (b,) [dB].
-        variance: (b,) [dB^2].
-        unknown: (b,), share of the prior variance.
-        explained: (b,) [dB], the part of the mean that coherent waves explain, or all of it.
-    """
-
-    mean: Tensor
-    variance: Tensor
-    unknown: Tensor
-    explained: Tensor
 
 
 class PowerField(ClosedForm):
@@ -188,7 +172,7 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        process, places = self._require_process(), query.places(self.site)
+        process, places = self.require_fitted(self.powers), query.places(self.site)
         parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
         joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
         mean, spread, share, explained = joined
@@ -204,7 +188,7 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: before `condition`.
         """
-        process = self._require_process()
+        process = self.require_fitted(self.powers)
         decibels, spread = process.left_out(self.at)
         if self.fringes is not None:
             posterior = process.posterior
@@ -236,21 +220,16 @@ class PowerField(ClosedForm):
         self.priors, self.powers, self.fringes = parts
         self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
 
-    def _decibel_moments(self, process: PowerProcess, places: Tensor) -> DecibelMoments:
+    def _decibel_moments(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
+        """Mean [dB], variance [dB^2], unknown share, and what coherent waves explain [dB], (b,) each."""
         mean, spread, share = process.answer(places)
         if self.fringes is None:
-            return DecibelMoments(mean, spread, share, mean)
+            return mean, spread, share, mean
         mean, factor = self.fringes.blend_solutions(mean, places, self._nearest_distance(places))
-        explained = self.fringes.solution_powers(places).mean(1)
-        return DecibelMoments(mean, spread * factor, share, explained)
+        return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)
 
     def _nearest_distance(self, places: Tensor) -> Tensor:
         """From the nearest known row (B,) [m]."""
         if self._tree is None:
-            self._tree = cKDTree(self._require_process().places)
+            self._tree = cKDTree(self.require_fitted(self.powers).places)
         return nearest_distance(self._tree, places)
-
-    def _require_process(self) -> PowerProcess:
-        if self.powers is None:
-            raise ValueError("a field of powers: condition it first")
-        return self.powers

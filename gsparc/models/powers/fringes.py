@@ -17,7 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.models.powers.groups import SPREAD, ErrorGain, compare_errors, number_squares, split_groups
+from gsparc.models.powers.groups import SPREAD, number_squares, split_groups
 from gsparc.models.powers.waves import FLOOR, PlaneWaveBasis, field_db, fit_wave_weights, make_basis
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
@@ -170,7 +170,7 @@ def fit_fringes(
     )
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
-    gain: ErrorGain | None = None
+    gain = 0.0  # mean of the squared errors at places left out, of the process less those of both [dB^2]
     while len(weights) < budget.effort.fringes and not budget.is_spent():
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
@@ -180,9 +180,9 @@ def fit_fringes(
         powers = level + field_db(columns @ np.stack(weights, 1))
         blend, gain = _fit_blend(rows, group, fold, powers, blind, error, distance)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
-        if len(weights) >= TRIED and not gain.exceeds(0.0):
+        if len(weights) >= TRIED and gain <= 0:
             break
-    if fringes is None or gain is None or not gain.exceeds(0.0):
+    if fringes is None or gain <= 0:
         return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{tail}"
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
     note = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
@@ -234,7 +234,7 @@ def _errors_and_distances(
 def _fit_blend(
     rows: PowerRows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
     error: np.ndarray, distance: np.ndarray,
-) -> tuple[Blend, ErrorGain]:  # fmt: skip
+) -> tuple[Blend, float]:  # fmt: skip
     """How to share predictions with a process of errors (n,), and what that gains at places left out."""
     probes = fold < 0
     # From the process's prediction, measured plus error, to that of the solutions.
@@ -250,7 +250,7 @@ def _fit_blend(
         left.append(both / max(float((error[chosen] ** 2).mean()), TINY))
     apart = ~probes
     squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
-    gain = compare_errors(squares[apart], error[apart] ** 2, group[apart])
+    gain = float((error**2 - squares)[apart].mean())
     middle = (float(np.median(distance[probes])), float(np.median(distance[apart])))
     return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
 

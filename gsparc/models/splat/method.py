@@ -141,7 +141,6 @@ class LearnedField(Method):
         self._paying: int | None = None  # position in the schedule after which steps did not pay
         self.steps = self.steps_taken = 0  # of gradient: kept in the last stage, and taken in the first
         self.init_s: float | None = None  # of all initialisers; None of a model read back
-        self._billed = Spent()  # for reusable work, by the stages so far
         self._earlier_s = 0.0  # of training, by the stages so far [s]
         self.frozen: FrozenView | FrozenArray | None = None
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
@@ -202,7 +201,7 @@ class LearnedField(Method):
         self.steps_taken, self._earlier_s = int(extra.get("taken", 0)), float(extra.get("earlier_s", 0.0))
         self.spent, self._apart = {}, _validation_distance(data, fold)
         self._left_out = from_plain(extra.get("left_out"))  # an interrupted run's start is not repeated
-        self._billed, self._limited_by = Spent(), extra.get("limited_by")
+        self._limited_by = extra.get("limited_by")
 
     def _plan_stages(
         self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, resumed: Stored | None
@@ -271,9 +270,6 @@ class LearnedField(Method):
             self.model = self._new_model(data.site)
             solved = None if start.solve is None else start.solve(self.model)
             self._left_out = solved or start.left_out
-            # What an earlier run has paid for is billed; what an earlier stage has, is not again.
-            budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
-            self._billed = Spent(*start.billed_s)
         else:
             self.restore(data.site, checkpoint.read(context.resume).state)
         if stage.name == "refit":
@@ -386,9 +382,7 @@ class LearnedField(Method):
         Raises:
             ValueError: before `fit` or `restore`.
         """
-        if self.model is None:
-            raise ValueError(f"{self.name} has not been trained: call fit() or load a checkpoint")
-        return self.model
+        return self.require_fitted(self.model)
 
     @property
     def threads_pay(self) -> bool:  # type: ignore[override]

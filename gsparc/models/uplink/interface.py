@@ -48,8 +48,7 @@ class UplinkMethod(Method):
         Raises:
             ValueError: there is none, or nothing was fitted.
         """
-        if self.site is None:
-            raise ValueError(f"{self.name}: fit or restore it first")
+        self.require_fitted(self.site)
         if query.uplink is None:
             raise ValueError(
                 f"{self.name}: reads a fresh uplink, and positions alone have none: uplink= is needed, or "

@@ -83,10 +83,9 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
     asked, inner = [], vector_cache.recover_vectors
     monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
     monkeypatch.setattr(vector_cache, "recover_vectors", lambda *a: asked.append(len(a[1])) or inner(*a))
-    first, seconds = vector_cache.recover_cached(data, np.arange(10))
-    again, later = vector_cache.recover_cached(data, np.arange(5, 25))
-    assert asked == [10, 8, 7] and seconds.wall > 0 and later.wall > seconds.wall / 2
-    assert seconds.processor > 0 and seconds.processor / 2 < later.processor
+    first = vector_cache.recover_cached(data, np.arange(10))
+    again = vector_cache.recover_cached(data, np.arange(5, 25))
+    assert asked == [10, 8, 7]
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
     assert "array vectors of 5 spectra were computed before" in caplog.messages
     other = replace(data, site=replace(data.site, sha256="another"))

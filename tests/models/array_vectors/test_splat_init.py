@@ -49,7 +49,7 @@ def process(trained):
         steering_matrix(site.array, site.grid, site.wavelength).numpy(),
         index_mirror_elements(site.array),
     )
-    found, _ = recover_cached(data, fold.train)  # the same solutions
+    found = recover_cached(data, fold.train)  # the same solutions
     kernel = choose_kernel(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = align_by_likelihood(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])

@@ -98,7 +98,7 @@ def test_isotropic_term_alone_is_the_plain_process():
     level = field.weights[0].scale * (1 + plain.kernel.noise) / plain.kernel.amplitude
     torch.testing.assert_close(after.variance, before.variance * level, rtol=2e-3, atol=1e-6)
     torch.testing.assert_close(1 - after.unknown, before.confidence, rtol=2e-3, atol=1e-4)
-    left, _ = plain._posterior().left_out_residuals()
+    left, _ = plain.posterior.left_out_residuals()
     own = torch.from_numpy(data.target[field.rows]) - field.left_out().mean
     torch.testing.assert_close(own.flatten(), left.flatten().to(own.dtype), rtol=1e-3, atol=1e-4)
 

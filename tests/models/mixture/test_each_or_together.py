@@ -1,7 +1,6 @@
 """Stations learned together or each, where nobody says."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,39 +23,21 @@ def of_one_law():
     return data, fold_of(data)
 
 
-def test_powers_of_one_law_are_learned_together():
-    how, why = each_or_together.choose_stations(*of_one_law(), FitContext(budget_s=6))
-    assert how == "together" and "dB together" in why and "folds)" in why
-
-
-@pytest.mark.parametrize(("wrong_db", "best"), [({"joint_powers": 2, "powers": 1}, "each"),
-                                                ({"joint_powers": 1, "powers": 2}, "together")])  # fmt: skip
-def test_powers_are_learned_as_rows_left_out_want_it(monkeypatch, wrong_db, best):
-    def wrong(name):
-        class Wrong:
-            fit = predict = lambda self, batch, *rest: SimpleNamespace(
-                mean=getattr(batch, "target", 0) * 10 ** (wrong_db[name] / 10)
-            )
-
-        return lambda **settings: Wrong()
-
-    monkeypatch.setattr(each_or_together, "JointPowerField", wrong("joint_powers"))
-    monkeypatch.setattr(each_or_together, "PowerField", wrong("powers"))
-    how, why = each_or_together.choose_stations(*of_one_law(), FitContext(budget_s=60))
-    said = f"{wrong_db['joint_powers']}.00 dB together, {wrong_db['powers']}.00 dB each"
-    assert how == best and said in why and "3 folds" in why
+def test_powers_of_few_rows_are_learned_together_without_a_trial():
+    how, why = Gsparc().choose_stations(*of_one_law(), FitContext())
+    assert how == "together" and "law" in why
 
 
 def test_rows_beyond_one_factor_are_learned_by_station(monkeypatch):
     monkeypatch.setattr(each_or_together, "ONE_FACTOR", 50)
-    how, why = each_or_together.choose_stations(*of_one_law(), FitContext())
+    how, why = Gsparc().choose_stations(*of_one_law(), FitContext())
     assert how == "each" and why.endswith("rows are more than one factor holds (50)")
 
 
 def test_stations_that_nobody_heard_are_answered_by_what_all_share():
     data, split = of_one_law()[0], SplitSettings("stations", leave_out=1)
     fold = fold_of(data, name="stations", leave_out=1)
-    assert each_or_together.choose_stations(data, fold, FitContext(split=split))[0] == "together"
+    assert Gsparc().choose_stations(data, fold, FitContext(split=split))[0] == "together"
 
 
 def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkeypatch, caplog):

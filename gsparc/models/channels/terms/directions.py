@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from gsparc.models.channels.columns import Slot, SlotPlaces
-from gsparc.models.channels.kernels import directional_correlation, matern_envelope
+from gsparc.models.channels.kernels import directional_correlation
 from gsparc.models.channels.terms.compressed import Basis
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
-from gsparc.processes.kernel import distances
+from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.left_out import ENTRIES
 
 HALF = 0.25  # length of the mean of directions from which they are of a half sphere
@@ -80,7 +80,7 @@ class Directions(ChannelTerm):
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
         for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
             each = torch.tensordot(powers, self.correlations(self.angles, wavenumber, part, other), 1)
-            parts.append(each * matern_envelope(distances(part, other), self.frame.envelope))
+            parts.append(each * matern32(distances(part, other), self.frame.envelope))
         whole = torch.cat(parts, 1)
         return whole if len(whole) == len(a) else repeat(whole[0], len(a))
 
@@ -93,7 +93,7 @@ class Directions(ChannelTerm):
         places, wavenumber = at.places, at.slot.wavenumber
 
         def correlation_matrices() -> list[Tensor]:
-            bound = matern_envelope(distances(places, places), self.frame.envelope)
+            bound = matern32(distances(places, places), self.frame.envelope)
             ones = self.angles.split(1)
             return [self.correlations(one, wavenumber, places, places)[0] * bound for one in ones]
 

@@ -14,6 +14,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from gsparc.models.apart import keep_apart
 from gsparc.models.image_sources.clutter.blocking import plane_tangents, share_inside_patches
 from gsparc.models.image_sources.clutter.boxes import maximise_by_evolution
 from gsparc.models.image_sources.clutter.residual import UnexplainedRows
@@ -124,15 +125,8 @@ def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMi
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * limit, len(total))).indices.tolist():
             mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
-    return _drop_overlapping(mirrors, 0.5 * wavelength)[:limit]
-
-
-def _drop_overlapping(mirrors: list[SmallMirror], max_gap: float) -> list[SmallMirror]:
-    apart: list[SmallMirror] = []
-    for mirror in sorted(mirrors, key=lambda m: -m.score):
-        if not any(mirror.overlaps(other, max_gap) for other in apart):
-            apart.append(mirror)
-    return apart
+    best, gap = sorted(mirrors, key=lambda m: -m.score), 0.5 * wavelength
+    return [best[i] for i in keep_apart(range(len(best)), lambda i, j: best[i].overlaps(best[j], gap), limit)]
 
 
 def _best_rectangles(

@@ -111,10 +111,7 @@ def _select_variants(values: Tensor, variants: Tensor) -> Tensor:
     """(K, M, n, ...) at variant `variants` (K, n)."""
     if values.shape[1] == 1:
         return values[:, 0]
-    index = variants[:, None]
-    while index.dim() < values.dim():
-        index = index[..., None]
-    return values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]
+    return values[torch.arange(len(values))[:, None], variants, torch.arange(values.shape[2])]
 
 
 def _equivalent_sequences(

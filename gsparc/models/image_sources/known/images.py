@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.walls import SceneWalls, box_faces, polygon_area, polygon_normal
+from gsparc.models.apart import keep_apart
 from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, hesse_form, images
@@ -230,11 +231,7 @@ def _drop_doubles(sequences: list[Reflections], transmitter: Tensor, planes: Ten
     distinct: list[int] = []
     numbers = sorted(range(len(sequences)), key=lambda i: (len(sequences[i]), sorted(sequences[i])))
     for _, group in groupby(numbers, key=lambda i: sorted(sequences[i])):
-        mine: list[int] = []
-        for i in group:
-            if all(float((places[i] - places[j]).norm()) > SAME_M for j in mine):
-                mine.append(i)
-        distinct += mine
+        distinct += keep_apart(group, lambda i, j: float((places[i] - places[j]).norm()) <= SAME_M)
     return [sequences[i] for i in sorted(distinct)]
 
 

@@ -111,18 +111,10 @@ class JointPowerField(ClosedForm):
         self.heard = self.unheard = SharedTerms.from_rows(used, self.own.never.known_trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
-        terms, self.inflation, gain = learn_shared_terms(used, self.own, self.seed, budget)
-        if gain is None:
-            remarks.append("no shared terms: too few stations to leave some out")
-            return (*notes, *remarks)
-        before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
-        remarks.append(
-            f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, "
-            f"{after:.3g} dB with them (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
-        )
+        terms, self.inflation, remark = learn_shared_terms(used, self.own, self.seed, budget)
         if terms.place_db:
             self.unheard = terms.set_inducing(used, PLACES, self.seed)
-        return (*notes, *remarks)
+        return (*notes, *remarks, remark)
 
     @property
     def network(self) -> Sectors | None:
@@ -271,9 +263,7 @@ class JointPowerField(ClosedForm):
         return result
 
     def _require_posteriors(self) -> tuple[SharedTermsPosterior, SharedTermsPosterior]:
-        if self.posterior is None or self.elsewhere is None:
-            raise ValueError("a field of powers: condition it first")
-        return self.posterior, self.elsewhere
+        return self.require_fitted(self.posterior), self.require_fitted(self.elsewhere)
 
     def _places_and_stations(self, query: Query) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.groups import ErrorGain, compare_errors
+from gsparc.models.mixture.weights import mean_and_error
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import Kernel, distances
@@ -155,7 +155,7 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
 
 def learn_shared_terms(
     rows: StationRows, priors: StationPriors, seed: int, budget: TimeBudget | None = None
-) -> tuple[SharedTerms, float, ErrorGain | None]:
+) -> tuple[SharedTerms, float, str]:
     """Return shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
@@ -166,14 +166,14 @@ def learn_shared_terms(
 
     Returns:
         The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
-        g gains at these, each after one constant, None if not tried.
+        must be said of what g gains at these, each after one constant.
     """
     heard = rows.heard_rows
     few = heard.thin_rows(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
     short = min(priors.never.kernel.lengths)
     bare = SharedTerms.from_rows(few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:
-        return bare, 1.0, None
+        return bare, 1.0, "no shared terms: too few stations to leave some out"
     processes = priors.condition(few, bare, seed).processes
     best = plain = bare, *_left_out_errors(processes, bare)
     for length in LENGTHS:
@@ -185,9 +185,14 @@ def learn_shared_terms(
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
     (_, errors, *_), (_, others, _, station) = best, plain
-    gain = compare_errors(errors**2, others**2, station)
-    terms, _, ratio, _ = best if gain.exceeds(ERRORS) else plain
-    return terms, min(max(ratio, 1 / WIDEST), WIDEST), gain
+    gain, unsure = mean_and_error(others**2 - errors**2, station)
+    terms, _, ratio, _ = best if gain > ERRORS * unsure else plain
+    before, after = (math.sqrt(float((one**2).mean())) for one in (others, errors))
+    remark = (
+        f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, "
+        f"{after:.3g} dB with them (gain {gain:.2g} +- {unsure:.2g} dB^2)"
+    )
+    return terms, min(max(ratio, 1 / WIDEST), WIDEST), remark
 
 
 def _left_out_errors(
