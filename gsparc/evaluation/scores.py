@@ -169,10 +169,10 @@ def score_methods(
         if limited:
             # Rows of `val` are not among those learned from where they are the ones scored.
             known = taught.train if eval_on == "val" else np.concatenate([taught.train, taught.val])
-            silent, variance = own.censored_side(known) > 0, scored["variance"] * data.site.target_scale**2
+            variance = scored["variance"] * data.site.target_scale**2
             with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
                 level = power_in_decibels(scored["prediction"], variance)
-            given = levels_given_heard(own.subset(known[silent]), data.subset(rows), *level)
+            given = levels_given_heard(method, own.subset(np.sort(known)), data.subset(rows), *level)
             # Who learned from heard rows alone predicts such levels.
             scored |= given if method.uses_censored else {"heard_share": given["heard_share"]}
         samples.append(scored)

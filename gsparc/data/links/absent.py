@@ -77,7 +77,12 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         floor = np.nan_to_num(stated, nan=levels[heard].min())
         may = np.isnan(lists.level)
         how = "one that a full list leaves out is below its weakest"
-        how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"
+        how += f", in lists shorter than {lists.length}: "
+        if lists.short_are_lost(floor):
+            may &= lists.full[:, None]
+            how += "unknown, strong ones are lost there"
+        else:
+            how += f"below {floor.min():.4g} dB"
     if absent != "auto":
         does = "unlisted ones are predicted too high, and figures of listed rows do not show it"
         if absent == "silent":

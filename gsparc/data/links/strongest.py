@@ -10,6 +10,7 @@ were lost, in outages or at random, are missing beside strong ones, too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -101,27 +102,38 @@ class StrongestLists:
         above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
 
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """(M, T) levels at the nearest other place, NaN where there are none."""
+        known = np.flatnonzero(np.isfinite(self.place).all(1))
+        places, first, which = np.unique(self.place[known], axis=0, return_index=True, return_inverse=True)
+        result = np.full(self.level.shape, np.nan)
+        if len(places) > 1:
+            near = cKDTree(places).query(places, k=2)[1][:, 1]
+            result[known] = self.level[known[first[near[which.reshape(-1)]]]]
+        return result
+
+    def strong_beside(self, floor: np.ndarray) -> np.ndarray:
+        """Return which of `beside`, (M, T), are well above floors (T,) [dB]."""
+        apart = np.abs(self.level - self.beside)
+        spread = 1.4826 * float(np.nanmedian(apart if np.isfinite(apart).any() else 0))
+        return self.beside > floor + max(STRONG_DB, SPREADS * spread)
+
+    def short_are_lost(self, floor: np.ndarray) -> bool:
+        """Tell whether lists that are not full lack stations that are strong beside them, as in outages."""
+        missing = np.isnan(self.level) & ~self.full[:, None] & np.isfinite(self.beside)
+        return bool((missing & self.strong_beside(floor)).sum() > BESIDE_STRONG * missing.sum())
+
     def below_floor(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return floors (T,) [dB] and which links (M, T) lie below; None where missing ones look lost.
 
         A link beside a strong one, and a station with several of these, are taken as lost in any case.
         """
-        known = np.flatnonzero(np.isfinite(self.place).all(1))
-        places, first, which = np.unique(self.place[known], axis=0, return_index=True, return_inverse=True)
-        if len(places) < 2:
-            return None
-        near = cKDTree(places).query(places, k=2)[1][:, 1]
-        beside = np.full(self.level.shape, np.nan)
-        beside[known] = self.level[known[first[near[which.reshape(-1)]]]]
-        missing, pairs = np.isnan(self.level), np.isfinite(self.level) & np.isfinite(beside)
-        if not pairs.any():
-            return None
-        floor = np.full(self.level.shape[1], np.nan)
+        missing, floor = np.isnan(self.level), np.full(self.level.shape[1], np.nan)
         heard = ~missing.all(0)
         floor[heard] = np.nanpercentile(self.level[:, heard], FLOOR, axis=0)
-        spread = 1.4826 * float(np.median(np.abs(self.level - beside)[pairs]))
-        strong = beside > floor + max(STRONG_DB, SPREADS * spread)
-        edges, lost = missing & np.isfinite(beside), missing & strong
+        strong = self.strong_beside(floor)
+        edges, lost = missing & np.isfinite(self.beside), missing & strong
         if min(edges.sum(), strong.sum()) < LEAST_LINKS:
             return None
         if lost.sum() > min(LOST * strong.sum(), BESIDE_STRONG * edges.sum()):
