@@ -6,13 +6,10 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.by_station import levels_of_nearest_moment
 from gsparc.evaluation.experiment.folds import fit_folds
-from gsparc.evaluation.scores import Scores, rows_to_score, score_methods
+from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.models.method import Method
 from gsparc.models.per_station import stations_of_fold
 from gsparc.models.registry import method_class
@@ -83,9 +80,4 @@ def fit_baseline(
     contexts = [FitContext(Path())] * len(before.folds)
     fits = fit_folds(method_class(name)(), own, before, contexts, learned=known, keep=said)
     scores = score_methods(fits.methods, data, split, eval_on, learned)
-    if name == "nearest" and data.site.kind == "rssi" and data.station is not None:
-        taught = [known(own, fold)[1] for fold in before.folds]
-        there = [own.subset(np.concatenate([fold.train, fold.val])) for fold in taught]
-        asked = [data.subset(rows_to_score(fold, eval_on)) for fold in split.folds]
-        scores.samples["served"] = np.concatenate([*map(levels_of_nearest_moment, there, asked)])
     return FittedBaseline(fits.methods, scores, fits.train_s)

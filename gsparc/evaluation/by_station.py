@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
 
 from gsparc.data.schema import Measurements, show_names
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
@@ -26,19 +25,6 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
     error = pd.Series(scores.samples["error_db"])
     left = error - error.groupby(station[scores.row]).transform("mean")
     return float((left**2).mean() ** 0.5) if left.notna().any() else None
-
-
-def levels_of_nearest_moment(learned: Measurements, asked: Measurements) -> np.ndarray:
-    """Return levels (n,), linear, of stations of rows asked at the nearest place learned from; 0 if unheard.
-
-    The strongest of the nearest moment, as anyone would tell a best server; levels of each station's own
-    nearest moments tell it worse (simulated lists of three .30 to .36 for .48 to .76 of the places).
-    """
-    heard = np.flatnonzero(learned.censored_side(np.arange(len(learned))) <= 0)
-    places, which = np.unique(learned.moving[heard], axis=0, return_inverse=True)
-    table = np.zeros((len(places), max(learned.station.max(), asked.station.max()) + 1))
-    np.maximum.at(table, (which.reshape(-1), learned.station[heard]), learned.target[heard, 0])
-    return table[cKDTree(places).query(asked.moving)[1], asked.station]
 
 
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
