@@ -77,7 +77,7 @@ results: setup ## tables of docs/results.md in outputs/results/report, measured 
 test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(PYTEST) -m "slow and not rare"
 
-rare: setup sionna browser $(VENV)/.docs ## what takes minutes each: tutorials, furnished rooms, all commands of all pages
+rare: setup sionna browser $(VENV)/.docs ## what takes minutes each: furnished rooms, all commands of all pages
 	$(PYTEST) -m rare
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md

@@ -60,7 +60,6 @@ def _build(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.rare
 @pytest.mark.timeout(1800)
 def test_tutorials_run():
     pytest.importorskip("nbclient", reason="tutorials need the extra docs: make docs")

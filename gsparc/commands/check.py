@@ -44,7 +44,7 @@ def check(
     from gsparc.data.load import split_for
 
     try:
-        reading = read_any(path, columns, stations_file, **settings)
+        reading = read_any(path, columns=columns, stations_file=stations_file, **settings)
     except DataError as error:
         count = len(error.problems)
         for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from gsparc.commands.train import read_inputs, train
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.cells import Budget, Contender, plan_cells, plugin_contenders
-from gsparc.evaluation.experiment.latency import Latency, time_by_dataset
+from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
 from gsparc.evaluation.experiment.run_cells import CellResult, PreparedCell, prepare_cell, run_cells
@@ -68,7 +68,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
-    timed = time_by_dataset(filled, by_name) if settings["latency"] else {}
+    timed = time_by_dataset(filled, by_name) if settings["latency"] else None
     return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 
@@ -84,7 +84,7 @@ def train_cell(one: PreparedCell, interrupted: str | None) -> None:
 
 
 def write_comparison(
-    filled: Sequence[CellResult], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path,
+    filled: Sequence[CellResult], timed: pd.DataFrame | None, ours: str, run_dir: Path,
     figures: Sequence[str] = (),
 ) -> pd.DataFrame:  # fmt: skip
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.

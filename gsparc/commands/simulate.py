@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import run_directory
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.data.instantiate import from_settings
 from gsparc.evaluation import simulated, summary
 from gsparc.evaluation.console import open_console
 from gsparc.simulate.auto import AutoSettings
@@ -38,9 +39,9 @@ def campaign(config: DictConfig) -> Campaign:
     settings = to_dict(config)
     return Campaign(
         scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
-        SpectrumSettings(**settings["spectrum"]), ArraySettings(**settings["csi"]),
-        shard=int(settings["shard"]), check=int(settings["check"]),
-        measurement=str(settings["measurement"]),
+        from_settings(SpectrumSettings, settings["spectrum"], "spectrum"),
+        from_settings(ArraySettings, settings["csi"], "csi"),
+        **{name: settings[name] for name in ("shard", "check", "measurement")},
     )  # fmt: skip
 
 
@@ -48,7 +49,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
     # Effects that are to be chosen among stand under `full`; without it they are given.
     if "full" not in config:
         return effects_from_config(config)
-    return AutoSettings(**{**config, "full": effects_from_config(config["full"])})
+    return from_settings(AutoSettings, {**config, "full": effects_from_config(config["full"])}, "effects")
 
 
 def task(config: DictConfig) -> Outcome | None:
@@ -70,8 +71,8 @@ def task(config: DictConfig) -> Outcome | None:
     # The exact shoebox has walls, but no triangles.
     if len(triangles):
         write_walls(triangles, run_dir / "walls.yaml")
-    if outcome.choice is not None:
-        console.print(choice_table(outcome.choice))
+    if outcome.decision is not None:
+        console.print(choice_table(outcome.decision.choice))
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     facts = {
         **summary_facts(outcome),

@@ -20,17 +20,12 @@ from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
 from gsparc.evaluation.experiment.done import State, measurements_hash, run_once
-from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
-from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models.reduced import list_settings, with_reduction
 from gsparc.prediction import operating_point
-from gsparc.prediction.pareto import Point, pareto_front
-from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import BLOCKS, COPY, peak_memory, reference_copy
+from gsparc.prediction.timing import BLOCKS, peak_memory
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
@@ -49,57 +44,41 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     """Measure, draw and write."""
-    fold, data, method = run.split.folds[0], run.data, run.methods[0]
-    rows = rows_to_score(fold, config.eval_on)
+    data, method = run.data, run.methods[0]
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
-    learned = np.sort(np.concatenate([fold.train, fold.val]))
+    learned = np.sort(np.concatenate([run.split.folds[0].train, run.split.folds[0].val]))
     inputs = method.reduction_inputs(data, learned)
     settings = list(list_settings(method, to_dict(config.grid)))
     single = config.threads is None and not method.threads_pay
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, with_reduction(method, some, inputs)) for some in settings]
-    others = tradeoff.fit_others(run, config.baselines, config.eval_on)
-    # Predictors are asked in world coordinates, as a user would.
-    places = data.moving[rows]
-    clocks = {name: Predictor(one.methods[0], data.site).cycle_places(places) for name, one in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
-    how = {"eval_on": config.eval_on, "clock": clock, "others": {COPY: reference_copy(), **clocks}}
-    points, other_ms = tradeoff.measure_candidates(candidates, threads, data, fold, **how)
-    figure = deciding_figure(points[0].figures, data.site.scored)
-    pareto = pareto_front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
-    # Stored points are chosen by closeness to the full model, which uses no measured value of tested rows.
-    chosen = pareto_front([p.p50 for p in points], [p.closeness_db for p in points])
+    how = data, run.split, config.eval_on, clock
+    points, beside = tradeoff.measure_points(candidates, threads, config.baselines, *how)
+    kept = points[points.kept_with_model == 1]
     if config.store:
-        operating_point.store_points(Path(config.ckpt), [points[i] for i in chosen], figure, inputs)
-    beside = {
-        name: Point(name, {}, 1, pool_figures(one.scores, data, run.split), np.nan, other_ms[name], 0)
-        for name, one in others.items()
-    }
-    copy_ms = float(np.median(other_ms[COPY]))
-    table_of_points = tradeoff.table_of_points(points, pareto, chosen, copy_ms)
-    write_samples(run_dir / "tradeoff.csv", table_of_points.to_dict("list"))
-    best = [points[i] for i in pareto]
+        operating_point.store_points(Path(config.ckpt), kept.to_dict("records"), inputs)
+    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of_csv(points))
     title = f"{data.site.name}, split {run.split.title}, {config.eval_on}: {method.name}"
-    save(tradeoff.draw_front(points, pareto, beside, figure, method.name, title), run_dir / "tradeoff.png")
+    save(tradeoff.draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
     facts = {
-        **tradeoff.facts_of(points, best, figure, beside, copy_ms),
+        **tradeoff.facts_of(points, beside),
         **peak_memory(), **run.facts(),
         "ckpt": str(config.ckpt), "seed": run.stored[0].configuration.get("seed"),
         "time/includes": "one query end to end: world position in, physical units out; warm",
-        "tradeoff/stored": len(chosen) if config.store else 0,
+        "tradeoff/stored": len(kept) if config.store else 0,
     }  # fmt: skip
-    front_rows = table_of_points[table_of_points.front == 1].to_dict("records")
-    sheet = Table.from_rows(title, [*tradeoff.POINT, Column(figure, of=figure)], front_rows)
+    best = points[points.front == 1].to_dict("records")
+    sheet = Table.from_rows(title, [*tradeoff.POINT, Column(best[0]["figure"], of="value")], best)
     with tracking.open_loggers(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.log_table(loggers, "operating points", *sheet.texts())
     finish_run(run_dir, facts, sheet, lines=tradeoff.why_irreducible(method))
     # A front of one model's points alone would hide that another method is as fast and better.
-    for p in best:
-        other = tradeoff.find_better(p, beside, figure)
-        if other is not None:
-            log.warning("%s: %s is as fast and better", p.label, other)
+    for row in best:
+        if other := tradeoff.find_better(row, beside):
+            log.warning("%s: %s is as fast and better", row["label"], other)
 
 
 def _threads(setting: Sequence[int] | None) -> list[int]:

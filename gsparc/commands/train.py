@@ -36,13 +36,7 @@ from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.done import (
-    State,
-    measurements_hash,
-    program_hash,
-    read_finished,
-    recorded,
-)  # fmt: skip
+from gsparc.evaluation.experiment.done import State, measurements_hash, program_hash, read_finished, recorded
 from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metric_formats import main_figure, score_of

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
-from gsparc.data.errors import DataError, suggest_name
+from gsparc.data.errors import DataError
+from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 
@@ -155,9 +156,8 @@ def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurement
         DataError: no such convention, or one that cannot be of these measurements.
     """
     chosen = set(names)
-    for name in chosen - set(CONVENTIONS):
-        hint = suggest_name(name, CONVENTIONS, 0.4)
-        raise DataError(f"conventions: {name!r} is none of {', '.join(CONVENTIONS)}{hint}")
+    for name in chosen:
+        choice(*CONVENTIONS).check("conventions", name)
     # In the table's order, not the user's: axes are exchanged before what runs along them is turned.
     for name in [name for name in CONVENTIONS if name in chosen]:
         one = CONVENTIONS[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Self
 
@@ -47,6 +47,7 @@ def _permutation(seed: int, epoch: int, count: int) -> np.ndarray:
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 
+@dataclass
 class StepLoader:
     """Iterating yields the batches from step `first_step()` to the end of that step's epoch.
 
@@ -60,20 +61,18 @@ class StepLoader:
         rank, devices: which share of every batch is yielded.
     """
 
-    def __init__(
-        self,
-        data: Measurements,
-        pool: np.ndarray,
-        batch_size: int,
-        seed: int,
-        first_step: Callable[[], int] = lambda: 0,
-        rank: int = 0,
-        devices: int = 1,
-    ) -> None:
-        if batch_size < 1 or len(pool) == 0:
-            raise ValueError(f"expected batch_size >= 1 and training rows, got {batch_size} and {len(pool)}")
-        self.data, self.pool, self.batch_size, self.seed = data, pool, batch_size, seed
-        self.first_step, self.rank, self.devices = first_step, rank, devices
+    data: Measurements
+    pool: np.ndarray
+    batch_size: int
+    seed: int
+    first_step: Callable[[], int] = lambda: 0
+    rank: int = 0
+    devices: int = 1
+
+    def __post_init__(self) -> None:
+        size, count = self.batch_size, len(self.pool)
+        if size < 1 or count == 0:
+            raise ValueError(f"expected batch_size >= 1 and training rows, got {size} and {count}")
 
     def __len__(self) -> int:
         return steps_per_epoch(len(self.pool), self.batch_size)

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data import spacing
 from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError, suggest_name
+from gsparc.data.errors import DataError
 from gsparc.data.instantiate import (
     accepted_arguments,
     from_settings,
@@ -27,7 +27,7 @@ from gsparc.data.instantiate import (
     refuse_foreign,
     suggest_or_list,
 )
-from gsparc.data.limits import SettingError
+from gsparc.data.limits import SettingError, choice
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
 from gsparc.data.splits import FileSettings, Split, SplitSettings, make_split, remove_rows, rows_to_leave_out
@@ -143,9 +143,7 @@ def _choices() -> dict[str, DictConfig]:
 
 
 def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
-    if str(name) not in choices:
-        hint = suggest_name(str(name), choices, 0.4)
-        raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")
+    choice(*sorted(choices)).check("dataset", str(name))
     return choices[str(name)]
 
 

@@ -29,12 +29,8 @@ from gsparc.data.units import LINEAR, PowerUnit
 log = logging.getLogger(__name__)
 
 SSIM_WINDOW = 11  # pixels along each side; as in losses and metrics, which data do not import
-SHAPES: dict[str, tuple[tuple[None, ...], ...]] = {
-    "spectrum": ((None, None, None),),
-    "csi": ((None,), (None, None), (None, None, None)),
-    "rssi": ((None,),),
-}
 Arrays = Mapping[str, np.ndarray]
+OF_ROWS = ("station", "place", "censored", "run")  # of `Measurements`, as `expand_links` leaves them
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
@@ -137,11 +133,11 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         check.problems.raise_if_any()
     assert values is not None
     rows = len(values)
-    row_names = links.name_rows(check.name_rows(rows))
-    check.row_names = row_names
+    of_rows = {name: raw.arrays.get(name) for name in OF_ROWS}
+    row_names = check.name_rows(rows, links.stations)
     ends = {end: check.read_positions(f"{end}_position", rows) for end in ("rx", "tx")}
     rotation = check.read_rotation(rows)
-    given_mask = check.read_mask(raw.arrays[measured].shape, links.censored)
+    given_mask = check.read_mask(raw.arrays[measured].shape, of_rows["censored"])
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
     named = str(raw.attributes.get("conventions", "")).split()
@@ -182,8 +178,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
-        station=links.station, place=links.place, censored=links.censored, run=links.run,
-        position_std=position_std,
+        position_std=position_std, **of_rows,
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":
@@ -191,7 +186,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     data = data if kind == "rssi" else convert_conventions(data, named)
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
-    target, scale = _scaled(measured, data.target, data.mask, links.censored)
+    target, scale = _scaled(measured, data.target, data.mask, data.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
@@ -239,7 +234,7 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
 def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
     kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    array = check.read_array(name, *SHAPES[kind])
+    array = check.read_array(name, *([(None,)] if kind == "rssi" else FIELDS[name].shapes))
     if array is None:
         return None, kind
     if kind == "csi" and array.size:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems, suggest_name
 from gsparc.data.raw import Raw
-from gsparc.data.schema import FIELDS, KIND_WORDS, KINDS, MEASUREMENTS, POWER, REAL, TrainTest
+from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
 from gsparc.ops import SphereGrid
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
@@ -64,8 +64,10 @@ class Checker:
         Raises:
             DataError: arrays of another type or number of axes than the schema's: nobody else looks at these.
         """
-        sound = True
-        for name in self.raw.arrays:
+        sound, arrays = True, self.raw.arrays
+        # What is ignored must not be taken for an array of the same name that is made of others.
+        self.raw = replace(self.raw, arrays={name: arrays[name] for name in arrays if name in FIELDS})
+        for name in arrays:
             if name in FIELDS:
                 unit = self.raw.units.get(name, FIELDS[name].unit)
                 if unit != FIELDS[name].unit:
@@ -76,7 +78,7 @@ class Checker:
                 sound &= self.read_array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
-            if hint := suggest_name(name, [known for known in FIELDS if known not in self.raw.arrays], 0.6):
+            if hint := suggest_name(name, [known for known in FIELDS if known not in arrays], 0.6):
                 self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")
@@ -97,23 +99,26 @@ class Checker:
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
         return self.problems.add(self.source, f"{wanted}; found {names}")
 
-    def name_rows(self, rows: int) -> list[str]:
-        """Return what messages call each row: `row_name`, or its number."""
-        names = self.raw.arrays.get("row_name")
-        self.row_names = [f"row {i}" for i in range(rows)]
-        if names is not None and self.has_shape("row_name", names, (rows,)):
-            self.row_names = [str(name) for name in names]
-        return self.row_names
+    def name_rows(self, rows: int, stations: Stations | None) -> list[str]:
+        """Return what messages call each row: `row_name`, or its number, with its station."""
+        arrays, named = self.raw.arrays, [f"row {i}" for i in range(rows)]
+        if "row_name" in arrays and self.has_shape("row_name", arrays["row_name"], (rows,)):
+            named = [str(name) for name in arrays["row_name"]]
+        if stations is not None:  # a place alone would name several rows
+            shown, pairs = stations.shown, zip(named, arrays["station"], strict=True)
+            named = [f"{row}, station {shown[t]}" for row, t in pairs]
+        self.row_names = named
+        return named
 
-    def read_array(self, name: str, *shapes: Shape, kinds: str | None = None) -> np.ndarray | None:
-        """Return array `name` if its dtype is of its kinds and it fits one of `shapes` (None: any length)."""
-        array, kinds = self.raw.arrays.get(name), kinds or KINDS.get(name, REAL)
+    def read_array(self, name: str, *shapes: Shape, holds: str = "") -> np.ndarray | None:
+        """Return array `name` if it `holds` what it should and fits one of `shapes` (None: any length)."""
+        array, holds = self.raw.arrays.get(name), holds or FIELDS[name].holds
         if array is None:
             return None
         # Images of uint16 hold no stated largest value; of uint8 it is 255.
-        wide = kinds == POWER and array.dtype.kind == "u" and array.itemsize > 1
-        if array.dtype.kind not in kinds or wide:
-            return self.refuse(name, f"expected {KIND_WORDS[kinds]}, found dtype {array.dtype}")
+        wide = holds == POWER and array.dtype.kind == "u" and array.itemsize > 1
+        if array.dtype.kind not in HOLDS[holds] or wide:
+            return self.refuse(name, f"expected {holds}, found dtype {array.dtype}")
         return array if self.has_shape(name, array, *shapes) else None
 
     def read_real(self, name: str, *shapes: Shape) -> np.ndarray | None:
@@ -130,7 +135,7 @@ class Checker:
         turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
         here = " or ".join(map(str, wanted))
         here = f", here {here}" if any(wanted) and "None" not in here else ""
-        known = FIELDS[name].shape if name in FIELDS else str(shapes[0]).replace("'", "")
+        known = FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
         fault = f"found {array.shape}{'; transposed?' if turned else ''}"
         self.refuse(name, f"expected shape {known}{here}, {fault}")
         return False

@@ -88,29 +88,14 @@ class Links:
     Attributes:
         static_end: which end the stations, or the one static end, are; None where both move.
         stations: in world coordinates; None where there is one static end, or none.
-        station, place: (S,) int64, see `Measurements`; None without stations.
-        censored: (S,) int8, see `Measurements`; None where nothing is.
-        run: (S,) int64; None without runs.
         unknown_transmitter: powers of a transmitter whose place nobody gave.
         georeference: of the world's origin, where places came in degrees.
     """
 
     static_end: End | None
     stations: Stations | None = None
-    station: np.ndarray | None = None
-    place: np.ndarray | None = None
-    censored: np.ndarray | None = None
-    run: np.ndarray | None = None
     unknown_transmitter: bool = False
     georeference: Georeference | None = None
-
-    def name_rows(self, rows: list[str]) -> list[str]:
-        """Return names (S,) of rows, with their stations."""
-        if self.stations is None or self.station is None:
-            # A row of a file of links is a place and a station; the place alone would name several rows.
-            return rows
-        names = self.stations.shown
-        return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -386,6 +371,8 @@ class Field:
         unit: required value of `units` where given.
         required: `yes`, `one of`, or when.
         meaning: in words.
+        holds: what its entries are, one of `HOLDS`.
+        becomes: of an array of a release, its name in the schema.
     """
 
     name: str
@@ -393,35 +380,28 @@ class Field:
     unit: str
     required: str
     meaning: str
+    holds: str
+    becomes: str = ""
 
     @property
-    def shapes(self) -> list[tuple[int | None, ...]]:
-        """Allowed shapes, None for any size; empty where they follow from another array.
+    def shapes(self) -> list[tuple[int | str | None, ...]]:
+        """Allowed shapes, a letter for a size of its own; empty where they follow from another array.
 
         >>> FIELDS["rx_orientation"].shapes
-        [(4,), (None, 4)]
+        [(4,), ('S', 4)]
         """
-        parts = [part.split(",") for part in re.findall(r"\(([^)]*)\)", self.shape)]
-        return [tuple(int(a) if a.strip().isdigit() else None for a in part if a.strip()) for part in parts]
+        parts = [re.findall(r"[^, ][^,]*", part) for part in re.findall(r"\(([^)]*)\)", self.shape)]
+        return [tuple(int(a) if a.isdigit() else a for a in part) for part in parts]
 
 
 FIELDS = {one["name"]: Field(**one) for one in read_shipped_table("gsparc.data", "fields.csv")}
 
-# Kinds of NumPy's dtypes that an array may be of, and how messages call them; arrays are real otherwise.
-REAL, WHOLE, COMPLEX, FLAGS, TEXT, LABELS, POWER = "iuf", "iu", "c", "biuf", "US", "USiu", "uf"
-NAMES, GAINS = "USiufb", "ciuf"
-KIND_WORDS = {
-    **{REAL: "real numbers", WHOLE: "whole numbers", COMPLEX: "complex numbers", FLAGS: "True and False"},
-    **{TEXT: "text", LABELS: "text or whole numbers", POWER: "uint8 or floating point numbers"},
-    **{NAMES: "text or numbers", GAINS: "numbers"},
-}
-KINDS = {
-    **{"spectrum": POWER, "csi": COMPLEX, "mask": FLAGS, "run": LABELS, "station": WHOLE},
-    **dict.fromkeys(("path_offsets", "split_train", "split_test"), WHOLE),
-    **dict.fromkeys(("station_name", "station_label", "row_name"), NAMES),
-    **dict.fromkeys(("path_gain", "source_gain"), GAINS),
-    **dict.fromkeys(("line_of_sight", "source_visible"), FLAGS),
-}
+POWER = "uint8 or floating point numbers"
+# Kinds of NumPy's dtypes that an array may be of, by the words of messages.
+HOLDS = {
+    "real numbers": "iuf", "whole numbers": "iu", "complex numbers": "c", "numbers": "ciuf", POWER: "uf",
+    "True and False": "biuf", "text": "US", "text or whole numbers": "USiu", "text or numbers": "USiufb",
+}  # fmt: skip
 MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
 NORMALISATIONS = ("max", "minmax", "power", "none")
 
@@ -432,5 +412,5 @@ def list_arrays_with_axis(letter: str) -> dict[str, set[int]]:
     >>> list_arrays_with_axis("T")["carrier_hz"]  # a frequency for each station
     {1}
     """
-    shapes = {name: re.findall(rf"\({letter}(,[^)]*)\)", field.shape) for name, field in FIELDS.items()}
-    return {name: {1 + len(re.findall(r"\w+", s)) for s in rest} for name, rest in shapes.items() if rest}
+    axes = {n: {len(s) for s in field.shapes if s[:1] == (letter,)} for n, field in FIELDS.items()}
+    return {name: counts for name, counts in axes.items() if counts}

@@ -6,17 +6,15 @@ Rows are links by then: arrays named as in docs/reference/schema.md, `station` a
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from gsparc.data.blocks import take
 from gsparc.data.errors import DataError, list_first, suggest_name
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import Checked, Limit, number, or_null, setting, whole
+from gsparc.data.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 
@@ -26,8 +24,8 @@ SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample or path, and how many axes they then have.
 ROW_AXES, PATH_AXES = list_arrays_with_axis("S"), list_arrays_with_axis("P")
 # Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
-ALWAYS = ("mask", "place", "file_row",
-          *(name for name in ROW_AXES if not re.search(r"\(\)|\([^S]", FIELDS[name].shape)))  # fmt: skip
+OF_ROWS = {name for name, field in FIELDS.items() if all(shape[:1] == ("S",) for shape in field.shapes)}
+ALWAYS = {"place", "file_row", *OF_ROWS}
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
 
@@ -81,6 +79,13 @@ class Selection(Checked):
 
 
 WHOLE = Selection()
+
+
+def take_selection(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of `Selection` out of all of a dataset, which then lack them."""
+    return {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
+
+
 Part = tuple[Arrays, Stations | None, list[str]]
 
 
@@ -171,10 +176,9 @@ def _of_runs(arrays: Arrays, runs: Sequence[str | int], source: str) -> np.ndarr
     if "run" not in arrays:
         raise DataError(f"dataset.runs: {source} names no runs; expected an array run")
     of_row = arrays["run"].astype(str)
-    known, wanted = np.unique(of_row).tolist(), [str(run) for run in runs]
-    if unknown := sorted({*wanted} - {*known}):
-        hint = suggest_or_list(unknown[0], known)
-        raise DataError(f"dataset.runs={unknown[0]}: no such run in {source}{hint}")
+    wanted, of_file = [str(run) for run in runs], choice(*np.unique(of_row).tolist())
+    for run in wanted:
+        of_file.check("dataset.runs", run)
     return np.isin(of_row, wanted)
 
 

@@ -21,12 +21,14 @@ class Unit:
         kind: `length`, `angle`, `frequency`, `power` or `level`; one kind has one unit in the schema.
         factor: multiplies a value.
         offset: is added after that.
+        times: the part of the factor that a setting gives, as it was written; empty: none.
     """
 
     name: str
     kind: str
     factor: float = 1.0
     offset: float = 0.0
+    times: str = ""
 
     def convert(self, values: np.ndarray) -> np.ndarray:
         """Convert values of this unit to the schema's unit of its kind."""

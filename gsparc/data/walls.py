@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ import numpy as np
 
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import finite_array
+from gsparc.data.instantiate import from_settings, suggest_or_list
+from gsparc.data.limits import Checked, Limit, finite_array, or_null, setting
 
 EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`)"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here
@@ -39,6 +40,35 @@ class SceneWalls:
         return len(self.faces) + len(self.boxes)
 
 
+def _are_boxes(value: Any) -> bool:
+    corners = finite_array(value)
+    return corners.shape[1:] == (2, 3) and bool((corners[:, 0] < corners[:, 1]).all())
+
+
+SIZE = Limit("a list of three lengths above 0 [m]", lambda value: _are_boxes([[[0, 0, 0], value]]))
+BOXES = Limit("a list of [[x, y, z], [x, y, z]], lower corner first [m],", lambda v: not v or _are_boxes(v))
+
+
+@dataclass(frozen=True)
+class RoomSettings(Checked):
+    """A room from the origin, and boxes in it.
+
+    Attributes:
+        size_m: (3,) [m]; None: its walls are unknown.
+        boxes_m: lower and upper corner of each [m].
+        reflection: amplitude coefficient of all walls or of each, for a simulation.
+    """
+
+    size_m: Sequence[float] | None = setting(None, or_null(SIZE))
+    boxes_m: Sequence[Any] | None = setting(None, BOXES)
+    reflection: complex | Sequence[complex] = -0.7
+
+    @property
+    def boxes(self) -> np.ndarray:
+        """(B, 2, 3) [m]."""
+        return finite_array(self.boxes_m or []).reshape(-1, 2, 3)
+
+
 def read_walls(path: str | Path | None) -> SceneWalls:
     """Read walls out of `*.yaml` or `*.yml`; lengths are metres.
 
@@ -64,8 +94,11 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
     for key in content:
         if key not in SIMULATED | {"walls", "room"}:
             problems.add(path, f"{key}: no such key{suggest_or_list(str(key), ['walls', 'room'])}")
-    room = content.get("room")
-    faces, boxes = ([], np.zeros((0, 2, 3))) if room is None else _room(path, room, problems)
+    told = {} if content.get("room") is None else content["room"]
+    if not isinstance(told, dict):
+        told = problems.add(path, "room: expected size_m and boxes_m") or {}
+    room = problems.attempt(lambda: from_settings(RoomSettings, told, f"{path}: room")) or RoomSettings()
+    faces = [] if room.size_m is None else box_faces(np.zeros(3), finite_array(room.size_m))
     walls = content.get("walls") or []
     if not isinstance(walls, list):
         problems.add(path, "walls: expected a list, each with corners_m: [[x, y, z], ...]")
@@ -84,32 +117,7 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
             )
         else:
             faces.append(corners)
-    return SceneWalls(tuple(faces), boxes)
-
-
-def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], np.ndarray]:
-    """Six faces from the origin to `size_m`, and `boxes_m`."""
-    faces: list[np.ndarray] = []
-    boxes = np.zeros((0, 2, 3))
-    if not isinstance(room, dict):
-        return problems.add(path, "room: expected size_m and boxes_m") or (faces, boxes)
-    for key in room:
-        if key not in ("size_m", "boxes_m", "reflection"):
-            problems.add(path, f"room.{key}: no such key{suggest_or_list(str(key), ['size_m', 'boxes_m'])}")
-    if room.get("size_m") is not None:
-        size = finite_array(room["size_m"])
-        if size.shape != (3,) or not (size > 0).all():
-            problems.add(path, f"room.size_m={room['size_m']}: expected three lengths above 0 [m]")
-        else:
-            faces = box_faces(np.zeros(3), size)
-    if room.get("boxes_m"):
-        corners = finite_array(room["boxes_m"])
-        if corners.shape[1:] != (2, 3) or not (corners[:, 0] < corners[:, 1]).all():
-            wanted = "expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
-            problems.add(path, f"room.boxes_m: {wanted}")
-        else:
-            boxes = corners
-    return faces, boxes
+    return SceneWalls(tuple(faces), room.boxes)
 
 
 def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:

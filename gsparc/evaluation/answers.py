@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,16 +44,12 @@ class Answers:
     Attributes:
         place: (N,) int64, row of the places.
         names: (N,) of stations by heads of columns, see `Stations.named`; empty where the model has none.
-        mean: (N, ...) in the predictor's unit.
-        variance: (N,) float64, expected squared error per entry; None where the method has none.
-        confidence: (N,) float32; None where the method has none.
+        said: (N, ...) in the predictor's unit.
     """
 
     place: np.ndarray
     names: dict[str, np.ndarray]
-    mean: np.ndarray
-    variance: np.ndarray | None
-    confidence: np.ndarray | None
+    said: Prediction
 
     def __len__(self) -> int:
         return len(self.place)
@@ -88,13 +82,8 @@ def predict_file(
     for note in _notes(queries, site):
         log.info("%s: %s", places, note)
     world = to_world(queries, site)
-    row, number = rows_and_stations(queries, site, station)
-    named = station is not None or queries.station is not None
     far, margin = far_outside_and_margin(world, site)
-    # `check_fits` is asked after the first block: spectra for a csv are refused before all are predicted.
-    predictions = predict_places(
-        predictor, queries, world, row, number, named, partial(check_fits, path, site.kind)
-    )
+    predictions = predict_places(predictor, queries, world, station, path)
     speck = say_tiny_extent(queries, world, site)
     if speck is not None:
         log.warning("%s: %s", places, speck)
@@ -115,7 +104,8 @@ def predict_file(
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,
     }  # fmt: skip
     # A power of 0 is -inf dB, which would be the lowest of every file and no number of a summary.
-    known = predictions.mean[np.isfinite(predictions.mean)]
+    mean = predictions.said.mean.numpy()
+    known = mean[np.isfinite(mean)]
     if power is not None and len(known):
         ends = {"lowest": float(known.min()), "highest": float(known.max())}
         facts |= {f"predict/{name}_{unit_suffix(power)}": value for name, value in ends.items()}
@@ -133,28 +123,21 @@ def _notes(queries: QueryPlaces, site: Site) -> list[str]:
 
 
 def predict_places(
-    predictor: Predictor,
-    queries: QueryPlaces,
-    world: dict[End, np.ndarray],
-    row: np.ndarray,
-    number: np.ndarray,
-    named: bool,
-    accept: Callable[[tuple[int, ...]], None],
+    predictor: Predictor, queries: QueryPlaces, world: dict[End, np.ndarray], station: str | None, path: Path
 ) -> Answers:
-    """Predict; stations that cannot be are left out, which is logged.
+    """Predict for `path`; stations that cannot be are left out, which is logged.
 
     Args:
         predictor: of the model.
-        queries: for messages.
+        queries, station: see `rows_and_stations`.
         world: (n, 3) [m] by end.
-        row, number: (N,) of each prediction, see `rows_and_stations`.
-        named: whether somebody asked for these stations; then one without a model is refused.
-        accept: raises where predictions of a shape are not wanted; called after the first ones.
+        path: spectra for a csv are refused after the first block, before all are predicted.
 
     Raises:
         DataError: a station that was asked for had too few training rows, or none has a model.
     """
-    stations = predictor.site.stations
+    row, number = rows_and_stations(queries, predictor.site, station)
+    stations, named = predictor.site.stations, station is not None or queries.station is not None
     blocks: list[tuple[Predictor, np.ndarray]] = []
     silent: list[str] = []
     # By station: each may have a model of its own, whose matrices are then read once a block.
@@ -176,23 +159,20 @@ def predict_places(
         ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
         return own.predict(**ends)
 
-    parts: list[tuple[np.ndarray, Prediction]] = []
-    # Blocks may end in any order in other processes: their rows travel with them.
+    parts: dict[int, Prediction] = {}
+    # Blocks may end in any order in other processes.
     for block, prediction in run_each(predicted, range(len(blocks)), "blocks of places"):
         if not parts:
-            accept(tuple(prediction.mean.shape[1:]))
-        parts.append((blocks[block][1], prediction))
+            check_fits(path, predictor.site.kind, tuple(prediction.mean.shape[1:]))
+        parts[block] = prediction
     for line in silent:
         log.warning(line)
-    rows = np.concatenate([rows for rows, _ in parts])
+    rows = np.concatenate([blocks[block][1] for block in parts])
     # Blocks are of stations, answers are wanted in the order of places.
-    order = np.argsort(rows, kind="stable")
-    whole = Prediction.joined([prediction for _, prediction in parts], torch.from_numpy(order))
-    variance, confidence = (None if v is None else v.numpy() for v in (whole.variance, whole.confidence))
-    rows = rows[order]
+    said = Prediction.joined([*parts.values()], torch.from_numpy(np.argsort(rows, kind="stable")))
+    rows.sort()
     called = {} if stations is None else stations.named
-    names = {head: np.array(every)[number[rows]] for head, every in called.items()}
-    return Answers(row[rows], names, whole.mean.numpy(), variance, confidence)
+    return Answers(row[rows], {head: np.array(of)[number[rows]] for head, of in called.items()}, said)
 
 
 def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
@@ -236,20 +216,19 @@ def write_answers(
     """Write all predictions, whole or not at all; NaN for the level of no power."""
     archive = path.suffix.lower() == ".npz"
     columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
+    said, mean = predictions.said, predictions.said.mean.numpy()
     if kind == "rssi":
-        values = predictions.mean[:, 0]
-        columns[name] = np.where(np.isfinite(values), values, np.float32(np.nan))
-    if predictions.variance is not None:
+        columns[name] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], np.float32(np.nan))
+    if said.variance is not None:
         # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
-        columns[f"{name}_std"] = np.sqrt(predictions.variance).astype(np.float32)
-    if archive and kind != "rssi":
-        columns[kind] = predictions.mean
-    elif kind == "csi":
-        columns |= _entries(predictions.mean)
-    columns |= {} if predictions.confidence is None else {"confidence": predictions.confidence}
+        columns[f"{name}_std"] = said.variance.sqrt().float().numpy()
+    if kind != "rssi":
+        columns |= {kind: mean} if archive else _entries(mean)
+    columns |= {} if said.confidence is None else {"confidence": said.confidence.numpy()}
     if not archive:
         columns = _in_order(columns, queries, predictions)
-        write_samples(path, {name: _cells(values) for name, values in columns.items()})
+        # A float32 is written with as many digits as tell it from its neighbours, .1 and not .10000000149.
+        write_samples(path, {name: list(values) for name, values in columns.items()})
         return
     # An open file: given a name without .npz, which that of an unfinished file is, NumPy appends it.
     with whole_file(path) as partial, partial.open("wb") as file:
@@ -298,11 +277,3 @@ def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:
         entry = channels[:, *place]
         columns |= {f"csi_re{number}": entry.real, f"csi_im{number}": entry.imag}
     return columns
-
-
-def _cells(values: np.ndarray) -> list[object]:
-    """Text of numbers with as many digits as tell them from their neighbours; NaN stays a number."""
-    if values.dtype.kind != "f":
-        return values.tolist()
-    # str of a float32 has its shortest digits, .1; as a Python float it would be .10000000149.
-    return [value if np.isnan(value) else str(value) for value in values]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, Split
+from gsparc.data.splits import Split
 from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.models.method import Method
@@ -67,17 +67,14 @@ def fit_baseline(
         learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
     """
     own, before = learned or (data, split)
-    unseen = eval_on == "val" and learned is None
-
-    def known(there: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
-        # Learning from `val` rows as methods do; where these are scored they must stay unseen.
-        return there, replace(fold, val=fold.val[:0]) if unseen else fold
+    if eval_on == "val" and learned is None:  # learned from as methods do, but where they are scored
+        before = replace(before, folds=tuple(replace(fold, val=fold.val[:0]) for fold in before.folds))
 
     def said(number: int, method: Method, report: FitReport) -> None:
         for note in report.notes:
             log.info("fold %d: %s", number, note)
 
     contexts = [FitContext(Path())] * len(before.folds)
-    fits = fit_folds(method_class(name)(), own, before, contexts, learned=known, keep=said)
+    fits = fit_folds(method_class(name)(), own, before, contexts, keep=said)
     scores = score_methods(fits.methods, data, split, eval_on, learned)
     return FittedBaseline(fits.methods, scores, fits.train_s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.data.files import whole_file
 from gsparc.data.limits import choice
+from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
 # Colours that are told apart with any colour vision (Okabe and Ito 2008, the yellow darker; Tol 2021).
 PALETTE = (
@@ -121,6 +122,29 @@ def set_log_axis(axes: Any, decades: float = 3.0) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if fine else (1,)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def set_latency_axes(
+    axes: Any, figure_name: str, values: Sequence[float], others: Iterable[tuple[str, float, float]]
+) -> None:
+    """Mark others by name, milliseconds and accuracy, and set axes on which better is up.
+
+    Those far below the `values` that the picture is about leave it: they would flatten these.
+    """
+    for name, ms, value in others:
+        look = style_of(name)
+        axes.plot([ms], [value], ms=5, **look.marked)
+        where = {"textcoords": "offset points", "fontsize": 7, "color": look.colour}
+        axes.annotate(name, (ms, value), (5, -3), annotation_clip=True, **where)
+    set_log_axis(axes)
+    axes.set(xlabel="one query [ms], median; whisker to the 95th percentile", ylabel=axis_of(figure_name))
+    if lower_is_better(figure_name):
+        if np.isfinite(axes.dataLim.minposy):  # errors span decades
+            axes.set_yscale("log")
+        axes.invert_yaxis()
+    elif len(values) > 1:
+        middle, best = float(np.median(values)), max(values)
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best - middle), 5.0)))
 
 
 def save(figure: Figure, path: Path, dpi: float = 110, also: Iterable[str] = ()) -> None:

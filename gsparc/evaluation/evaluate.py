@@ -25,14 +25,7 @@ from gsparc.evaluation.summary import write_samples
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.prediction import timing
-from gsparc.prediction.timing import (
-    COPY,
-    ClockSettings,
-    cycle_queries,
-    draw_queries,
-    p50_p95,
-    time_interleaved,
-)
+from gsparc.prediction.timing import COPY, ClockSettings, p50_p95, query_calls, time_interleaved
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +33,6 @@ log = logging.getLogger(__name__)
 BATCH = 64
 SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
 FIELD = "field"  # Gaussians of the evaluated method, without the process that they are mixed with
-OWN = "self"  # the evaluated method's name among the timed ones; baselines may carry the same name as it
 
 
 @dataclass(frozen=True)
@@ -108,39 +100,41 @@ def evaluate(
         log.info("%-10s%s", "baselines", ", ".join(fitted))
     # A method that is a baseline (model=gp) has one fit and one row: another would only differ in seconds.
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
-    others = {n: same if n == shared else fit_baseline(n, data, split, eval_on, learned) for n in names}
+    fits = {n: same if n == shared else fit_baseline(n, data, split, eval_on, learned) for n in names}
+    others = {f"baseline/{name}": one for name, one in fits.items()}
     facts: dict[str, Any] = {}
-    every = {eval_on: scores, **{f"baseline/{name}": other.scores for name, other in others.items()}}
-    alone = [method.without_process() for method in methods]
-    fields = [one for one in alone if one is not None]
+    every = {eval_on: scores, **{room: other.scores for room, other in others.items()}}
+    # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
+    contenders = {"time": methods[0], **{room: other.methods[0] for room, other in others.items()}}
+    fields = [one for one in (method.without_process() for method in methods) if one is not None]
     # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
     if len(fields) == len(methods):
         every[FIELD] = score_methods(fields, data, split, eval_on, learned)
-    for stem, one in every.items():
-        own = {**pool_figures(one, data, split), "skill": _skill(one, others)}
-        facts |= {f"{stem}/{figure}": value for figure, value in own.items()}
-    stems = {f"baseline/{name}/": other.scores for name, other in others.items()}
-    stations = station_columns({"": scores, **stems}, data)
+        contenders[FIELD] = fields[0]
+    nearest = every.get("baseline/nearest")
+    for room, one in every.items():
+        own = {**pool_figures(one, data, split), "skill": _skill(one, nearest)}
+        facts |= {f"{room}/{figure}": value for figure, value in own.items()}
     judged = judged_by({**facts, "dataset/kind": data.site.scored}, eval_on)
-    for (name, other), (ahead, figure) in product(others.items(), judged.items()):
+    for (room, other), (ahead, figure) in product(others.items(), judged.items()):
         lead = lead_over_rows(other.scores.samples, scores.samples, figure)
         if lead is not None and other is not same:
-            facts |= {f"baseline/{name}/{ahead}{key}": value for key, value in lead.facts().items()}
-    facts |= {f"baseline/{name}/train_s": float(np.mean(other.train_s)) for name, other in others.items()}
+            facts |= {f"{room}/{ahead}{key}": value for key, value in lead.facts().items()}
+    facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}
     decided = scores.dominant_row()
     if decided and data.row_names:
         decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
     facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
-    # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
-    contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
-    if FIELD in every:
-        contenders[FIELD] = fields[0]
     facts |= time_methods(contenders, data, rows_to_score(split.folds[0], eval_on), clock) if timed else {}
     facts["split/unseen_runs"] = sum(len(unseen_runs(data, fold, eval_on)) for fold in split.folds)
     facts |= _about(methods, seconds, data, split)
     if FIELD in every:
         facts[f"{FIELD}/train_s"] = facts["time/train_s"]
-    return Evaluation(facts, _columns(scores, others, data), stations)
+    beside = {f"{room}/": other.scores for room, other in others.items()}
+    columns = _columns(scores, data)
+    for stem, one in beside.items():
+        columns |= {f"{stem}{name}": values for name, values in paired_values(one.samples).items()}
+    return Evaluation(facts, columns, station_columns({"": scores, **beside}, data))
 
 
 def _about(
@@ -165,18 +159,17 @@ def _about(
 def time_methods(
     methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings | None = None
 ) -> dict[str, float | int | str | None]:
-    """Return `time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others,
-    timed in turns.
+    """Return `time/*` and `<room>/render_ms_*` of methods by their rooms of facts, timed in turns.
 
     Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
     clock = clock or ClockSettings()
-    singles = cycle_queries(methods, draw_queries(data, rows, 1))
+    singles = query_calls(methods, data, rows)
     one = time_interleaved({**singles, COPY: timing.reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
     # A median: one interruption by another process moves a mean of few rounds.
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
-    many = time_interleaved(cycle_queries(quick, draw_queries(data, rows, BATCH)), fewer)
+    many = time_interleaved(query_calls(quick, data, rows, BATCH), fewer)
     copy_ms = float(np.median(one[COPY]))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {
@@ -187,12 +180,11 @@ def time_methods(
             "out; warm, plans made before; no file, no picture"
         ),
     }
-    for name in methods:
-        room = {OWN: "time", FIELD: FIELD}.get(name, f"baseline/{name}")
-        p50, p95 = p50_p95(one[name])
+    for room in methods:
+        p50, p95 = p50_p95(one[room])
         times = {"render_ms_p50": p50, "render_ms_p95": p95, "ratio_to_copy": p50 / copy_ms}
         facts |= {f"{room}/{key}": value for key, value in times.items()}
-        together = float(np.median(many[name])) / BATCH if name in quick else None
+        together = float(np.median(many[room])) / BATCH if room in quick else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
     return facts
 
@@ -217,17 +209,17 @@ def split_facts(split: Split) -> dict[str, Any]:
     return {"split/name": split.name, **hashes, "split/folds": len(split.folds), **counts}
 
 
-def _skill(scores: Scores, others: Mapping[str, FittedBaseline]) -> float | None:
+def _skill(scores: Scores, nearest: Scores | None) -> float | None:
     """1 - MSE / MSE(nearest), of powers in decibels; None without a neighbour, or when that one is right."""
-    if "nearest" not in others:
+    if nearest is None:
         return None
     # Rows without a target are NaN in both, so that the means are over the same rows.
-    every = (one.samples for one in (scores, others["nearest"].scores))
+    every = (one.samples for one in (scores, nearest))
     own, bar = (float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"])) for one in every)
     return 1 - own / bar if bar > 0 else None
 
 
-def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measurements) -> dict[str, Any]:
+def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
     # The last three are the moving end's place: where both move, columns are tx, then rx.
     world = data.moving[scores.row][:, -3:] + data.site.origin
     names = data.row_names or [f"row {i}" for i in range(len(data))]
@@ -247,6 +239,4 @@ def _columns(scores: Scores, others: Mapping[str, FittedBaseline], data: Measure
     if data.site.static_end is None:
         other = data.tx[scores.row] + data.site.origin
         columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
-    for name, other in others.items():
-        columns |= {f"baseline/{name}/{k}": v for k, v in paired_values(other.scores.samples).items()}
     return columns

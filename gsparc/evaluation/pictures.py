@@ -11,7 +11,8 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.models.method import Method, predict_in_batches
+from gsparc.models.method import Method, Prediction
+from gsparc.prediction.confidence import predict_rows
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
 SPECTRA = 4  # test rows drawn
@@ -23,20 +24,14 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     # Spread over the fold: rows beside each other in a file were measured beside each other.
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
-    told = list(predict_in_batches(method, data, rows))
-    # `predict_in_batches` goes station by station: back in the order of rows.
-    back = np.argsort(np.concatenate([chosen for chosen, _, _ in told]))
-    true = np.concatenate([batch.target.numpy() for _, batch, _ in told])[back]
-    predicted = np.concatenate([said.mean.numpy() for _, _, said in told])[back]
+    said, true = predict_rows(method, data, rows), data.targets(rows).numpy()
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         measured = data.censored_side(rows) == 0  # of a silent row the target is its level
-        return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
+        return draw_points(true[measured] * scale, said.mean.numpy()[measured] * scale, title, path, unit)
     assert data.site.grid is not None
-    known = [said.confidence.numpy() for _, _, said in told if said.confidence is not None]
-    confidence = np.concatenate(known)[back] if known else None
-    return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
+    return draw_spectra(true, said, rows, data.site.grid.edges(), title, path)
 
 
 def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
@@ -71,23 +66,18 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
 
 
 def draw_spectra(
-    target: np.ndarray,
-    predicted: np.ndarray,
-    rows: np.ndarray,
-    title: str,
-    path: Path,
-    confidence: np.ndarray | None = None,
-    edges: tuple[float, float, float, float] = (0.0, 360.0, 0.0, 90.0),
+    target: np.ndarray, said: Prediction, rows: np.ndarray, edges: Sequence[float], title: str, path: Path
 ) -> None:
     """Save a line per sample as PNG: measured, predicted and difference beside each other.
 
     Args:
-        target, predicted: (B, H, W) in [0, 1].
+        target: (B, H, W) in [0, 1].
+        said: their prediction, and the confidence that is written into it, if any.
         rows: (B,) dataset rows, for the labels.
-        title, path: of the figure.
-        confidence: (B,) in [0, 1], written into the predictions.
         edges: least and largest azimuth, least and largest elevation [degrees].
+        title, path: of the figure.
     """
+    predicted, confidence = said.mean.numpy(), said.confidence
     how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
     figure, axes = panels(8.5, 1.35 * len(target) + 1.2, len(target), 3, **how)
     options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}

@@ -127,7 +127,7 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
 
 def score_methods(
     methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test",
-    learned: tuple[Measurements, Split] | None = None,
+    learned: tuple[Measurements, Split] | None = None, means: list[Tensor] | None = None,
 ) -> Scores:  # fmt: skip
     """Predict the chosen rows of every fold with that fold's method.
 
@@ -140,6 +140,7 @@ def score_methods(
         split: as the methods were fitted with.
         eval_on: `train`, `val` or `test`.
         learned: what the methods learned from, where it is not `data` and `split`.
+        means: which the mean of every batch is added to.
 
     Raises:
         ValueError: another number of methods than folds, an empty subset, a prediction with NaN.
@@ -159,6 +160,8 @@ def score_methods(
         for chosen, batch, prediction in predict_in_batches(method, data, rows, CHUNK):
             mean = prediction.mean if turn is None else prediction.mean * turn[chosen, None, None]
             metric.update(mean, batch.target, batch.mask)
+            if means is not None:
+                means.append(mean)
             for name, values in outputs.items():
                 if (output := getattr(prediction, name)) is not None:
                     values[chosen] = output.detach().cpu().double().numpy()

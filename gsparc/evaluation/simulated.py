@@ -23,12 +23,14 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
 
     Of several transmitters, the strongest at each place.
     """
-    changed, survey = outcome.changed, outcome.survey
+    decision, survey = outcome.decision, outcome.survey
+    changed = None if decision is None else decision.changed
     count = 2 if changed is None else 3
-    places, by_station = survey.places, outcome.dataset.power.reshape(len(survey.engines), -1)
+    power, spreads = (outcome.rows.arrays[name] for name in ("received_power", "delay_spread"))
+    places, by_station = survey.places, power.reshape(len(survey.engines), -1)
     # Rows are stations x places: the row of the strongest station at each place.
     best = by_station.argmax(0) * len(places) + np.arange(len(places))
-    heard, spread = outcome.dataset.power[best], outcome.dataset.delay_spread[best]
+    heard, spread = power[best], spreads[best]
     extent = np.ptp(places[:, :2], axis=0)
     high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 1.3
     figure, (axes,) = panels(5.4 * count, high, 1, count, grid=False)
@@ -38,11 +40,11 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     _map(axes[0], places[reached], 10 * np.log10(heard[reached]), "received power [dB]", size)
     _map(axes[1], places[reached], spread[reached] * 1e9, "delay spread [ns]", size)
     if changed is not None:
-        known = outcome.dataset.power[changed.rows] > 0
+        known = power[changed.rows] > 0
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
         label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
         # Errors of spectra have no decibels.
-        if outcome.choice is not None and not outcome.choice.deliverable.startswith("spectrum"):
+        if decision is not None and not decision.choice.deliverable.startswith("spectrum"):
             label += " [dB]"
         _map(axes[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
     for axis in axes:
@@ -56,7 +58,7 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
             draw_walls(axis, triangles)
         set_bounds(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
     legend_below(figure)  # beside the title it would cover the last effects
-    figure.suptitle(f"{outcome.dataset.data.site.name}: {len(places)} receivers\n{outcome.effects}")
+    figure.suptitle(f"{outcome.data.site.name}: {len(places)} receivers\n{outcome.effects}")
     save(figure, path)
 
 

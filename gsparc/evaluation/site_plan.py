@@ -24,7 +24,6 @@ NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
 MOST_MARKS = 8  # suspicious places that are named
 INCHES = 6.5  # longer side of the map
-PLAIN = ("receiver", "transmitter")  # in the legend
 
 
 @dataclass(frozen=True)
@@ -97,10 +96,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
 
 
 def draw_site(
-    data: Measurements,
-    path: Path,
-    levels: LinkLevels | None = None,
-    steps: Sequence[tuple[int, LevelStep]] = (),
+    data: Measurements, path: Path, levels: LinkLevels | None, steps: Sequence[tuple[int, LevelStep]] = ()
 ) -> None:
     """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
@@ -129,13 +125,7 @@ def draw_site(
         for one, t in zip(axes[:, 1], jumping, strict=True):
             _draw_level(one, levels, t, [step for u, step in steps if u == t], data.site.level_unit)
     _draw_map(axis, data, places, low, high, jumping)
-    legend = legend_below(figure, 4)
-    mark: Any
-    for mark, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
-        if text.get_text() in PLAIN:  # whose colours and sizes are those of the first place
-            mark.set_array(None)
-            mark.set_color("0.4")
-            mark.set_sizes([25])
+    legend_below(figure, 4)
     figure.suptitle(_title(data, places))
     save(figure, path)
 
@@ -176,9 +166,8 @@ def _draw_map(
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
         # 1 and 99 %: a few outliers would leave one colour for the rest.
         limits = dict(zip(("vmin", "vmax"), np.percentile(places.level_db[known], [1, 99]), strict=True))
-        dots = axis.scatter(
-            *places.place[known].T, c=places.level_db[known], s=size, linewidths=0, label=name, **limits
-        )
+        dots = axis.scatter(*places.place[known].T, c=places.level_db[known], s=size, linewidths=0, **limits)
+        axis.scatter([], [], s=25, c="0.4", linewidths=0, label=name)  # whose colours are the bar's
         assert axis.figure is not None
         axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
     side = propose_side(data)

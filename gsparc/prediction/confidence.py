@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from gsparc.models.baselines.gp import choose_left_out_kernel, principal_compone
 from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
-from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold, join_evidence
+from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
@@ -29,57 +29,58 @@ KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the va
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
+def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Prediction:
+    """Return what a method says of rows (n,), in their order; see `predict_in_batches`."""
+    order, _, said = zip(*predict_in_batches(method, data, rows), strict=True)
+    return Prediction.joined(said, torch.from_numpy(np.argsort(np.concatenate(order))))
+
+
 def gather_evidence(
     method: Method, data: Measurements, fold: Fold, rows: np.ndarray, seen: Measurements | None = None
 ) -> Evidence:
     """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `seen` or `data`."""
-    evidence = join_evidence(
-        [
-            Evidence(rows[chosen], data.moving[rows[chosen]], *errors_and_scores(said, batch.target))
-            for chosen, batch, said in predict_in_batches(method, data, rows)
-        ]
-    )
-    return replace(evidence, scores=evidence.scores | position_scores(seen or data, fold, evidence.position))
+    said = predict_rows(method, data, rows)
+    return judge_answers(said, data.targets(rows), rows, data.moving[rows], seen or data, fold)
 
 
-def errors_and_scores(prediction: Prediction, true: Tensor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return relative errors (n,) of predictions of `true` (n, ...), and the scores (n,) that they state.
+def judge_answers(
+    said: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, data: Measurements, fold: Fold
+) -> Evidence:
+    """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m], and their scores.
 
-    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
-    (in a fade the same variance is a larger relative error); a method without them has no such kind.
+    What was learned from is `fold` of `data`. A method that does not state a kind of score has none of it.
     """
-    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (prediction.mean - true, true))
-    own = {"learned": prediction.confidence, "expected": expected_score(prediction)}
-    scores = {kind: score.double().numpy() for kind, score in own.items() if score is not None}
+    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
     # A silent row has no relative error: any miss of it counts as huge.
     error = (miss / power.clamp_min(1e-30)).double().numpy()
-    # Scores with a NaN rank nothing.
-    return error, {kind: score for kind, score in scores.items() if not np.isnan(score).any()}
-
-
-def expected_score(prediction: Prediction) -> Tensor | None:
-    """Return minus the error variance over the power predicted (B,); None without a variance."""
-    if prediction.variance is None:
-        return None
-    # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
-    return -prediction.variance / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
-
-
-def position_scores(data: Measurements, fold: Fold, places: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the confidences `RIVALS` (n,) of local places (n, 3) [m], by the rows learned from."""
     known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    return {kind: position_score(kind, known, kernel, places) for kind in RIVALS}
+    every = {kind: score_answers(kind, said, places, known, kernel) for kind in KINDS}
+    # Scores with a NaN rank nothing.
+    scores = {kind: own for kind, own in every.items() if own is not None and not np.isnan(own).any()}
+    return Evidence(rows, places, error, scores)
 
 
-def position_score(kind: str, known: np.ndarray, kernel: Kernel, places: np.ndarray) -> np.ndarray:
-    """Return minus the distance of places (B, 3) to the nearest known one [m], or minus `process_variance`.
+def score_answers(
+    kind: str, said: Prediction, places: np.ndarray | None, known: np.ndarray, kernel: Kernel | None
+) -> np.ndarray | None:
+    """Return the scores (B,) of a kind, larger is surer; None where the method states none.
 
-    >>> position_score("distance", np.zeros((1, 3)), None, np.array([[3.0, 4.0, 0.0]]))
+    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
+    (in a fade the same variance is a larger relative error), `distance` minus that of places (B, 3) to the
+    nearest of those `known` [m], `gp_variance` minus `process_variance`.
+
+    >>> score_answers("distance", None, np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)), None)
     array([-5.])
     """
     if kind == "distance":
         return -cKDTree(known).query(places)[0]
-    return -process_variance(kernel, known, places)
+    if kind == "gp_variance" and kernel is not None and places is not None:
+        return -process_variance(kernel, known, places)
+    own = said.confidence
+    if kind == "expected" and (own := said.variance) is not None:
+        # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
+        own = -own / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
+    return None if own is None else own.double().numpy()
 
 
 def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
@@ -155,7 +156,14 @@ class Trusted(Stored):
         """
         # What is asked for, then what calibration found best, then the method's own.
         kind = kind or self.kind or "learned"
-        return as_confidence(kind, self._score(kind, prediction, places)).astype(np.float32)
+        self.check_kind(kind)
+        if kind in RIVALS and places is None:
+            raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
+        score = score_answers(kind, prediction, places, self.known, self.kernel)
+        if score is None:
+            what = "has no confidence of its own" if kind == "learned" else "states no error variance"
+            raise ValueError(f"confidence={kind}: this model {what}")
+        return as_confidence(kind, score).astype(np.float32)
 
     def check_kind(self, kind: str) -> None:
         """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""
@@ -166,19 +174,6 @@ class Trusted(Stored):
                 f"confidence={kind}: the checkpoint does not say where was measured; "
                 "gsparc calibrate ckpt=FILE stores it"
             )
-
-    def _score(self, kind: str, prediction: Prediction, places: np.ndarray | None) -> np.ndarray:
-        self.check_kind(kind)
-        if kind in RIVALS:
-            assert self.kernel is not None
-            if places is None:
-                raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
-            return position_score(kind, self.known, self.kernel, places)
-        score = prediction.confidence if kind == "learned" else expected_score(prediction)
-        if score is None:
-            what = "has no confidence of its own" if kind == "learned" else "states no error variance"
-            raise ValueError(f"confidence={kind}: this model {what}")
-        return score.double().numpy()
 
 
 def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,8 @@ import torch
 
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
-from gsparc.models.reduced import ReductionInputs, with_reduction
+from gsparc.models.reduced import ReductionInputs, Settings, with_reduction
 from gsparc.prediction.confidence import read_trusted
-from gsparc.prediction.pareto import Point, Settings
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, time_interleaved
 from gsparc.processes.stored import Stored, from_plain, to_plain
@@ -46,12 +45,15 @@ class Operating(Stored):
     p50_ms: float
 
 
-def store_points(path: Path, points: Sequence[Point], figure: str, inputs: ReductionInputs) -> None:
-    """Store points in a checkpoint, replacing earlier ones; the file is rewritten whole or not at all."""
+def store_points(path: Path, points: Sequence[Mapping[str, Any]], inputs: ReductionInputs) -> None:
+    """Store points, rows of a trade-off, in a checkpoint, replacing earlier ones; see `update_extra`."""
     found = [
-        Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
+        Operating(
+            p["label"], dict(p["settings"]), p["threads"], p["closeness_db"], (p["figure"], p["value"]),
+            p["render_ms_p50"],
+        )
         for p in points
-    ]
+    ]  # fmt: skip
     checkpoint.update_extra(path, {KEY: {"points": to_plain(found), "measured": inputs}})
 
 

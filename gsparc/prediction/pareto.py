@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-
-import numpy as np
 
 from gsparc.models.reduced import Settings
 
@@ -15,43 +12,6 @@ WORDS = {
     "confidence": lambda value: "" if value else "no confidence",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
 }
-
-
-@dataclass(frozen=True)
-class Point:
-    """One way of answering, measured.
-
-    Attributes:
-        label: in words.
-        settings: what is spared.
-        threads: CPU threads.
-        figures: on the evaluated rows, as in `summary.json`.
-        closeness_db: how near its answers are to the full model's [dB]; decides which points are kept.
-        ms: (n,) wall times of single queries end to end [ms].
-        size: Gaussians, sources or stored samples that answer.
-    """
-
-    label: str
-    settings: Settings
-    threads: int
-    figures: Mapping[str, float | None]
-    closeness_db: float
-    ms: np.ndarray
-    size: int = 0
-
-    def value(self, figure: str) -> float:
-        """Return a figure; errors as in `defined_figure`."""
-        return defined_figure(self.figures, figure)
-
-    @property
-    def p50(self) -> float:
-        """Median latency [ms]."""
-        return float(np.median(self.ms))
-
-    @property
-    def p95(self) -> float:
-        """95th percentile of the latency [ms]."""
-        return float(np.quantile(self.ms, 0.95))
 
 
 def defined_figure(figures: Mapping[str, float | None], name: str) -> float:

@@ -6,7 +6,7 @@ import os
 import platform
 import resource
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -14,7 +14,6 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Method, predict_with_threads
 
@@ -103,8 +102,16 @@ def _time_round(call: Call, turn: int, settings: ClockSettings) -> list[float]:
     return times
 
 
-def cycle_queries(methods: Mapping[Key, Method], queries: Sequence[Query]) -> dict[Key, Call]:
-    """Return calls that answer one of `draw_queries` each, another one every time."""
+def query_calls(
+    methods: Mapping[Key, Method], data: Measurements, rows: np.ndarray, size: int = 1
+) -> dict[Key, Call]:
+    """Return calls that ask a method each about `size` of the rows (n,), another set every time.
+
+    There are at most `QUERIES` sets, without targets.
+    """
+    where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
+    picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
+    queries = [where.batch(pick) for pick in picks]
 
     def call(method: Method) -> Call:
         return lambda turn: predict_with_threads(method, queries[turn % len(queries)])
@@ -119,13 +126,6 @@ def p50_p95(times: np.ndarray) -> tuple[float, float]:
     (50.0, 95.0)
     """
     return float(np.median(times)), float(np.quantile(times, 0.95))
-
-
-def draw_queries(data: Measurements, rows: np.ndarray, size: int = 1) -> list[Query]:
-    """Return batches of `size` of the rows (n,), another set each, without targets; at most `QUERIES`."""
-    picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
-    where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
-    return [where.batch(pick) for pick in picks]
 
 
 def reference_copy() -> Call:

@@ -18,6 +18,7 @@ from gsparc.data.datasets import argos
 from gsparc.data.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
 from gsparc.data.datasets.campaign import make_once, write_split
 from gsparc.data.files import whole_folder
+from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.streets import Rays, Streets, trace_streets
 
@@ -168,7 +169,7 @@ def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatt
 
 
 @dataclass(frozen=True)
-class ArgosStandIn:
+class ArgosStandIn(Checked):
     """What `dataset=argos` falls back on; a `gsparc.data.datasets.campaign.StandIn`.
 
     Attributes:
@@ -179,22 +180,16 @@ class ArgosStandIn:
         root: folder that holds stand-ins.
     """
 
-    count: int = 4000
-    seed: int = 0
+    count: int = setting(4000, whole(10))
+    seed: int = setting(0, whole(0))
     offsets: bool = True
-    scatterers: int = SCATTERERS
+    scatterers: int = setting(SCATTERERS, whole(1))
     root: str | Path = "outputs/stand-ins"
 
     def folder(self) -> Path:
         """See `StandIn.folder`."""
-        count, seed, scatterers = int(self.count), int(self.seed), int(self.scatterers)
-        if scatterers < 1:
-            raise ValueError(f"dataset.stand_in.scatterers={scatterers}: expected at least 1")
-        if count < 10:
-            raise ValueError(f"dataset.count={count}: expected at least 10 users")
-        name = f"{STAND_IN}-{count}-{seed}{'' if self.offsets else '-aligned'}"
-        name = name if scatterers == SCATTERERS else f"{name}-{scatterers}"
+        name = f"{STAND_IN}-{self.count}-{self.seed}{'' if self.offsets else '-aligned'}"
+        name += "" if self.scatterers == SCATTERERS else f"-{self.scatterers}"
         own = Offsets() if self.offsets else Offsets(0.0, 0.0, 0.0)
-        return make_once(
-            Path(self.root) / name, lambda folder: write_argos_sim(folder, count, seed, own, scatterers)
-        )
+        how = self.count, self.seed, own, self.scatterers
+        return make_once(Path(self.root) / name, lambda folder: write_argos_sim(folder, *how))

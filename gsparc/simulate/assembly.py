@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
-from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import ARRAYS, Paths, group_offsets
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
@@ -24,24 +22,6 @@ from gsparc.simulate.survey import Engine, Survey
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are not listed in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
-
-
-@dataclass(frozen=True)
-class Assembled:
-    """A finished file and facts about it.
-
-    Attributes:
-        data: as `load_own` reads the file.
-        power: (S,) sum of path powers.
-        delay_spread: (S,) [s].
-        facts: numbers that decide what the data can be used for, as `below_horizon`, the share of power that
-            an upper hemisphere cannot show.
-    """
-
-    data: Measurements
-    power: np.ndarray
-    delay_spread: np.ndarray
-    facts: dict[str, float]
 
 
 def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
@@ -67,14 +47,16 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
 def assemble_dataset(
     campaign: Campaign,
     survey: Survey,
-    effects: Effects,
     choice: Choice | None,
     convergence: Convergence | None,
     seconds: float,
     shards: Shards,
     rows: Rows,
-) -> Assembled:
-    """Write the file from what the shards hold (`join_shards`), drop the shards.
+) -> tuple[Measurements, dict[str, float]]:
+    """Write the file from what the shards hold (`join_shards`), drop the shards; as `load_own` reads it.
+
+    Facts beside it decide what the data can be used for, as `below_horizon`, the share of power that an upper
+    hemisphere cannot show.
 
     `seconds` [s] were spent on anything but the shards, which know their own; both are the file's
     `simulate_s`.
@@ -95,8 +77,8 @@ def assemble_dataset(
         "silent_receivers": float((~reached).sum()),
         "paths_per_receiver": len(paths.order) / len(survey),
     }
-    arrays = _arrays(campaign, survey, effects, whole, paths)
-    about = {**_provenance(campaign, engine, effects), **facts}
+    arrays = _arrays(campaign, survey, rows)
+    about = {**_provenance(campaign, engine), **facts}
     if survey.georeference is not None:
         about |= {f"origin_{name}": value for name, value in asdict(survey.georeference).items()}
     about["antennas"] = json.dumps([str(getattr(one, "antenna", "isotropic")) for one in survey.engines])
@@ -107,7 +89,7 @@ def assemble_dataset(
     data = write_own(shards.out, arrays, {**about, **shards.signature, "simulate_s": seconds})
     # Not before: until the file is there, the shards are all that there is.
     shards.remove()
-    return Assembled(data, power, whole["delay_spread"], facts)
+    return data, facts
 
 
 class Rows(NamedTuple):
@@ -140,11 +122,9 @@ def join_shards(shards: Shards, rows: int) -> Rows:
     return Rows(whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS)))
 
 
-def _arrays(
-    campaign: Campaign, survey: Survey, effects: Effects, whole: Mapping[str, np.ndarray], paths: Paths
-) -> dict[str, np.ndarray]:
-    scene, wavelength = campaign.scene, survey.engine.wavelength
-    csi = whole["csi"]
+def _arrays(campaign: Campaign, survey: Survey, rows: Rows) -> dict[str, np.ndarray]:
+    scene, wavelength, snr_db = campaign.scene, survey.engine.wavelength, campaign.decided.noise_snr_db
+    (whole, paths), csi = rows, rows.arrays["csi"]
     order = np.random.default_rng(scene.seed).permutation(len(survey.places))
     tests = max(1, round(scene.test_share * len(order)))
     each = np.arange(len(survey.engines))[:, None] * len(order)  # a place is held out with all transmitters
@@ -159,9 +139,9 @@ def _arrays(
         "split_train": np.sort((order[tests:] + each).ravel()),
         "split_test": np.sort((order[:tests] + each).ravel()),
     }
-    if effects.noise_snr_db is not None:
+    if snr_db is not None:
         power = sum(float((np.abs(csi[part]) ** 2).sum()) for part in row_blocks(csi)) / csi.size
-        variance = power / 10 ** (effects.noise_snr_db / 10)
+        variance = power / 10 ** (snr_db / 10)
         # Another stream than the split's, so that noise does not follow what is held out.
         rng = np.random.default_rng(scene.seed + 1)
         for component in (csi.real, csi.imag):  # all of the one, then all of the other
@@ -193,7 +173,7 @@ def _ends(survey: Survey) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[str, Any]:
+def _provenance(campaign: Campaign, engine: Engine) -> dict[str, Any]:
     """Attributes of the file: what it is and how it was made."""
     return {
         "name": campaign.scene.name,
@@ -202,8 +182,8 @@ def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[st
         "simulator_versions": json.dumps(engine.package_versions()),
         "scene": json.dumps(asdict(campaign.scene)),
         "materials": json.dumps(engine.materials()),
-        "effects": str(effects),
-        "effects_json": json.dumps(asdict(effects)),
+        "effects": str(campaign.decided),
+        "effects_json": json.dumps(asdict(campaign.decided)),
         "sampling": json.dumps(asdict(campaign.sampling)),
         "path_gain_convention": "without carrier phase: multiply by exp(-j 2 pi f path_delay)",
         "path_mechanisms_bits": "0 sight, 1 specular, 2 diffuse, 4 refraction, 8 diffraction, 16 edge",

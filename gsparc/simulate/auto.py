@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
+from gsparc.data.limits import SHARE, Checked, number, setting, whole
 from gsparc.simulate.attribution import Deliverable, Probe, list_effect_sets, list_removals
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
@@ -26,7 +27,7 @@ SIMILAR = 0.1  # of prices, within which the set of fewer effects is taken
 
 
 @dataclass(frozen=True)
-class AutoSettings:
+class AutoSettings(Checked):
     """How `auto` decides.
 
     Attributes:
@@ -40,20 +41,15 @@ class AutoSettings:
     """
 
     deliverable: str = "coverage +-1 dB"
-    quantile: float = 0.95
-    probes: int = 128
-    confidence: float = 0.85
-    held_back: int = 64
-    rays: float = 0.3
+    quantile: float = setting(0.95, SHARE)
+    probes: int = setting(128, whole(16))
+    confidence: float = setting(0.85, SHARE)
+    held_back: int = setting(64, whole(16))
+    rays: float = setting(0.3, number(0, 1, open_low=True))
     full: Effects = field(default_factory=lambda: Effects(depth=5))
 
     def __post_init__(self) -> None:
-        if self.probes < 16 or self.held_back < 16:
-            raise ValueError("effects.probes and effects.held_back: at least 16 receivers each, spread out")
-        if not 0 < self.confidence < 1:
-            raise ValueError(f"effects.confidence={self.confidence}: expected a share between 0 and 1")
-        if not 0 < self.rays <= 1:
-            raise ValueError(f"effects.rays={self.rays}: expected a share above 0, at most 1")
+        super().__post_init__()
         Deliverable.parse(self.deliverable, self.quantile)
 
     @property

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.executor import run_each
+from gsparc.data.schema import Measurements
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import SECONDS, Assembled, assemble_dataset, join_shards, shard_arrays
-from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.assembly import SECONDS, Rows, assemble_dataset, join_shards, shard_arrays
+from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.convergence import Convergence, measure_convergence
-from gsparc.simulate.deciding import Changed, Decision
+from gsparc.simulate.deciding import Decision
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.settings import Campaign
@@ -25,7 +26,7 @@ from gsparc.simulate.survey import Survey
 log = logging.getLogger(__name__)
 
 STAGES = ("build", "decide", "trace", "converge", "write")
-PARTS = 5  # version of what a shard holds: those of another are refused
+PARTS = 6  # version of what a shard holds: those of another are refused
 
 
 @dataclass(frozen=True)
@@ -33,17 +34,20 @@ class Outcome:
     """A finished dataset and what it cost.
 
     Attributes:
-        dataset, survey, effects: the file, its rows, and what was simulated.
-        choice, changed: of `auto`; else None.
+        data, facts: the file, and numbers about it, see `assemble_dataset`.
+        rows: what it was made of, in its order.
+        survey, effects: its rows, and what was simulated.
+        decision: of `auto`; else None.
         convergence: between two seeds; None where there are no rays.
         seconds: by stage [s].
     """
 
-    dataset: Assembled
+    data: Measurements
+    facts: dict[str, float]
+    rows: Rows
     survey: Survey
     effects: Effects
-    choice: Choice | None
-    changed: Changed | None
+    decision: Decision | None
     convergence: Convergence | None
     seconds: dict[str, float]
 
@@ -62,27 +66,28 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     survey = build_survey(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS, "inputs": campaign.inputs()})
     laps.append(time.perf_counter())
-    effects, choice, changed, left_out = campaign.effects, None, None, deciding.NONE
-    if isinstance(effects, AutoSettings):
-        decision = _decided(campaign, effects, survey, shards)
-        effects, choice, changed = decision.effects, decision.choice, decision.changed
+    decision, left_out = None, deciding.NONE
+    if isinstance(campaign.effects, AutoSettings):
+        decision = _decided(campaign, campaign.effects, survey, shards)
+        campaign = replace(campaign, effects=decision.effects)
         if decision.samples is not None:
             campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
             survey = survey.with_samples(decision.samples)
             left_out = _decided_on(shards)  # these rows have more rays than the others
-    effects = survey.engine.supported_effects(effects)
+    campaign = replace(campaign, effects=survey.engine.supported_effects(campaign.decided))
     laps.append(time.perf_counter())
-    _trace_all(campaign, survey, effects, shards)
+    _trace_all(campaign, survey, shards)
     laps.append(time.perf_counter())
     rows = join_shards(shards, len(survey))
-    error = measure_convergence(campaign, survey, effects, rows.arrays, left_out)
+    error = measure_convergence(campaign, survey, rows.arrays, left_out)
     laps.append(time.perf_counter())
     # Seconds of all but the shards, which keep their own over interruptions.
     other_s = laps[1] - laps[0] + laps[4] - laps[3]
-    dataset = assemble_dataset(campaign, survey, effects, choice, error, other_s, shards, rows)
+    choice = None if decision is None else decision.choice
+    data, facts = assemble_dataset(campaign, survey, choice, error, other_s, shards, rows)
     laps.append(time.perf_counter())
     seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
-    return Outcome(dataset, survey, effects, choice, changed, error, seconds)
+    return Outcome(data, facts, rows, survey, campaign.decided, decision, error, seconds)
 
 
 def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:
@@ -91,12 +96,13 @@ def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards:
     if stored is not None:
         return Decision.from_dict(stored)
     begin = time.perf_counter()
-    decision = deciding.Decider(campaign, settings, survey).decide()
-    assert decision.rows is not None and decision.paths is not None
-    arrays = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
+    decider = deciding.Decider(campaign, settings, survey)
+    decision = decider.decide()
+    paths = decider.paths.keep_effects(decision.effects)
+    arrays = shard_arrays(paths, campaign, survey.engine.wavelength)
     seconds = np.array(time.perf_counter() - begin)
-    shards.write(0, {**arrays, ROWS: decision.rows, SECONDS: seconds})
-    shards.write_note(decision.to_dict())
+    shards.write(0, {**arrays, ROWS: decider.rows, SECONDS: seconds})
+    shards.write_note(asdict(decision))
     return decision
 
 
@@ -105,7 +111,6 @@ class _Tracing:
     """Traces and stores shards; where it is sent to, it builds the scene once, which cannot be pickled."""
 
     campaign: Campaign
-    effects: Effects
     shards: Shards
     survey: Survey | None
 
@@ -118,19 +123,19 @@ class _Tracing:
             return
         if self.survey is None:
             self.survey = build_survey(self.campaign.scene, self.campaign.sampling)
-        paths = self.survey.trace(rows, self.effects)
+        paths = self.survey.trace(rows, self.campaign.decided)
         arrays = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
         self.shards.write(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
 
 
-def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Shards) -> None:
+def _trace_all(campaign: Campaign, survey: Survey, shards: Shards) -> None:
     """Trace what is missing."""
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
     if len(missing) < len(parts):
         log.info("%d of %d shards already done", len(parts) - len(missing), len(parts))
-    work = _Tracing(campaign, effects, shards, survey)
+    work = _Tracing(campaign, shards, survey)
     for _ in run_each(work, missing, "shards", cost=lambda shard: len(shard[1])):
         pass
 

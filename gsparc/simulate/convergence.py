@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from gsparc.simulate.effects import Effects
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey
@@ -40,16 +39,12 @@ class Convergence:
 
 
 def measure_convergence(
-    campaign: Campaign,
-    survey: Survey,
-    effects: Effects,
-    traced: Mapping[str, np.ndarray],
-    left_out: np.ndarray,
+    campaign: Campaign, survey: Survey, traced: Mapping[str, np.ndarray], left_out: np.ndarray
 ) -> Convergence | None:
     """Compare rows of a file with a second seed's; None where none is asked for, or without rays.
 
     Args:
-        campaign, survey, effects: of the file.
+        campaign, survey: of the file.
         traced: its arrays, a row for each of the survey's.
         left_out: (n,) rows that were traced otherwise.
     """
@@ -59,7 +54,7 @@ def measure_convergence(
     # So many that enough remain when those traced otherwise are taken out.
     rows = survey.choose_distant_rows(count + len(left_out), campaign.scene.seed + 1)
     rows = np.sort(rows[~np.isin(rows, left_out)][:count])
-    again = survey.trace(rows, effects, campaign.sampling.seed + 1)
+    again = survey.trace(rows, campaign.decided, campaign.sampling.seed + 1)
     csi, spectrum, power = (traced[name][rows] for name in ("csi", "spectrum", "received_power"))
     frequency, wavelength = campaign.scene.frequency_hz, survey.engine.wavelength
     other = again.responses(frequency, campaign.csi.elements(wavelength), wavelength)

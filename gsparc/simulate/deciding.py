@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,7 @@ COMPILING = 100
 TRIAL = 2  # how much more fewer rays are to save than their trial costs, because it may fail
 
 
-@dataclass(frozen=True)
-class Changed:
+class Changed(NamedTuple):
     """Errors at held-back receivers from leaving out what the requirement does not need.
 
     Attributes:
@@ -50,30 +49,19 @@ class Decision:
             for compiling the solver for other effects.
         samples: with how many rays of a call; None for those of the settings.
         changed: errors at held-back receivers; None where there are none.
-        rows: (n,) of the survey, those that were traced.
-        paths: of these rows, with `effects`; None in a resumed run, which has them in a shard.
     """
 
     choice: Choice
     effects: Effects
     samples: int | None = None
     changed: Changed | None = None
-    rows: np.ndarray | None = None
-    paths: Paths | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what a resumed run reads; without paths, which are in a shard."""
-        changed = None if self.changed is None else [v.tolist() for v in vars(self.changed).values()]
-        about = {"choice": asdict(self.choice), "effects": asdict(self.effects)}
-        return {**about, "samples": self.samples, "changed": changed}
 
     @staticmethod
     def from_dict(note: Mapping[str, Any]) -> Decision:
-        """Invert `to_dict`."""
-        rows, errors = note["changed"] or ([], [])
-        changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
+        """Invert `dataclasses.asdict`, with arrays as lists."""
+        changed = Changed(*map(np.array, note["changed"])) if note["changed"] else None
         effects = Effects(**note["effects"])
-        return Decision(Choice.from_dict(note["choice"]), effects, note.get("samples"), changed)
+        return Decision(Choice.from_dict(note["choice"]), effects, note["samples"], changed)
 
 
 class Decider:
@@ -112,7 +100,7 @@ class Decider:
         if self.survey.engine.random and 0 < saved <= COMPILING:
             log.info("auto: everything is simulated: for %d receivers, compiling costs more", self.left)
             effects, samples = self.full, None
-        return Decision(choice, effects, samples, changed, self.rows, self.paths.keep_effects(effects))
+        return Decision(choice, effects, samples, changed)
 
     def _groups(self) -> tuple[np.ndarray, np.ndarray]:
         """Probes and held-back rows, both spread out."""

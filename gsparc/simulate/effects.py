@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import from_settings
+from gsparc.data.limits import Checked, setting, whole
 
 # Bits of one interaction; the first four are Sionna's, an edge is a wedge with one face.
 SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION, EDGE = 1, 2, 4, 8, 16
@@ -24,7 +25,7 @@ MECHANISMS = ("line_of_sight", *BITS)
 
 
 @dataclass(frozen=True)
-class Effects:
+class Effects(Checked):
     """What is simulated; off means not computed.
 
     Attributes:
@@ -45,13 +46,12 @@ class Effects:
     diffraction: bool = True
     edge_diffraction: bool = True
     diffuse: bool = True
-    depth: int = 3
+    depth: int = setting(3, whole(0, 8))
     polarisation: bool = True
     noise_snr_db: float | None = None
 
     def __post_init__(self) -> None:
-        if not 0 <= self.depth <= 8:
-            raise ValueError(f"effects.depth={self.depth}: expected 0 to 8 interactions")
+        super().__post_init__()
         if self.diffuse and not self.specular:
             raise ValueError(
                 "effects.diffuse needs effects.specular (the solver loses diffuse power without)"

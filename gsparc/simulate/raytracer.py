@@ -19,12 +19,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
 from gsparc.simulate.paths import Paths, join_receivers
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
-from gsparc.simulate.scenes.solid import Solid
+from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
 from gsparc.simulate.survey import Engine
 
@@ -35,12 +36,10 @@ CANDIDATES_PER_RECEIVER = 20_000
 HASHES = 64_000_000
 GROUND_LEVEL = 0.7  # least share of the ground's area that is level
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
-MATERIALS = {  # thickness [m] and scattering coefficient, where a scene gives none
-    "concrete": (0.20, 0.20), "brick": (0.12, 0.25), "plasterboard": (0.025, 0.10), "wood": (0.03, 0.15),
-    "glass": (0.008, 0.05), "ceiling_board": (0.015, 0.20), "chipboard": (0.018, 0.15),
-    "plywood": (0.012, 0.15),
-    "floorboard": (0.02, 0.15), "metal": (0.002, 0.05), "marble": (0.10, 0.15),
-}  # fmt: skip
+# Thickness [m] and scattering coefficient, where a scene gives none.
+MATERIALS = {
+    row["material"]: (float(row["thickness_m"]), float(row["scattering"])) for row in LISTED_MATERIALS
+}
 OTHERS = (0.10, 0.20)
 
 
@@ -426,9 +425,7 @@ def _load_file(source: str | Path) -> Any:
         except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
             first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
             raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
-    known = list_shipped_scenes()
-    if source not in known:
-        raise ValueError(f"scene.builtin={source}: Sionna has no such scene; there are {', '.join(known)}")
+    choice(*list_shipped_scenes()).check("scene.builtin", source)
     return rt.load_scene(getattr(rt.scene, str(source)))
 
 

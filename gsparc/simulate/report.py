@@ -48,14 +48,13 @@ def describe_choice(choice: Choice) -> str:
 
 def summary_facts(outcome: Outcome) -> dict[str, Any]:
     """Return flat facts."""
-    dataset = outcome.dataset
     facts: dict[str, Any] = {
-        "dataset/name": dataset.data.site.name,
-        "dataset/sha256": dataset.data.site.sha256,
+        "dataset/name": outcome.data.site.name,
+        "dataset/sha256": outcome.data.site.sha256,
         "dataset/receivers": len(outcome.survey.places),
         "dataset/rows": len(outcome.survey),
         "effects": str(outcome.effects),
-        **{f"scene/{name}": value for name, value in dataset.facts.items()},
+        **{f"scene/{name}": value for name, value in outcome.facts.items()},
         **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
         # A resumed run that found all shards has traced nothing, in no time.
         "time/receivers_per_s": len(outcome.survey) / max(outcome.seconds["trace"], 1e-9),
@@ -63,8 +62,8 @@ def summary_facts(outcome: Outcome) -> dict[str, Any]:
     if outcome.convergence is not None:
         facts["dataset/convergence_error"] = outcome.convergence.nmse
         facts |= {f"dataset/{k}": v for k, v in outcome.convergence.attributes().items()}
-    choice = outcome.choice
-    if choice is not None:
+    if outcome.decision is not None:
+        choice = outcome.decision.choice
         facts |= {f"auto/{k}": getattr(choice, k) for k in STATED}
         for row in choice.table:
             name = row.effect.replace(" > ", "_over_")
@@ -81,7 +80,7 @@ def closing_sentences(outcome: Outcome, seconds: float, load: float) -> list[str
     lines = [
         f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "
         + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),
-        f"{outcome.dataset.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
+        f"{outcome.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
     ]
     if outcome.convergence is not None:
         error = outcome.convergence

@@ -20,6 +20,7 @@ from gsparc.data.datamodule import DataModule
 from gsparc.data.datasets.campaign import load_stand_in, make_once, write_split
 from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.data.files import whole_folder
+from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering_matrix
@@ -88,7 +89,7 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
 
 
 @dataclass(frozen=True)
-class RFIDStandIn:
+class RFIDStandIn(Checked):
     """What `dataset=rfid` falls back on; a `gsparc.data.datasets.campaign.StandIn`.
 
     Attributes:
@@ -97,17 +98,14 @@ class RFIDStandIn:
         root: folder that holds stand-ins.
     """
 
-    count: int = 640
-    seed: int = 0
+    count: int = setting(640, whole(2))
+    seed: int = setting(0, whole(0))
     root: str | Path = "outputs/stand-ins"
 
     def folder(self) -> Path:
         """See `StandIn.folder`."""
-        count, seed = int(self.count), int(self.seed)
-        if count < 2:
-            raise ValueError(f"dataset.count={count}: expected at least 2 tag positions")
-        where = Path(self.root) / f"{STAND_IN}-{count}-{seed}"
-        return make_once(where, lambda folder: write_rfid_sim(folder, count, seed))
+        where = Path(self.root) / f"{STAND_IN}-{self.count}-{self.seed}"
+        return make_once(where, lambda folder: write_rfid_sim(folder, self.count, self.seed))
 
 
 class RFIDSim(DataModule):

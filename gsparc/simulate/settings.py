@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from gsparc.data.limits import Checked, choice, setting, whole
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
@@ -14,12 +15,12 @@ from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 
 @dataclass(frozen=True)
-class Campaign:
+class Campaign(Checked):
     """One dataset.
 
     Attributes:
         scene: where.
-        effects: what is simulated, or how `auto` decides.
+        effects: what is simulated; until that is decided, how `auto` does.
         sampling: how hard the ray tracer works.
         spectrum, csi: what is stored.
         shard: receivers per shard.
@@ -32,9 +33,15 @@ class Campaign:
     sampling: Sampling = field(default_factory=Sampling)
     spectrum: SpectrumSettings = field(default_factory=SpectrumSettings)
     csi: ArraySettings = field(default_factory=ArraySettings)
-    shard: int = 400
-    check: int = 128
-    measurement: str = "spectrum"
+    shard: int = setting(400, whole(1))
+    check: int = setting(128, whole(0))
+    measurement: str = setting("spectrum", choice("spectrum", "csi"))
+
+    @property
+    def decided(self) -> Effects:
+        """What is simulated, once `auto` has decided where it is to."""
+        assert isinstance(self.effects, Effects)
+        return self.effects
 
     def inputs(self) -> dict[str, str]:
         """Return the SHA-256 of the files that a scene and its receivers are read from."""
@@ -45,9 +52,3 @@ class Campaign:
             for file in files
             if file is not None and Path(file).is_file()
         }
-
-    def __post_init__(self) -> None:
-        if self.measurement not in ("spectrum", "csi"):
-            raise ValueError(f"measurement={self.measurement}: expected spectrum or csi")
-        if self.shard < 1 or self.check < 0:
-            raise ValueError("shard is at least 1, check at least 0")

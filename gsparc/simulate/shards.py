@@ -48,7 +48,7 @@ class Shards:
 
     def write_note(self, content: Mapping[str, Any]) -> None:
         """Store a decision, so that a resumed run does not decide again."""
-        write_whole(self.folder / NOTE, json.dumps(content, indent=1))
+        write_whole(self.folder / NOTE, json.dumps(content, indent=1, default=np.ndarray.tolist))
 
     def read_note(self) -> dict[str, Any] | None:
         """Return the stored decision, or None."""

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 
+from gsparc.data.limits import POSITIVE, Checked, setting, whole
 from gsparc.ops import SphereGrid
 from gsparc.simulate.paths import Paths
 
@@ -19,7 +20,7 @@ BLOCK = 64  # receivers at once
 
 
 @dataclass(frozen=True)
-class ArraySettings:
+class ArraySettings(Checked):
     """A planar array in the receiver's xy plane.
 
     Attributes:
@@ -27,9 +28,9 @@ class ArraySettings:
         spacing: in carrier wavelengths.
     """
 
-    rows: int = 1
-    columns: int = 1
-    spacing: float = 0.5
+    rows: int = setting(1, whole(1))
+    columns: int = setting(1, whole(1))
+    spacing: float = setting(0.5, POSITIVE)
 
     def elements(self, wavelength: float) -> np.ndarray:
         """Return positions (M, 3) [m] of the elements about their middle.
@@ -49,16 +50,10 @@ class SpectrumSettings(ArraySettings):
         height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width of azimuth.
     """
 
-    rows: int = 8
-    columns: int = 8
-    height: int = 90
-    width: int = 360
-
-    def __post_init__(self) -> None:
-        if min(self.rows, self.columns, self.height, self.width) < 1:
-            raise ValueError("spectrum: rows, columns, height and width are at least 1")
-        if not self.spacing > 0:
-            raise ValueError("spectrum: spacing is positive")
+    rows: int = setting(8, whole(1))
+    columns: int = setting(8, whole(1))
+    height: int = setting(90, whole(1))
+    width: int = setting(360, whole(1))
 
     @property
     def grid(self) -> SphereGrid:

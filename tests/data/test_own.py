@@ -33,6 +33,11 @@ def test_round_trip(tmp_path, csi_arrays, suffix):
     assert np.array_equal(read.subset(np.arange(3)).position_std, arrays["position_std"][:3])
 
 
+def test_an_array_called_place_was_ignored_and_yet_decided_the_split(csi_arrays):
+    plain, more = (from_arrays({**csi_arrays, **own}) for own in ({}, {"place": np.zeros(12)}))
+    assert more.place is None and more.site.sha256 == plain.site.sha256
+
+
 def test_a_subset_of_rows_without_names_was_an_index_error(csi_arrays):
     read = replace(from_arrays(csi_arrays), row_names=[])
     assert len(read.subset(np.arange(3))) == 3

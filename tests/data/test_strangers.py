@@ -220,7 +220,7 @@ def test_amplitudes_and_phases_are_channels(write, unit):
     columns = np.stack([np.abs(arrays["csi"]), phase], axis=2).reshape(30, 8)
     text = table(",".join(["x,y,z", *heads]), *arrays["rx_position"].T, *columns.T)
     where = {"tx_x": 4, "tx_y": 2, "tx_z": 2, "frequency_hz": "2.4e9:2.403e9"}
-    data = read_any(write(text), where).data
+    data = read_any(write(text), columns=where).data
     np.testing.assert_allclose(data.target[:, 0] * data.site.target_scale, arrays["csi"], atol=1e-5)
 
 

@@ -1,11 +1,11 @@
 """Who is beaten, in words and drawn."""
 
-import numpy as np
+import pandas as pd
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gsparc.evaluation.experiment.tradeoff import find_better
-from gsparc.prediction.pareto import Point, describe_point, pareto_front
+from gsparc.prediction.pareto import describe_point, pareto_front
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 
@@ -34,12 +34,9 @@ def test_settings_are_said_in_words():
     )
 
 
-def other(psnr_db: float, ms: float) -> Point:
-    return Point("a baseline", {}, 1, {"psnr_db": psnr_db}, np.nan, np.full(3, ms))
-
-
 def test_a_point_that_another_method_beats_is_said():
-    point = Point("p", {}, 1, {"psnr_db": 20.0}, 0.0, np.full(3, 1.0))
-    others = {"nearest": other(26.0, 0.5), "gp": other(29.0, 2.0), "mean": other(15.0, 0.1)}
-    assert find_better(point, others, "psnr_db") == "nearest"
-    assert find_better(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None
+    others = pd.DataFrame(
+        {"label": ["nearest", "gp", "mean"], "render_ms_p50": [0.5, 2.0, 0.1], "score": [26.0, 29, 15]}
+    )
+    point = {"render_ms_p50": 1.0, "score": 20.0}
+    assert find_better(point, others) == "nearest" and find_better(point, others[1:]) is None

@@ -81,7 +81,7 @@ def test_words_become_a_deliverable(text, kind, tolerance):
     {"deliverable": "csi -20 dB please"}, {"rays": 0}, {"rays": 2}, {"confidence": 1.0}, {"probes": 3},
 ])  # fmt: skip
 def test_bad_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match=r"effects\." + next(iter(wrong))):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
         AutoSettings(**wrong)
 
 
@@ -176,4 +176,4 @@ def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
 
 def test_decision_survives_its_file():
     decision = Decision(decided("coverage +-1 dB"), FULL, 300)
-    assert Decision.from_dict(json.loads(json.dumps(decision.to_dict()))) == decision
+    assert Decision.from_dict(json.loads(json.dumps(dataclasses.asdict(decision)))) == decision

@@ -97,7 +97,7 @@ def test_file_equals_the_exact_room_and_its_paths_make_the_channel(tmp_path):
     assert json.loads(about["effects_json"])["depth"] == 3
     assert load_own(tmp_path / "box.h5").site.kind == "spectrum"
     assert check([str(tmp_path / "box.h5")]) == 0
-    assert outcome.convergence is None and outcome.dataset.facts["paths_per_receiver"] > 5
+    assert outcome.convergence is None and outcome.facts["paths_per_receiver"] > 5
     assert 0 < about["simulate_s"] <= sum(outcome.seconds.values())
     paths = stored["path_offsets"]
     assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
@@ -124,14 +124,15 @@ def test_file_is_read_as_powers(tmp_path):
     """Sums of path powers; where no path arrives, a power is below the weakest that was heard."""
     blocked = replace(SCENE, room={**SCENE.room, "boxes_m": [[[2.6, 0, 0], [3.0, 4.0, 3]]]})
     direct = replace(MIRROR, specular=False, depth=0)
-    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").dataset
+    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").rows.arrays
     data = read(tmp_path / "box.h5", "rssi")
-    heard = made.power > 0
+    power = made["received_power"]
+    heard = power > 0
     assert data.site.kind == "rssi" and 0 < heard.sum() < 60 and data.site.convergence_error is None
     np.testing.assert_array_equal(data.censored, ~heard)
     powers = data.target[:, 0] * data.site.target_scale
-    np.testing.assert_allclose(powers[heard], made.power[heard], rtol=1e-4)
-    np.testing.assert_allclose(powers[~heard], made.power[heard].min(), rtol=1e-4)
+    np.testing.assert_allclose(powers[heard], power[heard], rtol=1e-4)
+    np.testing.assert_allclose(powers[~heard], power[heard].min(), rtol=1e-4)
 
 
 def test_outlier_does_not_set_the_sensitivity():
@@ -257,7 +258,7 @@ def test_existing_file_is_not_overwritten(tmp_path):
 
 def test_auto_decides_verifies_and_is_drawn(tmp_path):
     outcome = simulate(plan(effects=FEW_PROBES), tmp_path / "box.h5")
-    choice = outcome.choice
+    choice = outcome.decision.choice
     assert choice is not None and choice.verdict is not None and choice.verdict.kept
     assert set(outcome.effects.enabled) == {"line_of_sight", "specular"} and 1 <= outcome.effects.depth < 4
     stored = json.loads(arrays(tmp_path / "box.h5")[1]["auto"])
@@ -316,8 +317,9 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     asked, many = with_rays(monkeypatch, 1.05), replace(SCENE, num_receivers=200)
     whole = simulate(plan(scene=many, effects=replace(asked, rays=1.0)), tmp_path / "whole.h5")
     outcome = simulate(plan(scene=many, effects=asked), tmp_path / "fewer.h5")
-    assert whole.choice.samples is None and outcome.choice.samples == 90_000
-    assert outcome.choice.verdict.kept and outcome.choice.verdict.error == pytest.approx(0.42, abs=0.01)
+    choice = outcome.decision.choice
+    assert whole.decision.choice.samples is None and choice.samples == 90_000
+    assert choice.verdict.kept and choice.verdict.error == pytest.approx(0.42, abs=0.01)
     (all_, _), (fewer, about) = (arrays(tmp_path / f"{name}.h5") for name in ("whole", "fewer"))
     assert json.loads(about["sampling"])["samples"] == json.loads(about["auto"])["samples"] == 90_000
     ratio = fewer["received_power"] / all_["received_power"]
@@ -326,16 +328,14 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     np.testing.assert_allclose(ratio[~decided_on], 1.05**2, rtol=1e-4)
     assert outcome.convergence.nmse == pytest.approx(1e-4, rel=0.01)
     assert outcome.convergence.power_db == pytest.approx(20 * np.log10(1.01), rel=0.01)
-    assert (
-        "90,000 rays" in describe_choice(outcome.choice) and summary_facts(outcome)["auto/samples"] == 90_000
-    )
+    assert "90,000 rays" in describe_choice(choice) and summary_facts(outcome)["auto/samples"] == 90_000
 
 
 def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
     asked, many = with_rays(monkeypatch, 1.2), replace(SCENE, num_receivers=200)
     outcome = simulate(plan(scene=many, effects=asked), tmp_path / "box.h5")
-    row = outcome.choice.table[-1]
-    assert outcome.choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
+    choice, row = outcome.decision.choice, outcome.decision.choice.table[-1]
+    assert choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
     assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
 
 
@@ -350,8 +350,8 @@ def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     monkeypatch.setattr(deciding.auto, "verify_choice", refuted)
     settings = replace(FEW_PROBES, full=full)
     outcome = simulate(plan(effects=settings), tmp_path / "box.h5")
-    assert outcome.effects == outcome.choice.effects == full
-    assert "NOT MET by less (line of sight, specular, depth" in describe_choice(outcome.choice)
+    assert outcome.effects == outcome.decision.choice.effects == full
+    assert "NOT MET by less (line of sight, specular, depth" in describe_choice(outcome.decision.choice)
 
 
 def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
@@ -359,9 +359,9 @@ def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
     monkeypatch.setattr("gsparc.simulate.scenes.build.ShoeboxEngine", Rays)
     monkeypatch.setattr(deciding, "COMPILING", 10)
     few = simulate(plan(effects=FEW_PROBES), tmp_path / "few.h5")
-    assert few.effects.depth == 4 and few.choice.effects.depth < 4
+    assert few.effects.depth == 4 and few.decision.choice.effects.depth < 4
     many = simulate(plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=120)), tmp_path / "many.h5")
-    assert many.effects == many.choice.effects
+    assert many.effects == many.decision.choice.effects
 
 
 def test_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path):
@@ -392,9 +392,7 @@ def put_together(out: Path, receivers: int) -> int:
     gc.set_threshold(700, 10, 10)  # Python's own: what is looked for seldom stays longer
     tracemalloc.start()
     try:
-        assemble_dataset(
-            asked, survey, asked.effects, None, None, 0.0, shards, join_shards(shards, receivers)
-        )
+        assemble_dataset(asked, survey, None, None, 0.0, shards, join_shards(shards, receivers))
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -413,15 +411,15 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("changes, words", [
-    ({"builder": "x"}, "exactly one of"),
+    ({"builder": "conference_room"}, "exactly one of"),
     ({"num_receivers": 3}, "at least 20"),
     ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
     ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
     ({"transmitter_m": (9.0, 1.0)}, "three finite numbers"),
     ({"transmitters": [{"position_m": [1, 1, 1]}]}, "not both"),
-    ({"transmitter_m": None, "transmitters": []}, "empty list"),
+    ({"transmitter_m": None, "transmitters": []}, "one transmitter or more"),
     ({"transmitter_m": None, "transmitters": [{"position_m": [1, 1, 1], "sectors": 3}]}, "isotropic"),
-    ({"over": "sea"}, "expected one of zero"),
+    ({"over": "sea"}, "over='sea': one of zero"),
     ({"receivers": {"knd": "grid"}}, "no such setting"),
 ])  # fmt: skip
 def test_bad_scenes_are_refused(tmp_path, changes, words):

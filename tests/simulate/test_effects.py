@@ -36,7 +36,7 @@ def test_path_needs_all_its_mechanisms_and_depth():
 @pytest.mark.parametrize("config, words", [
     ({"specular": False}, "diffuse needs"),
     ({"diffraction": False}, "edge_diffraction needs"),
-    ({"depth": 9}, "0 to 8"),
+    ({"depth": 9}, "at most 8"),
     ({"speculr": True}, "speculr: no such effect"),
     (dict.fromkeys(("line_of_sight", "specular", "refraction", "diffraction", "edge_diffraction", "diffuse"),
                    False), "every mechanism is off"),

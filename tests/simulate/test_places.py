@@ -33,7 +33,10 @@ class Hut:
 
 
 def laid(georeference=None, streets=(), **settings):
-    return place_receivers(Layout(**settings), 30, AREA, (1.0, 2.0), 0, Hut(), streets, georeference)
+    asked = {"num_receivers": 30, "height_m": (1.0, 2.0), "seed": 0}
+    on_map = georeference is not None or len(streets)
+    town = SimpleNamespace(georeference=georeference, streets=streets) if on_map else None
+    return place_receivers(SimpleNamespace(layout=Layout(**settings), **asked), AREA, Hut(), town)
 
 
 def test_sectors_are_stations_at_equal_angles():
@@ -61,8 +64,8 @@ def test_a_third_coordinate_beside_degrees_was_ignored():
     ({"position_m": [0, 0, 1], "position_deg": [1, 2]}, "give position_m"),
     ({"position_m": [0, 0]}, "height_m"),
     ({"position_m": [0, float("nan"), 1]}, "finite"),
-    ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn: expected one of iso"),
-    ({"position_m": [0, 0, 1], "sectors": 0}, "1 to 12"),
+    ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn': one of iso"),
+    ({"position_m": [0, 0, 1], "sectors": 0}, "at most 12"),
     ({"position_deg": [95.0, 0.0], "height_m": 2}, "outside -90 to 90"),
     ({"name": "a", "position_m": [0, 0, 1]}, "'a' twice"),
 ])  # fmt: skip
@@ -111,9 +114,9 @@ def test_bad_times_are_refused(cell, words, tmp_path):
 
 
 @pytest.mark.parametrize("settings, words", [
-    ({"kind": "circle"}, "expected one of area"),
-    ({"inside": "maybe"}, "drop or refuse"),
-    ({"kind": "grid", "spacing_m": 0.0}, "positive"),
+    ({"kind": "circle"}, "circle': one of area"),
+    ({"inside": "maybe"}, "one of drop, refuse"),
+    ({"kind": "grid", "spacing_m": 0.0}, "spacing_m=0.0: a number above 0"),
     ({"kind": "grid", "spacing_m": 1e-4}, "places"),
     ({"kind": "streets"}, "no streets"),
     ({"kind": "file"}, "file is missing"),

@@ -210,7 +210,7 @@ def test_town_with_sectors_in_degrees(tmp_path):
     )  # fmt: skip
     plan = Campaign(town, PLAIN, sampling=QUICK, check=0, spectrum=SpectrumSettings(height=18, width=36))
     outcome = simulate(plan, tmp_path / "town.h5")
-    power, places = outcome.dataset.power.reshape(3, -1), outcome.survey.places
+    power, places = outcome.rows.arrays["received_power"].reshape(3, -1), outcome.survey.places
     east = (places[:, 0] > 30) & (np.abs(places[:, 1] - 11) < 5)  # on High Street, where the first looks
     assert east.sum() >= 3 and (power[0, east] > 3 * power[1:, east].max(0)).all()
     read = load({"name": "sionna", "file": str(tmp_path / "town.h5"), "target": "csi"})
@@ -239,7 +239,7 @@ def test_auto_in_the_conference_room(tmp_path):
     asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
     plan = Campaign(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
     outcome = simulate(plan, tmp_path / "room.h5")
-    assert outcome.choice is not None and outcome.choice.verdict is not None
+    assert outcome.decision is not None and outcome.decision.choice.verdict is not None
     assert outcome.effects.line_of_sight and outcome.effects.specular
     assert outcome.convergence is not None and 0 < outcome.convergence.nmse < 0.5
     with h5py.File(tmp_path / "room.h5") as file:

@@ -72,7 +72,7 @@ def test_both_polarisations_add_their_powers():
     assert high[0] == pytest.approx(2**0.5 * low[0], rel=1e-5)
 
 
-@pytest.mark.parametrize("settings, words", [({"rows": 0}, "at least 1"), ({"spacing": 0}, "positive")])
+@pytest.mark.parametrize("settings, words", [({"rows": 0}, "at least 1"), ({"spacing": 0}, "above 0")])
 def test_bad_settings_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         SpectrumSettings(**settings)

@@ -18,7 +18,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
 from gsparc.physics.row_factors import align_factors
 from gsparc.prediction.channels import interpolate_tones
-from gsparc.prediction.confidence import errors_and_scores, position_scores
+from gsparc.prediction.confidence import judge_answers
 from gsparc.prediction.risk import Evidence
 
 if TYPE_CHECKING:
@@ -99,8 +99,8 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
 
 def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Return evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
-    error, own = errors_and_scores(Prediction(band.predicted, band.variance, 1 - band.confidence), band.true)
-    return Evidence(rows, data.moving[rows], error, own | position_scores(data, fold, data.moving[rows]))
+    said = Prediction(band.predicted, band.variance, 1 - band.confidence)
+    return judge_answers(said, band.true, rows, data.moving[rows], data, fold)
 
 
 @lru_cache(maxsize=1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.limits import SettingError
+from gsparc.data.limits import SettingError, choice
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import neighbour_distance
@@ -106,8 +106,7 @@ def set_freedom(data: Measurements, align: str) -> Measurements:
     Raises:
         SettingError: no such freedom, or one of what are no channels.
     """
-    if align not in ("auto", *FREEDOMS):
-        raise SettingError(f"dataset.align={align}: is none of auto, {', '.join(FREEDOMS)}")
+    choice("auto", *FREEDOMS).check("dataset.align", align)
     if data.site.kind != "csi":
         if align not in ("auto", "none"):
             raise SettingError(f"dataset.align={align}: is for channels, these are {data.site.kind}")

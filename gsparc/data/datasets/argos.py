@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import centre_positions, rounded_rms
-from gsparc.data.datasets.campaign import Expected, Release, StandIn, check_layout, load_stand_in, read_split
+from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
 from gsparc.data.errors import DataError, Problems, readable
 from gsparc.data.files import read_yaml
-from gsparc.data.limits import finite_array
+from gsparc.data.limits import choice, finite_array, or_word, whole
+from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
@@ -48,11 +49,14 @@ def load_argos(
         DataError: anything is missing or wrong.
     """
     root, positions, align = Path(root), str(positions).lower(), bool(align)  # `true` in YAML is no text
+    choice("encoder", "true").check("dataset.positions", positions)
     expected = "`base_station:` with a list of antenna positions [m]"
     description = read_yaml(root / "base-station.yml", "the antennas' positions", expected)
     csi = _channels(root)
     places = _antennas(root, description, csi.shape[1])
-    chosen = _antenna_numbers(antenna, csi.shape[1])
+    count = csi.shape[1]
+    or_word(whole(0, count - 1), "all").check("dataset.antenna", antenna)
+    chosen = np.arange(count) if antenna == "all" else np.array([antenna])
     tones = np.array(description.get("tones", TONES), dtype=np.float64)
     spacing = float(description.get("spacing_hz", SPACING_HZ))
     carrier = float(description.get("carrier_hz", CARRIER_HZ))
@@ -132,22 +136,14 @@ def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndar
     return places
 
 
-def _antenna_numbers(antenna: int | str, count: int) -> np.ndarray:
-    if antenna == "all":
-        return np.arange(count)
-    if not isinstance(antenna, int) or isinstance(antenna, bool) or not 0 <= antenna < count:
-        raise DataError(f"dataset.antenna={antenna}: expected all, or a number from 0 to {count - 1}")
-    return np.array([antenna])
-
-
 def _places(root: Path, of: str, up: np.ndarray, split: TrainTest | None) -> np.ndarray:
     if of == "true":
         path = root / "positions.npy"
-        known = Raw({"rx_position": _loaded(path, "true positions exist in the stand-in only")})
-        layout = {"rx_position": Expected((len(up), 3), place=True)}
-        return check_layout(known, path, layout)["rx_position"].astype(np.float64)
-    if of != "encoder":
-        raise DataError(f"dataset.positions={of!r}: expected encoder or true")
+        stored = _loaded(path, "true positions exist in the stand-in only")
+        check = Checker(Raw({"rx_position": np.atleast_2d(stored)}), str(path))
+        places = check.read_positions("rx_position", len(up))
+        check.problems.raise_if_any()
+        return np.asarray(places)
     # The encoder sees training rows alone: uplinks of test rows must not shape its codes.
     rows = np.arange(len(up)) if split is None else split[0]
     return encode_positions(up, rows)

@@ -20,10 +20,6 @@ from gsparc.data.files import read_text
 from gsparc.data.raw import Raw
 
 CARRIER_HZ = 2.44e9  # the middle of the three frequencies that beacons use in turns
-NPZ = {
-    **{"mobile_position": "tx_position", "station_position": "station_position", "rssi_db": "rssi_db"},
-    **{"station": "station_name", "frequency_hz": "carrier_hz"},
-}
 
 
 def read_ble(path: str | Path, hall: int = 1) -> Raw:
@@ -40,7 +36,8 @@ def read_ble(path: str | Path, hall: int = 1) -> Raw:
     Raises:
         DataError: no such file, or an array is missing, or a line is none of the release.
     """
-    return _of_release(Path(path), hall) if Path(path).is_dir() else read_converted(path, NPZ, layout="ble")
+    folder = Path(path).is_dir()
+    return _of_release(Path(path), hall) if folder else read_converted(path, "ble npz", layout="ble")
 
 
 def _of_release(root: Path, hall: int) -> Raw:

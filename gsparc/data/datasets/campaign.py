@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -16,14 +16,14 @@ from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanit
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems, Severe
-from gsparc.data.files import read_text
+from gsparc.data.files import read_shipped_table, read_text
 from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.data.raw import Raw, numbered_rows, read_raw, rename_arrays
-from gsparc.data.schema import KIND_WORDS, REAL, Measurements, TrainTest
-from gsparc.data.selection import Selection
+from gsparc.data.schema import Field, Measurements, TrainTest
+from gsparc.data.selection import Selection, take_selection
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +57,7 @@ class Campaign(DataModule):
         if not isinstance(file, str | Path):
             raise SettingError(f"dataset.file={[*map(str, file)]}: expected one file; join tables first")
         self.file = Path(file)
-        part = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
-        self.settings, self.selection = settings, Selection(**part)
+        self.settings, self.selection = settings, Selection(**take_selection(settings))
 
     def raw(self) -> Raw:
         """Read the file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
@@ -218,58 +217,53 @@ def _read_index(path: Path, count: int | None, problems: Problems, first: int) -
 LONGEST = 18  # digits of an index
 
 
-@dataclass(frozen=True)
-class Expected:
-    """One array of a layout.
-
-    Attributes:
-        shape: per axis a size, or a letter that stands for the same size in all arrays.
-        kinds: allowed kinds of NumPy's dtypes, a key of `KIND_WORDS`.
-        place: whether rows are coordinates [m], all of which must be finite and on Earth.
-        optional: whether the array may be absent.
-    """
-
-    shape: tuple[str | int, ...]
-    kinds: str = REAL
-    place: bool = False
-    optional: bool = False
+def read_layout(layout: str) -> list[Field]:
+    """Return the arrays of a layout of layouts.csv."""
+    rows = read_shipped_table(__package__, "layouts.csv")
+    return [Field(**row) for row in rows if row.pop("layout") == layout]
 
 
-def check_layout(raw: Raw, source: str | Path, layout: Mapping[str, Expected]) -> dict[str, np.ndarray]:
-    """Return arrays of `layout`; the first array with a letter sets its size.
+def check_layout(
+    raw: Raw, source: str | Path, layout: str, places: Sequence[str] = ()
+) -> dict[str, np.ndarray]:
+    """Return arrays of a layout; the first array with a letter sets its size.
+
+    Args:
+        raw, source: the arrays, and their file.
+        layout: see `read_layout`.
+        places: arrays of coordinates [m], all of which must be finite and on Earth.
 
     Raises:
         DataError: all that is missing, of another shape or type, or no place, with array and row.
     """
-    check = Checker(raw, str(source))
-    for name, of in layout.items():
-        array = check.read_array(name, of.shape, kinds=of.kinds)
+    check, fields = Checker(raw, str(source)), {field.name: field for field in read_layout(layout)}
+    for name, field in fields.items():
+        array = check.read_array(name, *field.shapes, holds=field.holds)
         if array is not None:
-            letters = zip(of.shape, array.shape, strict=True)
+            shape = next(shape for shape in field.shapes if len(shape) == array.ndim)
+            letters = zip(shape, array.shape, strict=True)
             check.sizes |= {letter: size for letter, size in letters if isinstance(letter, str)}
-            if of.place:
-                check_positions(
-                    check.problems, check.describe_array(name), array, [*numbered_rows(len(array))]
-                )
-        elif name not in raw.arrays and not of.optional:
-            shape = str(of.shape).replace("'", "")
-            check.refuse(name, f"missing; expected {KIND_WORDS[of.kinds]} {shape}")
+            if name in places:
+                rows = [*numbered_rows(len(array))]
+                check_positions(check.problems, check.describe_array(name), array, rows)
+        elif name not in raw.arrays and field.required == "yes":
+            check.refuse(name, f"missing; expected {field.holds} {field.shape}")
     check.problems.raise_if_any()
-    return {name: raw.arrays[name] for name in layout if name in raw.arrays}
+    return {name: raw.arrays[name] for name in fields if name in raw.arrays}
 
 
-def read_converted(path: str | Path, fields: Mapping[str, str], **about: str) -> Raw:
+def read_converted(path: str | Path, of: str, **about: str) -> Raw:
     """Read arrays of an npz that was made of a release, by field of the schema.
 
     Args:
         path: of the file.
-        fields: of the schema, by names in the file.
+        of: the layout in layouts.csv, with names of the schema.
         **about: attributes.
 
     Raises:
         DataError: no such file, or some of the arrays are not in it.
     """
-    raw = read_raw(path)
+    raw, fields = read_raw(path), {field.name: field.becomes for field in read_layout(of)}
     missing = [f"{path}, {name}: missing" for name in fields if name not in raw.arrays]
     if missing:
         raise DataError(missing, path)

@@ -13,10 +13,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Expected, check_layout
-from gsparc.data.errors import DataError, list_first, readable, suggest_name
+from gsparc.data.datasets.campaign import check_layout
+from gsparc.data.errors import DataError, list_first, readable
+from gsparc.data.limits import choice
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.schema import FLAGS, LABELS
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables import is_table
 
@@ -26,14 +26,6 @@ LOUDEST, FAINTEST = 20.0, -160.0  # levels of no receiver lie beyond [dBm]
 STOREY_M = 3.7  # between floors of a table, which has no heights
 NUMBERS = {"floor": "floor", "building": "building", "walk": "walk", "month": "campaign", "round": "campaign"}
 COLUMNS = {"FLOOR": "floor", "BUILDINGID": "building", "TIMESTAMP": "time_s"}
-LAYOUT = {
-    "rss_dbm": Expected(("S", "P")),
-    "position": Expected(("S", "D"), place=True),
-    "access_point": Expected(("P",), LABELS, optional=True),
-    "test": Expected(("S",), FLAGS, optional=True),
-    "time_s": Expected(("S",), optional=True),
-}
-UNPLACED = LAYOUT | {"position": Expected(("S", "D"))}  # NaN where nobody knows
 
 
 @dataclass(frozen=True)
@@ -88,7 +80,7 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
     raw = _of_table(path, placed) if is_table(path) else read_raw(path)
     if not placed:
         raw.arrays.setdefault("position", np.full((len(raw.arrays.get("rss_dbm", ())), 3), np.nan))
-    checked = check_layout(raw, path, LAYOUT if placed else UNPLACED)
+    checked = check_layout(raw, path, "fingerprints", places=["position"] * placed)
     level, position = checked["rss_dbm"].astype(np.float32), checked["position"].astype(np.float64)
     count, dimensions = position.shape
     if dimensions not in (2, 3):
@@ -101,11 +93,8 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         what = f"{level[row, column]:g} in row {row}, column {column}; NaN stands for not heard"
         raise DataError(f"{path}, rss_dbm: expected {FAINTEST:g} to {LOUDEST:g} dBm, found {what}")
     numbers = {field: np.zeros(count, np.int64) for field in NUMBERS.values()}
-    for name in NUMBERS.keys() & raw.arrays:
-        array = raw.arrays[name]
-        if array.dtype.kind not in "iu" or array.shape not in ((), (count,)):
-            raise DataError(f"{path}, {name}: expected {count} whole numbers, found {array.dtype}")
-        numbers[NUMBERS[name]] = np.broadcast_to(array, count).astype(np.int64)
+    for name in NUMBERS.keys() & checked:
+        numbers[NUMBERS[name]] = np.broadcast_to(checked[name], count).astype(np.int64)
     names = checked.get("access_point", np.arange(level.shape[1])).astype(str)
     if len(np.unique(names)) < len(names):
         raise DataError(
@@ -155,9 +144,7 @@ def split_fingerprints(
     Raises:
         DataError: there is no such split, or one part of it is empty.
     """
-    if how not in get_args(How):
-        hint = suggest_name(str(how), get_args(How))
-        raise DataError(f"split: {how!r} is none of {', '.join(get_args(How))}{hint}")
+    choice(*get_args(How)).check("split", how)
     if how in ("released", "later"):
         test = rows.test if how == "released" else rows.campaign > rows.campaign.min()
         if test.all() or not test.any():

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.selection import Selection
+from gsparc.data.selection import Selection, take_selection
 from gsparc.data.tables import is_table
 
 
@@ -48,7 +48,7 @@ def read_own(
     raw = apply_settings(read_file_or_table(path, columns, stations_file), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
-        raise DataError(f"{path}: this is a file of dataset={campaign}; say dataset={campaign}")
+        raise DataError(f"{path}: this is a file of dataset={campaign.choice}; say dataset={campaign.choice}")
     return raw
 
 
@@ -98,47 +98,40 @@ class Own(Campaign):
 
 
 CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)
-LOADERS: dict[str, Callable[[Path], Raw]] = {kind.choice: kind.reader for kind in CAMPAIGNS}
 
 
-def dataset_by_arrays(raw: Raw) -> str | None:
-    """Return the choice of conf/dataset that reads a file with these arrays; None: of none of them."""
+def dataset_by_arrays(raw: Raw) -> type[Campaign] | None:
+    """Return the campaign that a file with these arrays is of; None: of none of them."""
     # By its arrays rather than its name: files are renamed, arrays are not.
-    return next((kind.choice for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
+    return next((kind for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
 
 
-def dataset_by_path(path: Path) -> str | None:
-    """Return the choice of conf/dataset that reads a release, file or folder; None where none does."""
-    folder = path.is_dir()
+def dataset_by_path(path: Path) -> type[Campaign] | None:
+    """Return the campaign that a release, file or folder, is of; None: of none of them."""
     for kind in CAMPAIGNS:
-        if path.suffix.lower() in kind.suffixes or (folder and kind.inside and any(path.glob(kind.inside))):
-            return kind.choice
+        inside = kind.inside and path.is_dir() and any(path.glob(kind.inside))
+        if inside or path.suffix.lower() in kind.suffixes:
+            return kind
     return None
 
 
-def read_any(
-    path: str | Path,
-    columns: Mapping[str, object] | None = None,
-    stations_file: str | Path | None = None,
-    **settings: Any,
-) -> Reading:
+def read_any(path: str | Path, **settings: Any) -> Reading:
     """Read a folder or file of a release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
-        columns, stations_file: of a table, see `read_own`.
-        **settings: see `apply_settings`, and of `Selection`.
+        **settings: of `read_own` and of `Selection`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
-    chosen = {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
-    part = from_settings(Selection, chosen, "dataset")
+    part = from_settings(Selection, take_selection(settings), "dataset")
+    table = {name: settings.pop(name, None) for name in ("columns", "stations_file")}
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
-        raw, said = LOADERS[release](path), f"this is the release of dataset={release}"
+        raw, said = release.reader(path), f"this is the release of dataset={release.choice}"
     elif path.is_dir():
         if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
             raise DataError(
@@ -147,9 +140,9 @@ def read_any(
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, said = read_file_or_table(path, columns, stations_file), ""
+        raw, said = read_file_or_table(path, **table), ""
         if (campaign := dataset_by_arrays(raw)) is not None:
-            raw, said = LOADERS[campaign](path), f"this is a file of dataset={campaign}"
+            raw, said = campaign.reader(path), f"this is a file of dataset={campaign.choice}"
     raw = replace(raw, notes=(*filter(None, [said]), *raw.notes))
     return interpret(apply_settings(raw, **settings), path, part)
 

@@ -21,8 +21,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, Problems, shorten
 from gsparc.data.files import read_text
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import finite_array, number
+from gsparc.data.limits import choice, finite_array, number
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.raw import Raw
 
@@ -32,11 +31,6 @@ NO_VALUE_DB = -101.0
 WALKER_M, STATION_M = 1.5, 10.0
 STATIONS = "location_coordinates.json"
 LATITUDE, LONGITUDE, TIME = "tx_x_coord", "tx_y_coord", "timestamp"
-NPZ = {
-    **{"mobile_position": "tx_position", "station_position": "station_position", "rssi_db": "rssi_db"},
-    **{"latitude": "latitude", "longitude": "longitude"},
-    **{"station": "station_name", "frequency_hz": "carrier_hz"},
-}
 
 
 def read_powder(
@@ -72,15 +66,15 @@ def read_powder(
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
     if sensitivity_db:
         names = raw.arrays["station_name"].tolist()
-        if wrong := sorted(sensitivity_db.keys() - {*names}):
-            raise DataError(f"dataset.sensitivity_db: no {wrong[0]}{suggest_or_list(wrong[0], names)}")
+        for name in sensitivity_db:
+            choice(*names).check("dataset.sensitivity_db", name)
         heights["sensitivity_db"] = np.array([sensitivity_db.get(name, np.nan) for name in names], float)
     about = {"name": "powder", **raw.attributes, "layout": "powder"}
     return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)
 
 
 def _of_npz(path: Path) -> Raw:
-    raw = read_converted(path, NPZ)
+    raw = read_converted(path, "powder npz")
     places, stations = raw.arrays.pop("tx_position"), raw.arrays.pop("station_position")
     degrees = np.stack([raw.arrays["latitude"], raw.arrays["longitude"]], axis=1)
     # Rows are known in degrees and in metres: over a campus an affine map is good to centimetres.

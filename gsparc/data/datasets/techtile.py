@@ -17,33 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.datasets.campaign import Campaign, Expected, check_layout, read_converted
+from gsparc.data.datasets.campaign import Campaign, check_layout, read_converted, read_layout
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
 from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
-from gsparc.data.schema import FLAGS, LABELS, TEXT
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received
 ANTENNAS = "techtile_antenna_locations.yml"
-NPZ = {
-    **{"tx_position": "tx_position", "rx_antenna_position": "station_position", "csi": "csi"},
-    **{"mask": "mask", "run": "run", "frequency_hz": "frequency_hz"},
-}
-RELEASE = {
-    "csi_real": Expected(("E", "C", "H")),
-    "csi_imag": Expected(("E", "C", "H")),
-    "rover_x": Expected(("E", "C")),
-    "rover_y": Expected(("E", "C")),
-    "rover_z": Expected(("E", "C")),
-    "experiment_id": Expected(("E",), LABELS),
-    "cycle_id": Expected(("C",), LABELS),
-    "hostname": Expected(("H",), TEXT),
-    "csi_available": Expected(("E", "C", "H"), FLAGS, optional=True),
-    "position_available": Expected(("E", "C"), FLAGS, optional=True),
-    "rx_antenna_position": Expected(("H", 3), place=True, optional=True),
-}
 
 
 def read_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
@@ -65,7 +47,7 @@ def read_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
     path = Path(path)
     if path.suffix.lower() in NETCDF_SUFFIXES:
         return _of_release(_with_experiments(read_raw(path), path), path, antennas)
-    return read_converted(path, NPZ, name="techtile", layout="techtile")
+    return read_converted(path, "techtile npz", name="techtile", layout="techtile")
 
 
 def _with_experiments(raw: Raw, path: Path) -> Raw:
@@ -73,15 +55,15 @@ def _with_experiments(raw: Raw, path: Path) -> Raw:
     if "csi_real" not in raw.arrays or raw.arrays["csi_real"].ndim != 2:
         return raw
     arrays = dict(raw.arrays)
-    for name, wanted in RELEASE.items():
-        if wanted.shape[0] == "E" and name in arrays and name != "experiment_id":
-            arrays[name] = arrays[name][None]
+    for field in read_layout("techtile"):
+        if field.shapes[0][0] == "E" and field.name in arrays and field.name != "experiment_id":
+            arrays[field.name] = arrays[field.name][None]
     arrays["experiment_id"] = np.atleast_1d(arrays.get("experiment_id", np.array(path.stem)))
     return Raw(arrays, raw.attributes, raw.units)
 
 
 def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
-    variables = check_layout(raw, path, RELEASE)
+    variables = check_layout(raw, path, "techtile", places=["rx_antenna_position"])
     hosts = variables["hostname"].astype(str)
     places = variables.get("rx_antenna_position")
     if places is None:

@@ -37,11 +37,6 @@ MOST_OFFSET_HZ, OFFSET_STEP_HZ = 40e3, 50.0  # 7 ppm between the oscillators of 
 LEAST_AGREEMENT = 0.6  # of neighbours: right pairs have .94 or more, others .36 or less
 GAP_M = 0.007  # an eighth of a wavelength without a packet: the root's sign is lost
 AVERAGED = 5  # packets of a row: within 3 mm
-NPZ = {
-    **{"rx_position": "rx_position", "tx_position": "station_position", "tx_index": "station"},
-    **{"segment": "run", "h2": "csi", "root_sign": "sign", "subcarrier_hz": "frequency_hz", "good": "good"},
-}
-
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -77,7 +72,7 @@ def read_wsr(
     path = Path(path)
     if path.is_dir():
         return _of_release(path, LOS_SET_A if transmitters is None else transmitters, spacing_m)
-    arrays = read_converted(path, NPZ).arrays
+    arrays = read_converted(path, "wsr npz").arrays
     arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("sign")
     good = arrays.pop("good")
     kept = {name: arrays[name][good] for name in ("rx_position", "station", "run", "csi")}

@@ -7,7 +7,6 @@ A file may hold one row per place and a column per station (wide), or one row pe
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -30,11 +29,10 @@ from gsparc.data.selection import Selection, select, take_rows
 STATION_FIELDS = (
     *("station", "station_position", "station_name", "station_label", "station_orientation", *SECTOR),
 )
-OF_ROWS = ("station", "place", "run")  # arrays that go into `Links`
 
 
 def expand_links(check: Checker, measured: str, part: Selection) -> Links | None:
-    """Replace `check.raw` by one row per link of the plain schema; None where something is wrong (noted).
+    """Replace `check.raw` by rows of links, stations, places and runs as numbers; None: something is wrong.
 
     Args:
         check: of the file; notes say what was left out.
@@ -54,13 +52,12 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
     if links is None:
         return None
     held = check.raw.arrays
-    of_rows: dict[str, Any] = {name: held.pop(name) for name in OF_ROWS if name in held}
     if links.stations is not None:
         # From here on rows have positions of their own, as in a file of one static end.
-        held[f"{links.static_end}_position"] = links.stations.position[of_rows["station"]]
+        held[f"{links.static_end}_position"] = links.stations.position[held["station"]]
         if links.stations.rotation is not None:
-            held["rx_rotation"] = links.stations.rotation[of_rows["station"]]
-    return replace(links, georeference=origin, **of_rows)
+            held["rx_rotation"] = links.stations.rotation[held["station"]]
+    return replace(links, georeference=origin)
 
 
 def _selected(check: Checker, measured: str, stations: Stations | None, part: Selection) -> Stations | None:

@@ -45,7 +45,7 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
     Args:
         check: of the file, whose `raw` is changed; takes notes, and what is wrong.
         measured: name of the measurement.
-        links: of its rows; returned with `censored`, None where something is wrong.
+        links: of its rows; None is returned where something is wrong.
         unlisted: rows that lists of the strongest leave out.
     """
     values, arrays, before = check.raw.arrays[measured], check.raw.arrays, len(check.problems)
@@ -103,7 +103,8 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
     if not side.any():
         return links
     arrays["mask"] = arrays.get("mask", np.ones(len(side), bool)).astype(bool) & (side == 0)
-    return replace(links, censored=side)
+    arrays["censored"] = side
+    return links
 
 
 def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarray | None:

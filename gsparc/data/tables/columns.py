@@ -247,7 +247,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None
     if times and head is not None:
         unit = _unit(head, role) or Unit("", KINDS[role])
-        unit = replace(unit, name=f"x {times[2]} {unit.name}".strip(), factor=unit.factor * float(times[2]))
+        unit = replace(unit, times=times[2], factor=unit.factor * float(times[2]))
         return (Column(role, unit=unit, head=head),)
     joined = [_head(sheet, part.strip()) for part in text.split("+")] if role == "station" else []
     if len(joined) > 1 and all(joined):
@@ -322,7 +322,7 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
     for kind in SCHEMA:
         # Kinds rather than quantities: a position in mm beside another axis without a unit mixes both.
         columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
-        turned = [c for c in columns if c.unit is not None and c.unit.changes and c.unit.name[:2] != "x "]
+        turned = [c for c in columns if c.unit is not None and c.unit.changes and not c.unit.times]
         silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
         if turned and silent and turned[0].unit is not None:
             other = silent[0].unit
@@ -367,15 +367,9 @@ def _note(columns: tuple[Column, ...]) -> str:
     return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
 
 
-def _factor_of(unit: Unit | None) -> tuple[str, str]:
-    """The factor that a setting gives, "" for none, and the unit of the head, "" for none."""
-    name = "" if unit is None else unit.name
-    return (name.split()[1], " ".join(name.split()[2:])) if name.startswith("x ") else ("", name)
-
-
 def _turned(column: Column, unit: Unit) -> str:
     """What becomes of a column that a setting chose; with a caution where its unit is counted twice."""
-    (factor, bare), wanted = _factor_of(unit), schema_unit(column)
+    factor, bare, wanted = unit.times, unit.name, schema_unit(column)
     if not factor:
         return f"column {column.head!r}: {bare} turned into {wanted}"
     then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
@@ -388,7 +382,7 @@ def _turned(column: Column, unit: Unit) -> str:
 
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
-    unit, bare = SCHEMA.get(KINDS[column.role], "deg"), _factor_of(column.unit)[1]
+    unit, bare = SCHEMA.get(KINDS[column.role], "deg"), "" if column.unit is None else column.unit.name
     if not bare and "rsrp" in heads.words_of(column.head or ""):
         return unit  # dBm by definition (3GPP TS 36.214)
     # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.

@@ -83,7 +83,7 @@ def parse_table(
     if power is not None and "rssi_db" in chosen:
         about["level_unit"] = schema_unit(power)
     # A column that is scaled has the schema's unit.
-    if power is not None and power.unit is not None and not power.unit.name.startswith("x "):
+    if power is not None and power.unit is not None and not power.unit.times:
         about["unit"] = power.unit.name
     return Raw(arrays, about, notes=(*notes, *guessed, *builder.notes))
 

@@ -25,7 +25,7 @@ from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.summary import read_summary, run_git
+from gsparc.evaluation.summary import read_summary
 from gsparc.models.fitting import LAST, dotted_settings
 
 log = logging.getLogger(__name__)
@@ -36,10 +36,8 @@ WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether,
 OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
-PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh")
-INSTALLED = (".py", ".so")  # of a package, kernels among it
-NO_PROGRAM = ("tests/", "docs/", "bench/", "examples/")  # of a checkout
-OURS = ("gsparc/", "ops/", "callbacks/", "conf/", "hydra_plugins/")  # of gsparc's; the rest is somebody's
+PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh", ".so")
+OURS = ("gsparc", "ops", "callbacks", "conf", "hydra_plugins")  # folders of gsparc's checkout
 STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
 REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
 DOCSTRING = re.compile(rf'(:\n\s+|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
@@ -89,20 +87,12 @@ class State:
         names = set(asdict(self)) - ({"program"} if reuse else set())
         return all(record.get(name) == getattr(self, name) for name in names)
 
-    def changes(self, record: Mapping[str, Any]) -> str:
-        """Return in what a record is of another state: `settings changed (effort); program changed`."""
-        said = []
-        for name, value in asdict(self).items():
-            before = record.get(name)
-            if before == value:
-                continue
-            names = []
-            if isinstance(value, dict) and isinstance(before, dict):
-                names = [key for key in {**before, **value} if before.get(key) != value.get(key)]
-            elif name == "program":
-                names = _edited_since(float(record.get("began", math.inf)))
-            said.append(f"{name} changed" + (f" ({list_first(names, 3)})" if names else ""))
-        return "; ".join(said)
+    def changes(self, record: Mapping[str, Any]) -> list[str]:
+        """Return in what a record is of another state: `settings.effort`, `program` and its newer files."""
+        own = asdict(self)
+        now, before = (dict(dotted_settings({name: of.get(name) for name in own})) for of in (own, record))
+        names = [name for name in before | now if before.get(name) != now.get(name)]
+        return names + (_edited_since(record.get("began", math.inf)) if "program" in names else [])
 
 
 def measurements_hash(data: Measurements) -> str:
@@ -172,7 +162,7 @@ def recorded(folder: Path, state: State, unread: State | None = None) -> Iterato
     left = None
     if record is None or record.get("ended") or not state.same(record):
         if record is not None and not state.same(record):
-            log.info("%s: begun anew: %s", folder, state.changes(record))
+            log.info("%s: begun anew, as these changed: %s", folder, list_first(state.changes(record)))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "unread": unread and asdict(unread), "began": time.time(), "ended": False}
         write_whole(folder / RECORD, json.dumps(record, indent=1))
@@ -198,24 +188,24 @@ def _program(packages: tuple[str, ...]) -> str:
 
 
 def package_hash(package: str) -> str:
-    """Return the hash of a package's text.
+    """Return the hash of the program that a package is, see `program_files`.
 
-    In a checkout it is of what git tracks and of new files, as they are, of gsparc's in its own folders:
-    commits that change pages, tests, comments or docstrings alone change nothing. Of an installed
-    package it is of all modules in its folder.
+    Changes of pages, tests, comments or docstrings alone change nothing.
     """
+    return _of_files(*program_files(package))
+
+
+def program_files(package: str) -> tuple[Path, list[str]]:
+    """Return a folder and the files below it that are a package's program; of gsparc's its own folders'."""
     spec = find_spec(package)
     if spec is None:
-        return ""
-    inside = next(iter(spec.submodule_search_locations or ()), None)
-    if inside is None:  # one module
-        return "" if spec.origin is None else _content_of(spec.origin)
-    folder = Path(spec.origin).parent if spec.origin else Path(inside)
-    checkout = _checkout(folder)
-    if checkout is not None:
-        return _of_files(*checkout)
-    files = (file for file in folder.rglob("*") if file.suffix in INSTALLED)
-    return _of_files(folder, [str(file.relative_to(folder)) for file in files])
+        return Path(), []
+    if spec.submodule_search_locations is None:  # one module
+        return Path(), [spec.origin] if spec.origin else []
+    folder = Path(spec.origin).parent if spec.origin else Path(next(iter(spec.submodule_search_locations)))
+    root, parts = folder.parent, OURS if package == "gsparc" else (folder.name,)
+    every = (file for part in parts for file in (root / part).rglob("*"))
+    return root, [str(file.relative_to(root)) for file in every if file.suffix in PROGRAM]
 
 
 def strip_comments(text: str) -> str:
@@ -230,30 +220,16 @@ def strip_comments(text: str) -> str:
     return DOCSTRING.sub(lambda one: one[2] or f'{one[1]}""', code)
 
 
-def _checkout(folder: Path) -> tuple[Path, list[str]] | None:
-    """The root of the working tree that a package is tracked in, and its program's files; None: in none."""
-    root = run_git(folder, "rev-parse", "--show-toplevel")
-    if not root or not run_git(folder, "ls-files"):
-        return None
-    files = run_git(Path(root), "ls-files", "-z", "--cached", "--others", "--exclude-standard") or ""
-    texts = [one for one in files.split("\0") if one.endswith(PROGRAM)]
-    own = str(folder.relative_to(root))  # of a plugin among the examples, too
-    if (Path(root) / "gsparc" / "models").is_dir():
-        return Path(root), [one for one in texts if one.startswith((f"{own}/", *OURS))]
-    return Path(root), [one for one in texts if not one.startswith(NO_PROGRAM) or one.startswith(own)]
-
-
 def _edited_since(began: float) -> list[str]:
-    """Files of gsparc's checkout that are newer [s since 1970]; none of an installed copy."""
-    root, files = _checkout(Path(__file__).parents[2]) or (Path(), [])
-    texts = [root / one for one in files if (root / one).is_file()]
-    return [str(one.relative_to(root)) for one in texts if one.stat().st_mtime > began]
+    """Files of gsparc's program that are newer [s since 1970]."""
+    root, files = program_files("gsparc")
+    return [one for one in files if (root / one).stat().st_mtime > began]
 
 
 def _of_files(root: Path, files: Iterable[str]) -> str:
     digest = sha256()
-    for name in sorted(set(files)):
-        if (root / name).is_file():  # git lists what was removed until it is committed
+    for name in sorted(files):
+        if (root / name).is_file():
             digest.update(f"{name} {_content_of(root / name)};".encode())
     return digest.hexdigest()
 

@@ -72,7 +72,6 @@ class FoldFits:
         methods: one per fold.
         train_s: seconds of each fit [s], without validation.
         train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not inflate them.
-        figures: accuracies pooled over folds, as in `Scores.figures`; empty when it was not scored.
         notes: what the first fold's fit said.
         limited_by: the clock whose seconds decided something: on another machine the result may be another.
         cost: of all fits together.
@@ -81,14 +80,13 @@ class FoldFits:
     methods: tuple[Method, ...]
     train_s: tuple[float, ...]
     train_cpu_s: tuple[float, ...]
-    figures: dict[str, float | None]
     notes: tuple[str, ...]
     limited_by: Clock | None = None
     cost: Cost = NO_COST
 
-    def score_on(self, data: Measurements, split: Split) -> FoldFits:
-        """Return the same fits with figures, of what they learned from or of other data, as moved queries."""
-        return replace(self, figures=pool_figures(score_methods(self.methods, data, split), data, split))
+    def figures(self, data: Measurements, split: Split) -> dict[str, float | None]:
+        """Return accuracies pooled over folds, of what it learned from or of other data, as moved queries."""
+        return pool_figures(score_methods(self.methods, data, split), data, split)
 
 
 def fold_contexts(whole: FitContext, split: Split) -> list[FitContext]:
@@ -101,7 +99,7 @@ def fit_folds(
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Method, FitReport], None] | None = None,
 ) -> FoldFits:  # fmt: skip
-    """Fit an unfitted method on every fold; `FoldFits.score_on` scores them together.
+    """Fit an unfitted method on every fold; `FoldFits.figures` scores them together.
 
     Args:
         factory: an unfitted method, or what chooses one.
@@ -137,6 +135,6 @@ def fit_folds(
     methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
-        methods, tuple(one.seconds for one in reports), processor, {}, reports[0].notes,
+        methods, tuple(one.seconds for one in reports), processor, reports[0].notes,
         worst_clock(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip

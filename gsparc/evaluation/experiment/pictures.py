@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
 
 from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
 from gsparc.evaluation.experiment.table import methods_by_mean_behind, shown
@@ -29,31 +29,21 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
     figure, grid = panels(*size, len(groups), columns, sharey="row")
     for line, here in zip(grid, groups, strict=True):
-        free = list(line)
-        first = here[here.split == here.split.iloc[0]]
-        wanted = [(own, "train_cpu_s", "training, CPU [s]") for _, own in here.groupby("split", sort=False)]
-        if first.query_ms.notna().any():
-            wanted.append((first, "query_ms", "one query [ms]"))
-        for own, horizontal, label in wanted:
-            axis = free.pop(0)
+        splits = [(own, "train_cpu_s", split) for split, own in here.groupby("split", sort=False)]
+        first = splits[0][0]
+        wanted = [*splits, *([(first, "query_ms", "queries")] if first.query_ms.notna().any() else [])]
+        for axis, (own, horizontal, shows) in zip(line, wanted, strict=False):
             _panel(axis, own, horizontal, ours)
-            shows = own.split.iloc[0] if horizontal == "train_cpu_s" else "queries"
-            axis.set(title=f"{own.dataset.iloc[0]}, {shows}", xlabel=label)
-        figure_name = here.figure.iloc[0]
-        line[0].set_ylabel(score_heading(figure_name))
-        if lower_is_better(figure_name):
+            label = "training, CPU [s]" if horizontal == "train_cpu_s" else "one query [ms]"
+            axis.set(title=f"{here.dataset.iloc[0]}, {shows}", xlabel=label)
+        line[0].set_ylabel(score_heading(first.figure.iloc[0]))
+        if lower_is_better(first.figure.iloc[0]):
             line[0].invert_yaxis()  # of the whole line: better is up in every panel
-        for axis in free:
+        for axis in line[len(wanted) :]:
             axis.set_visible(False)
-    handles: dict[str, Artist] = {}
-    # dict: each method once, though it is in many panels.
-    for axis in grid.flat:
-        # The line with its mark: an `errorbar` would be shown with bars that no point has.
-        lines, names = axis.get_legend_handles_labels()
-        handles |= {name: line[0] for name, line in zip(names, lines, strict=True)}
-    figure.legend(
-        list(handles.values()), list(handles), loc="outside lower center", ncols=min(6, 2 * columns)
-    )
+    # Lines with their marks: an `errorbar` would be shown with bars that no point has.
+    handles = [Line2D([], [], label=name, **style_of(name).marked) for name in rows.method.unique()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(6, 2 * columns))
     save(figure, path, also=also)
 
 

@@ -25,7 +25,7 @@ from gsparc.models import checkpoint, loading
 from gsparc.models.method import MethodFactory
 from gsparc.models.refined_places import move_rows
 from gsparc.prediction.pareto import defined_figure
-from gsparc.prediction.timing import ClockSettings, cycle_queries, draw_queries, p50_p95, time_interleaved
+from gsparc.prediction.timing import ClockSettings, p50_p95, query_calls, time_interleaved
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -125,73 +125,68 @@ class Study:
         Raises:
             ValueError: no variant can be trained here.
         """
+
+        def done(cell: tuple[str, int]) -> list[dict[str, Any]] | str:
+            """A row per condition, or why the data do not allow the variant."""
+            variant, turn = cell
+            # Each round has another seed, of the draws of errors as well as of the method.
+            own = replace(context, run_dir=context.run_dir / variant / str(turn), seed=self.seed + turn)
+            work = partial(self._fit_and_score, variant, data, split, own)
+            try:
+                facts = run_once(own.run_dir, state, work)
+            # Only what the data do not allow: any other error is a mistake and ends the study.
+            except ValueError as refused:
+                if REFUSED not in str(refused):
+                    raise
+                return str(refused)
+            return [{"variant": variant, **one.row(facts, own.run_dir)} for one in self.conditions]
+
         cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
-        work = partial(self._tried, data=data, split=split, context=context, state=state)
-        found = run_all(work, cells, "rounds of variants, possible here or not")
-        rows = list[dict[str, Any]]()
-        for facts, (variant, turn) in zip(found, cells, strict=True):
-            folder = context.run_dir / variant / str(turn)
-            if not isinstance(facts, str):
-                who = {"variant": variant, "turn": turn}
-                rows += [{**who, **one.row(facts, folder)} for one in self.conditions]
-            elif not any(isinstance(one, dict) for one in found):
-                raise ValueError(facts)
-            elif turn == 0:
-                log.info("%s is left out: %s", variant, facts)
+        found = run_all(done, cells, "rounds of variants, possible here or not")
+        refused = {cell[0]: why for why, cell in zip(found, cells, strict=True) if isinstance(why, str)}
+        rows = [row for one in found if not isinstance(one, str) for row in one]
+        if not rows:
+            raise ValueError(next(iter(refused.values())))
+        for variant, why in refused.items():
+            log.info("%s is left out: %s", variant, why)
         return self._table(pd.DataFrame(rows), data, split)
 
-    def _tried(
-        self, cell: tuple[str, int], data: Measurements, split: Split, context: FitContext, state: State
-    ) -> dict[str, Any] | str:
-        """The facts of a cell, or why the data do not allow it."""
-        folder = context.run_dir / cell[0] / str(cell[1])
-        try:
-            return run_once(folder, state, lambda left: self._done(*cell, folder, data, split, context))
-        # Only what the data do not allow: any other error is a mistake and ends the study.
-        except ValueError as refused:
-            if REFUSED not in str(refused):
-                raise
-            return str(refused)
-
-    def _done(
-        self, variant: str, turn: int, folder: Path, data: Measurements, split: Split, context: FitContext
+    def _fit_and_score(
+        self, variant: str, data: Measurements, split: Split, context: FitContext, left: str | None
     ) -> None:
         """One training per condition that changes what is learned from, scored under all of them."""
-        # Each round has another seed, of the draws of errors as well as of the method.
-        seed, figure, facts = self.seed + turn, "", dict[str, Any]()
-        fits: dict[Condition, FoldFits] = {}
+        facts, fits, seed = dict[str, Any](), dict[Condition, FoldFits](), context.seed
         for condition in self.conditions:
             learned = condition.learned
             if learned not in fits:
-                contexts = fold_contexts(
-                    replace(context, run_dir=learned.model(folder).parent, seed=seed), split
-                )
+                file = learned.model(context.run_dir)
+                here = data, split, fold_contexts(replace(context, run_dir=file.parent), split)
                 learned_from = partial(learned.change_training, seed=seed)
-                made = fit_folds(self.variants[variant](), data, split, contexts, learned=learned_from)
-                fits[learned] = made.score_on(data, split)
-                extra = {"fold": 0, "split_sha256": split.sha256}
+                fits[learned] = fit_folds(self.variants[variant](), *here, learned=learned_from)
                 # Without the configuration of the study: a variant has other settings.
-                checkpoint.save(learned.model(folder), made.methods[0], "", extra)
-            outcome = fits[learned]
+                extra = {"fold": 0, "split_sha256": split.sha256}
+                checkpoint.save(file, fits[learned].methods[0], "", extra)
+            outcome, asked = fits[learned], data
             if condition.what == "query":
                 tested = np.concatenate([fold.test for fold in split.folds])
-                outcome = outcome.score_on(add_position_errors(data, tested, condition.amount, seed), split)
+                asked = add_position_errors(data, tested, condition.amount, seed)
+            figures = outcome.figures(asked, split)
             # Where rows were silent they count, as in every other table.
-            figure = deciding_figure(outcome.figures, data.site.scored)
+            figure = deciding_figure(figures, data.site.scored)
             folds = [condition.change_training(data, fold, seed)[1] for fold in split.folds]
             own = {
                 "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
-                "value": defined_figure(outcome.figures, figure), "train_s": float(np.mean(outcome.train_s)),
+                "value": defined_figure(figures, figure), "train_s": float(np.mean(outcome.train_s)),
                 "train_cpu_s": float(np.mean(outcome.train_cpu_s)),
                 "effects": str(outcome.methods[0].effects or "none").replace("+", ", "),
             }  # fmt: skip
-            facts |= {f"{condition}/{name}": value for name, value in own.items()}
+            facts |= {"figure": figure, **{f"{condition}/{name}": value for name, value in own.items()}}
             log.info(
                 "%s%s, round %d of %d: %s %.4g after %.3g s of training a fold",
-                variant, "" if condition == Condition() else f", {condition}", turn + 1, self.rounds,
-                figure, own["value"], own["train_s"],
+                variant, "" if condition == Condition() else f", {condition}",
+                seed - self.seed + 1, self.rounds, figure, own["value"], own["train_s"],
             )  # fmt: skip
-        write_summary(folder / SUMMARY, {"figure": figure, "seed": seed, **facts, **provenance()})
+        write_summary(context.run_dir / SUMMARY, {"seed": seed, **facts, **provenance()})
 
     def _table(self, cells: pd.DataFrame, data: Measurements, split: Split) -> pd.DataFrame:
         """Rounds put together, and the models of the last one timed."""
@@ -206,7 +201,7 @@ class Study:
             file: loading.rebuild_method(self.variants[variant](), checkpoint.read(file))
             for file, variant in zip(rows.model, rows.variant, strict=True)
         }
-        times = time_interleaved(cycle_queries(methods, draw_queries(data, split.folds[0].test)), self.clock)
+        times = time_interleaved(query_calls(methods, data, split.folds[0].test), self.clock)
         rows[["query_ms", "query_p95_ms"]] = [p50_p95(times[file]) for file in rows.model]
         return rows[list(ROW)]
 
@@ -253,17 +248,13 @@ def add_position_errors(data: Measurements, rows: np.ndarray, error_m: float, se
     return move_rows(data, rows, offset[first][place.reshape(-1)])
 
 
-def add_direction_errors(
-    data: Measurements, error_deg: float, seed: int, *, missing: float = 0.0, false: float = 0.0
-) -> Measurements:
+def add_direction_errors(data: Measurements, error_deg: float, seed: int) -> Measurements:
     """Disturb directions of arrival as a receiver measures them; all else stays.
 
     Args:
         data: with directions.
         error_deg: standard deviation about each of two axes across a direction [degrees].
         seed: of the draw.
-        missing: share of the directions that are not there.
-        false: number of directions from anywhere, as a share of those that are there.
 
     Raises:
         ValueError: no directions.
@@ -277,9 +268,6 @@ def add_direction_errors(
         aside = rng.normal(scale=sigma, size=ray.shape)
         # Only the part across the ray: to first order a rotation by `aside`, in radians.
         ray = ray + aside - (aside * ray).sum(1, keepdims=True) * ray
-        ray = ray[rng.random(len(ray)) >= missing]
-        # Directions of a normal vector are uniform on the sphere.
-        ray = np.concatenate([ray, rng.normal(size=(rng.binomial(len(ray), false), 3))])
         measured.append((ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32))
     return replace(data, directions=measured)
 

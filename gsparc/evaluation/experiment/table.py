@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.experiment.latency import Latency
+from gsparc.evaluation.experiment.latency import SPEED, TIMED
 from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
@@ -33,15 +33,14 @@ SECOND: dict[Scored, str] = {
 }  # fmt: skip
 # Plain methods that a reader could have without gsparc; remarks say where one of them wins.
 SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
-BESIDE = {  # figures beside the score, by their columns
-    "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
-    "chi2": CALIBRATION,
+BESIDE = {  # figures beside the score, and their headings, by their columns
+    "coverage": ("interval/coverage_90", Column("in 90 % interval", ".2f", of="coverage")),
+    "outage": ("outage/brier", Column("outage, Brier score", ".4f", of="outage")),
+    "after_constant": (
+        "rmse_db_after_constant", Column("after a constant, dB", ".2f", of="after_constant"),
+    ),
+    "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
 }  # fmt: skip
-BESIDE_COLUMNS = (
-    Column("after a constant, dB", ".2f", of="after_constant"),
-    Column("in 90 % interval", ".2f", of="coverage"), Column("outage, Brier score", ".4f", of="outage"),
-    Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2"),
-)  # fmt: skip
 OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
 LITTLE = 2 / 3  # share of a budget below which a longer one is proposed
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
@@ -68,7 +67,7 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         rows.append({
             **own, **asdict(one.cell), "result": own, "draws": one.drawn, "score_db": score_db(own),
             "second_figure": second, "second_value": own.get(second),
-            **{name: own.get(key) for name, key in BESIDE.items()},
+            **{name: own.get(key) for name, (key, _) in BESIDE.items()},
             "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
         })  # fmt: skip
     if not rows:
@@ -79,13 +78,12 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
-def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str, Latency]]) -> pd.DataFrame:
+def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
 
     Args:
         filled: cells.
-        timed: latencies by dataset and method, of the dataset's first split and shown there alone: models
-            of fewer measurements answer faster.
+        timed: of `time_by_dataset`; None: nothing was timed.
 
     Returns:
         Columns `ROW` (see `columns_of_csv`), and `results`, a row of each seed or draw; NaN where something
@@ -123,17 +121,10 @@ def average_cells(filled: Sequence[CellResult], timed: Mapping[str, Mapping[str,
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())
-    problems = list(dict.fromkeys(zip(rows.dataset, rows.split, strict=True)))
-    # Reversed, so that of a dataset's splits the first remains.
-    first = dict(reversed(problems))  # split of each dataset
-    times = [
-        timed.get(row.dataset, {}).get(row.method) if row.split == first[row.dataset] else None
-        for row in rows.itertuples()
-    ]
-    for name, field in (("query_ms", "p50_ms"), ("query_p95_ms", "p95_ms"), ("to_copy", "to_copy")):
-        rows[name] = [getattr(one, field, np.nan) for one in times]
-    order = [problems.index((row.dataset, row.split)) for row in rows.itertuples()]
-    rows = rows.assign(order=order).sort_values(["order", "budget_s", "method"], na_position="first")
+    timed = pd.DataFrame(columns=TIMED) if timed is None else timed
+    rows = rows.merge(timed, "left").astype(dict.fromkeys(SPEED, float))
+    rows["order"] = rows.groupby(PROBLEM, sort=False).ngroup()
+    rows = rows.sort_values(["order", "budget_s", "method"], na_position="first")
     return rows[[*ROW, "results"]].reset_index(drop=True)
 
 
@@ -243,7 +234,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second_figure.iloc[0], of="second_value")),
-        *((block[str(column.of)].notna().any(), column) for column in BESIDE_COLUMNS),
+        *((block[name].notna().any(), column) for name, (_, column) in BESIDE.items()),
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]

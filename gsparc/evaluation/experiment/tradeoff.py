@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,22 +13,20 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baselines import FittedBaseline, fit_baseline
-from gsparc.evaluation.drawing import panels, set_log_axis, style_of
+from gsparc.data.splits import Split
+from gsparc.evaluation.baselines import fit_baseline
+from gsparc.evaluation.drawing import panels, set_latency_axes, style_of
 from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import DECIDING, axis_of, lower_is_better, score_of
-from gsparc.evaluation.open_runs import Opened
+from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.scores import rows_to_score, score_methods
-from gsparc.evaluation.table import Column
-from gsparc.models.method import Method, Prediction
+from gsparc.evaluation.table import Column, Row
+from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
-from gsparc.models.reduced import View
-from gsparc.prediction.pareto import Point, Settings, describe_point
+from gsparc.models.reduced import Settings
+from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import Call, ClockSettings, time_interleaved
+from gsparc.prediction.timing import COPY, ClockSettings, p50_p95, reference_copy, time_interleaved
 
 log = logging.getLogger(__name__)
 
@@ -36,71 +34,71 @@ POINT = (  # columns of the table of points
     Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
     Column("ms p95", ".3g", of="render_ms_p95"),
 )  # fmt: skip
+TIMES = ["render_ms_p50", "render_ms_p95"]
+FIRST = ["label", *TIMES, "ratio_to_copy"]
+LAST = ["closeness_db", "front", "kept_with_model", "threads", "num_gaussians"]
 CLOSEST_DB = 100.0  # the precision of float32
 
 
-def measure_candidates(
-    candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int], data: Measurements, fold: Fold, *,
-    eval_on: str, clock: ClockSettings, others: Mapping[str, Call],
-) -> tuple[list[Point], dict[str, np.ndarray]]:  # fmt: skip
-    """Measure the candidates; the first is the full model, which the others are compared with.
+def measure_points(
+    candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int], baselines: Sequence[str],
+    data: Measurements, split: Split, eval_on: str, clock: ClockSettings,
+) -> tuple[pd.DataFrame, pd.DataFrame]:  # fmt: skip
+    """Score and time ways of answering; the first is the full model, which the others are compared with.
 
     Args:
-        candidates: to be measured: what a method is reduced by, and the method that answers so.
+        candidates: what a method is reduced by, and the method that answers so.
         threads: CPU threads that each is timed with.
-        data, fold: as the model was trained with.
+        baselines: names of others beside them; those whose deciding figure is not defined are left out.
+        data, split: as the model was trained with, its fold.
         eval_on: rows whose figures are shown.
         clock: how long to measure.
-        others: further contenders for the clock alone (a copy of memory), by name.
 
     Returns:
-        A point per candidate and number of threads, and the times [ms] of `others`.
+        A row per candidate and number of threads, the fastest first, and one per other. Columns are the
+        figures, `FIRST` and `LAST` (see `tradeoff.csv`), `settings`, and of the deciding figure its name
+        `figure`, `value` and `score`, larger is better. `front` marks those that no candidate beats,
+        `kept_with_model` those by their closeness to the full model, which takes no measurement.
+
+    Raises:
+        ValueError: these rows do not define the deciding figure.
     """
-    split = Split("tradeoff", (fold,), "")
-    scored: list[tuple[dict[str, float | None], float]] = []
+    ways: list[dict[str, Any]] = []
     whole = None
-    places = data.moving[rows_to_score(fold, eval_on)]
-    for number, (_, method) in enumerate(candidates):
-        recorded = RecordingView(method)
-        there = score_methods([recorded], data, split, eval_on)
-        answers = torch.cat(recorded.means)
+    for number, (settings, method) in enumerate(candidates):
+        means: list[Tensor] = []
+        own = pool_figures(score_methods([method], data, split, eval_on, means=means), data, split)
+        answers = torch.cat(means)
         whole = answers if whole is None else whole
-        scored.append((pool_figures(there, data, split), closeness_db(answers, whole)))
+        own |= {"closeness_db": closeness_db(answers, whole), "num_gaussians": method.count_components()}
+        for used in threads:
+            label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
+            way = {"label": label, "threads": used, "method": method, "settings": settings}
+            ways.append({**own, **way, **{f"set/{knob}": _cell(value) for knob, value in settings.items()}})
         if number % 10 == 9:
             log.info("%d of %d faster variants scored", number + 1, len(candidates))
-    calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
-    for index, (_, method) in enumerate(candidates):
-        ask = Predictor(method, data.site).cycle_places(places)
-        calls |= {(index, count): ask for count in threads}
+    figure, count = deciding_figure(ways[0], data.site.scored), len(ways)
+    for name in baselines:
+        fitted = fit_baseline(name, data, split, eval_on)
+        own = pool_figures(fitted.scores, data, split)
+        if own[figure] is not None:
+            ways.append({**own, "label": name, "threads": 1, "method": fitted.methods[0]})
+    # Predictors are asked in world coordinates, as a user would.
+    places = data.moving[rows_to_score(split.folds[0], eval_on)]
+    calls = {str(i): Predictor(way["method"], data.site).cycle_places(places) for i, way in enumerate(ways)}
     # A copy of memory, the unit of the others' times, is made by one thread.
-    times = time_interleaved(calls, clock, {key: 1 if isinstance(key, str) else key[1] for key in calls})
-    points = []
-    for key, ms in times.items():
-        if isinstance(key, str):
-            continue
-        index, count = key
-        (settings, method), (figures, close) = candidates[index], scored[index]
-        label = f"{describe_point(settings)}, {count} thread{'s' if count > 1 else ''}"
-        points.append(Point(label, settings, count, figures, close, ms, method.count_components()))
-    return points, {name: times[name] for name in others}
-
-
-class RecordingView(View):
-    """A method whose answers are kept while it is scored.
-
-    Attributes:
-        means: of every batch that was asked.
-    """
-
-    def __init__(self, inner: Method) -> None:
-        super().__init__(inner)
-        self.means: list[Tensor] = []
-
-    def predict(self, query: Query) -> Prediction:
-        """See `Method.predict`."""
-        prediction = self.inner.predict(query)
-        self.means.append(prediction.mean)
-        return prediction
+    using = {COPY: 1} | {name: way["threads"] for name, way in zip(calls, ways, strict=True)}
+    times = time_interleaved({COPY: reference_copy(), **calls}, clock, using)
+    rows = pd.DataFrame(ways, dtype=object).assign(figure=figure)
+    rows[TIMES] = [p50_p95(times[name]) for name in calls]
+    rows["ratio_to_copy"] = rows.render_ms_p50 / np.median(times[COPY])
+    rows["value"] = [defined_figure(way, figure) for way in ways]
+    rows["score"] = [score_of(figure, value) for value in rows.value]
+    points, beside = rows[:count].copy(), rows[count:]
+    for column, by in (("front", points.score), ("kept_with_model", points.closeness_db)):
+        best = pareto_front(points.render_ms_p50.to_list(), by.to_list())
+        points[column] = points.index.isin(best).astype(int)
+    return points.sort_values("render_ms_p50", kind="stable"), beside
 
 
 def closeness_db(answers: Tensor, whole: Tensor) -> float:
@@ -110,108 +108,56 @@ def closeness_db(answers: Tensor, whole: Tensor) -> float:
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
 
-def find_better(point: Point, others: Mapping[str, Point], figure_name: str) -> str | None:
+def find_better(point: Row, others: pd.DataFrame) -> str | None:
     """Return the most accurate other that is neither slower nor worse than a point; None without one."""
-    own = score_of(figure_name, point.value(figure_name))
-    better = {n: score_of(figure_name, r.value(figure_name)) for n, r in others.items() if r.p50 <= point.p50}
-    best = max(better, key=lambda name: better[name], default=None)
-    return best if best is not None and better[best] >= own else None
+    better = others[(others.render_ms_p50 <= point["render_ms_p50"]) & (others.score >= point["score"])]
+    return None if better.empty else str(better.label[better.score.astype(float).idxmax()])
 
 
-def draw_front(
-    points: Sequence[Point], on_front: Sequence[int], others: Mapping[str, Point], figure_name: str,
-    method: str, title: str,
-) -> Figure:  # fmt: skip
-    """Draw the points of a method beside others by name; `on_front` are of the front, fastest first."""
-    lines = 0.16 * (len(on_front) + 1)  # inches of the legend
-    figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
-    value = [p.value(figure_name) for p in points]
-    inside = [i for i in range(len(points)) if i not in on_front]
-    axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
-
-    x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]
-    reach = [[0.0] * len(x), [points[i].p95 - points[i].p50 for i in on_front]]
-    own, label = style_of(method).colour, "not beaten (to 95th percentile)"
-    axes.errorbar(x, y, xerr=reach, fmt="o-", color=own, capsize=2, lw=1, ms=4, label=label)
-    for number, place in enumerate(zip(x, y, strict=True), 1):
-        above = (-9, 5 if number % 2 else -13)  # or below: near points would cover each other's numbers
-        axes.annotate(str(number), place, above, textcoords="offset points", color=own, fontsize=9)
-    for name, other in others.items():
-        axes.plot([other.p50], [other.value(figure_name)], ms=6, **style_of(name).marked)
-        place = other.p50, other.value(figure_name)
-        axes.annotate(name, place, (6, -4), textcoords="offset points", color=style_of(name).colour)
-    set_log_axis(axes)
-    worst, best = min(y), max(y)  # far-off others would flatten the front
-    if lower_is_better(figure_name):
-        axes.set_yscale("log")
-        axes.invert_yaxis()
-    else:
-        axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
-        below = [name for name, other in others.items() if other.value(figure_name) < axes.get_ylim()[0]]
-        if below:
-            axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
-    axes.set(xlabel="one query end to end, median [ms]", ylabel=axis_of(figure_name))
-    axes.grid(alpha=0.3)
+def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: str) -> Figure:
+    """Draw the points of a method beside others, see `measure_points`."""
+    best, beaten = points[points.front == 1], points[points.front == 0]
+    figure, ((axes,),) = panels(7.5, 4.2)
+    axes.scatter(beaten.render_ms_p50, beaten.value, s=9, c="0.75", label="beaten")
+    reach = [np.zeros(len(best)), best.render_ms_p95 - best.render_ms_p50]
+    how: dict[str, Any] = {"fmt": "o-", "color": style_of(method).colour, "capsize": 2, "lw": 1, "ms": 4}
+    axes.errorbar(best.render_ms_p50, best.value, xerr=reach, label="not beaten", **how)
+    beside = zip(others.label, others.render_ms_p50, others.value, strict=True)
+    set_latency_axes(axes, best.figure.iloc[0], best.value, beside)
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
-    winner = {i: find_better(points[i], others, figure_name) for i in on_front}
-    rows = [
-        f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
-        + (f" ({winner[i]} is better)" if winner[i] else "")
-        for number, i in enumerate(on_front, 1)
-    ]
-    legend.axis("off")
-    text = "\n".join(["       median  accuracy  settings", *rows])
-    legend.text(0, 1, text, va="top", family="monospace", fontsize=7.5)
     return figure
 
 
-def fit_others(run: Opened, baselines: Sequence[str], eval_on: str) -> dict[str, FittedBaseline]:
-    """Fit baselines whose deciding figure is defined."""
-    fitted = {name: fit_baseline(name, run.data, run.split, eval_on) for name in baselines}
-    figure = DECIDING[run.data.site.scored]
-    return {name: one for name, one in fitted.items() if one.scores.figures()[figure] is not None}
-
-
-def table_of_points(
-    points: list[Point], pareto: list[int], chosen: list[int], copy_ms: float
-) -> pd.DataFrame:
-    """Return a row a point, those of `tradeoff.csv`: the fastest first."""
-    rows = [
-        {
-            "label": p.label, "render_ms_p50": p.p50, "render_ms_p95": p.p95,
-            "ratio_to_copy": p.p50 / copy_ms, **p.figures,
-            "closeness_db": p.closeness_db, "front": int(i in pareto), "kept_with_model": int(i in chosen),
-            "threads": p.threads, "num_gaussians": p.size,
-            **{f"set/{knob}": _cell(value) for knob, value in p.settings.items()},
-        }
-        for i, p in enumerate(points)
-    ]  # fmt: skip
-    return pd.DataFrame(rows, dtype=object).sort_values("render_ms_p50", kind="stable")
+def columns_of_csv(points: pd.DataFrame) -> dict[str, list[Any]]:
+    """Return the columns of `tradeoff.csv`: what it is and its times, figures, and what makes it."""
+    own = ["method", "settings", "figure", "value", "score"]
+    knobs = [name for name in points if name.startswith("set/")]
+    figures = [name for name in points if name not in {*FIRST, *LAST, *own, *knobs}]
+    return points[[*FIRST, *figures, *LAST, *knobs]].to_dict("list")
 
 
 def _cell(value: Any) -> Any:
     return "+".join(map(str, value)) if isinstance(value, (list, tuple)) else value
 
 
-def facts_of(
-    points: list[Point], best: list[Point], figure: str, others: dict[str, Point], copy_ms: float
-) -> dict[str, Any]:
+def facts_of(points: pd.DataFrame, others: pd.DataFrame) -> dict[str, Any]:
     """Return `tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
-    full = min((p for p in points if not p.settings), key=lambda p: p.p50)
+    best = points[points.front == 1].to_dict("records")
+    full = next(row for row in points.to_dict("records") if not row["settings"])  # the fastest of its threads
+    figure = full["figure"]
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
         "tradeoff/figure": figure,
-        "tradeoff/front_beaten_by_others": sum(find_better(p, others, figure) is not None for p in best),
-        "time/copy_ms": copy_ms,
-        "time/render_ms_p50": full.p50,
-        "time/render_ms_p95": full.p95,
-        f"test/{figure}": full.value(figure),
+        "tradeoff/front_beaten_by_others": sum(find_better(row, others) is not None for row in best),
+        "time/copy_ms": full["render_ms_p50"] / full["ratio_to_copy"],
+        **{f"time/{name}": full[name] for name in TIMES},
+        f"test/{figure}": full["value"],
     }
-    for name, other in others.items():
-        stem = f"baseline/{name}"
-        facts |= {f"{stem}/{figure}": other.value(figure), f"{stem}/render_ms_p50": other.p50}
+    for other in others.itertuples():
+        stem = f"baseline/{other.label}"
+        facts |= {f"{stem}/{figure}": other.value, f"{stem}/render_ms_p50": other.render_ms_p50}
     return facts
 
 

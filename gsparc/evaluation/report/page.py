@@ -6,7 +6,7 @@ import base64
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from PIL import Image
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
-from gsparc.evaluation.metric_formats import LISTED, judged_by
+from gsparc.evaluation.metric_formats import LISTED, PER_SAMPLE, judged_by
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
 from gsparc.evaluation.results import score_db
@@ -30,7 +30,7 @@ MOST_PICTURES = 6
 IDS = r'(id="|url\(#|href="#)'  # of an SVG, and what refers to them
 
 
-@dataclass
+@dataclass(frozen=True)
 class Section:
     """Runs whose figures can be compared: one dataset, one kind of split.
 
@@ -38,17 +38,23 @@ class Section:
         title: dataset and split.
         remarks: what a reader must know first.
         tables: in reading order.
-        plots: titles and SVG texts.
-        figures: the plots, for files of their own.
+        figures: plots.
         pictures: captions and PNG data in base64.
     """
 
     title: str
-    remarks: list[str] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
-    plots: list[tuple[str, str]] = field(default_factory=list)
-    figures: list[Figure] = field(default_factory=list)
-    pictures: list[tuple[str, str]] = field(default_factory=list)
+    remarks: list[str]
+    tables: list[Table]
+    figures: list[Figure]
+    pictures: list[tuple[str, str]]
+
+    @property
+    def plots(self) -> list[tuple[str, str]]:
+        """Titles and SVG texts of the figures, whose ids differ: matplotlib repeats them."""
+        return [
+            (str(figure.get_label()), re.sub(IDS, rf"\g<1>p{number}-", plots.to_svg(figure)))
+            for number, figure in enumerate(self.figures)
+        ]
 
 
 def make_sections(
@@ -58,34 +64,25 @@ def make_sections(
 
     `fronts`: names of datasets, `tradeoff.csv` by column.
     """
-    return [
-        _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
-        for (dataset, split), group in group_by_study(runs).items()
-    ]
-
-
-def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Section:
-    runs = drop_shared_overrides(group)
-    study = Section(title, warnings(runs))
-    # With one run a setting, spreads over seeds would be empty brackets.
-    if len(tables.group_by_setting(runs)) < len(runs):
-        study.tables.append(tables.table_of_seeds(runs))
-    kinds = tables.table_of_leads, tables.table_of_results, tables.table_of_worst
-    study.tables += [table for table in (kind(runs) for kind in kinds) if table.rows]
-    study.figures = [plots.draw_pareto(runs, fronts), plots.draw_accuracy_cdf(runs)]
-    study.plots = [
-        # Ids of several drawings on one page must differ: matplotlib repeats them.
-        (str(figure.get_label()), re.sub(IDS, rf"\g<1>p{number}-", plots.to_svg(figure)))
-        for number, figure in enumerate(study.figures)
-    ]
-    firsts = [group[0] for group in tables.group_by_setting(runs).values()]
-    study.pictures = [
-        (f"{run.setting}{what}", _png(run.folder / name))
-        for run in firsts[:MOST_PICTURES]
-        for name, what in (("test.png", ""), ("sectors.png", ": sectors"))
-        if (run.folder / name).is_file()
-    ]
-    return study
+    sections = []
+    for (dataset, split), group in group_by_study(runs).items():
+        own = drop_shared_overrides(group)
+        firsts = [same[0] for same in tables.group_by_setting(own).values()]
+        # With one run a setting, spreads over seeds would be empty brackets.
+        several = [tables.table_of_seeds] * (len(firsts) < len(own))
+        kinds = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
+        swept = [columns for name, columns in fronts if name == dataset]
+        of_sample = [PER_SAMPLE[own[0].row["kind"]]]
+        pictures = [
+            (f"{run.setting}{what}", _png(run.folder / name))
+            for run in firsts[:MOST_PICTURES]
+            for name, what in (("test.png", ""), ("sectors.png", ": sectors"))
+            if (run.folder / name).is_file()
+        ]
+        shown = [table for table in (kind(own) for kind in kinds) if table.rows]
+        figures = [plots.draw_pareto(own, swept), plots.draw_distributions(own, of_sample)]
+        sections.append(Section(f"{dataset}, split {split}", warnings(own), shown, figures, pictures))
+    return sections
 
 
 def warnings(runs: Sequence[Run]) -> list[str]:

@@ -5,18 +5,17 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.drawing import numbered_style, panels, save, set_log_axis, style_of
-from gsparc.evaluation.metric_formats import PER_SAMPLE, heading_of, lower_is_better, score_of
+from gsparc.evaluation.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
+from gsparc.evaluation.metric_formats import heading_of, score_of
 from gsparc.evaluation.report.runs import Run, distinct_baselines, error_sizes
 from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
 from gsparc.prediction.pareto import pareto_front
@@ -43,7 +42,8 @@ def to_svg(figure: Figure) -> str:
 
 def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
-    name, axes = runs[0].row["figure"], _axes()
+    figure, ((axes,),) = panels(WIDE, TALL)
+    name = runs[0].row["figure"]
     points: list[tuple[float, float]] = []
     for (setting, group), style in _styled(runs):
         for run in group:
@@ -56,13 +56,9 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
                 fmt="o", ms=4, lw=0.7, color=style["color"], label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, estimate.value))
-    for base in _rivals(runs):
-        value, ms, look_of = base["value"], base["query_ms"], style_of(base["method"])
-        if ms is not None:
-            axes.plot([ms], [value], **look_of.marked, ms=4)
-            how: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": look_of.colour}
-            axes.annotate(base["method"], (ms, value), (4, -3), **how)
-            points.append((ms, value))
+    others = [(base["method"], base["query_ms"], base["value"]) for base in _rivals(runs)]
+    others = [other for other in others if other[1] is not None]
+    points += [other[1:] for other in others]
     for columns in fronts:
         if name in columns:
             x, y = (columns[key][columns["front"] == 1] for key in ("render_ms_p50", name))
@@ -70,35 +66,47 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
     best = pareto_front([x for x, _ in points], [score_of(name, y) for _, y in points])
     x, y = [points[i][0] for i in best], [points[i][1] for i in best]
     axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
-    set_log_axis(axes)
-    axes.set_ylabel(heading_of(name))
-    # Errors span decades; minposy is infinite where none is above 0.
-    if lower_is_better(name) and np.isfinite(axes.dataLim.minposy):
-        axes.set_yscale("log")
-    if name == "psnr_db" and len(points) > 1:  # a black image at 6 dB would flatten everything above 25
-        values = [value for _, value in points]
-        middle, best_value = float(np.median(values)), max(values)
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best_value - middle), 5.0)))
-    what = "one query [ms], median; whisker to the 95th percentile"
-    return _finished(axes, "Accuracy against latency (95 % intervals)", what)
+    set_latency_axes(axes, name, [value for _, value in points], others)
+    handles, labels = axes.get_legend_handles_labels()
+    axes.legend(handles, [shorten_setting(label, 44) for label in labels], fontsize=6.5)
+    figure.set_label("Accuracy against latency (95 % intervals)")
+    return figure
 
 
-def draw_accuracy_cdf(runs: Sequence[Run]) -> Figure:
-    """Draw the share of test samples that are at most so good, per setting, with 95 % bands."""
-    name, axes = PER_SAMPLE[runs[0].row["kind"]], _axes()
-    _cdfs(axes, runs, name)
-    beside = [base["run"].samples for base in _rivals(runs) if base["method"] == "gp"]
-    known = [own[f"baseline/gp/{name}"] for own in beside if f"baseline/gp/{name}" in own]
-    if known:
-        rival = np.concatenate(known)  # of all draws
-        share = np.arange(1, len(rival) + 1) / len(rival)
-        axes.step(np.sort(rival), share, lw=0.8, label="gp", **style_of("gp").line)
-    axes.set_ylabel("share of samples")
-    title = "How the accuracy is distributed (95 % bands)"
-    return _finished(axes, title, f"{heading_of(name)} of a test sample")
+def draw_distributions(
+    runs: Sequence[Run], names: Sequence[str], labels: Mapping[str, str] = MappingProxyType({})
+) -> Figure:
+    """Draw the shares of test samples that are at most so good, per setting over its seeds, a panel a figure.
+
+    With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart): seeds
+    share their test samples, whose number counts once. `TIMES` among `names` are single queries.
+    """
+    figure, ((*line,),) = panels(max(4.2 * len(names), WIDE), TALL, 1, len(names))
+    for axes, name in zip(line, names, strict=True):
+        for (setting, group), style in _styled(runs):
+            every = [run.render_ms if name == TIMES else error_sizes(run, name) for run in group]
+            every = [values[np.isfinite(values)] for values in every]
+            count = max(map(len, every)) if name != TIMES else sum(map(len, every))
+            values, share = _shares(every)
+            # DKW: P(sup |F_n - F| > e) <= 2 exp(-2 n e^2), Massart 1990 for the constant 2.
+            half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * max(count, 1)))
+            axes.step(values, share, where="post", lw=1.2, label=labels.get(setting, setting), **style)
+            low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
+            axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
+        beside = [base["run"].samples for base in _rivals(runs) if base["method"] == "gp"]
+        if known := [own[f"baseline/gp/{name}"] for own in beside if f"baseline/gp/{name}" in own]:
+            axes.step(*_shares(known), lw=0.8, label="gp", **style_of("gp").line)  # of all draws
+        axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
+        if name in (TIMES, "mse", "error_power"):
+            set_log_axis(axes, np.inf if name == TIMES else 0.0)
+    line[0].set_ylabel("share of samples")
+    handles, shown = line[0].get_legend_handles_labels()
+    figure.legend(handles, [shorten_setting(one, 90) for one in shown], loc="outside lower center", ncols=2)
+    figure.set_label("How the accuracy is distributed (95 % bands)")
+    return figure
 
 
-def draw_distributions(runs: Sequence[Run], title: str, path: Path) -> None:
+def draw_sweep(runs: Sequence[Run], title: str, path: Path) -> None:
     """Save the figure that ends a sweep: distributions over test samples and of single queries, as PNG.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
@@ -111,42 +119,16 @@ def draw_distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     for setting, group in group_by_setting(runs).items():
         seconds = np.mean([run.row["train_s"] for run in group])
         ms = np.mean([run.row["query_ms"] for run in group if run.row["query_ms"] is not None])
-        labels[setting] = f"{shorten_setting(setting, 40)}: {seconds:.3g} s, {ms:.3g} ms"
-    figure, ((*line,),) = panels(4.2 * len(names), 3.9, 1, len(names))
-    for axes, name in zip(line, names, strict=True):
-        _cdfs(axes, runs, name, labels)
-        axes.set_xlabel("one query, alone [ms]" if name == TIMES else heading_of(name))
-        if name == TIMES:
-            set_log_axis(axes, np.inf)
-        if name in ("mse", "error_power") and np.isfinite(axes.dataLim.minposx):
-            axes.set_xscale("log")
-            axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
-    line[0].set_ylabel("share")
+        labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s, one query {ms:.3g} ms"
+    figure = draw_distributions(runs, names, labels)
     figure.suptitle(title, fontsize=9)
-    legend = {"loc": "outside lower center", "fontsize": 7, "ncols": 2, "title": "training, one query"}
-    figure.legend(*line[0].get_legend_handles_labels(), **legend)
     save(figure, path, 100)
 
 
-def _cdfs(axes: Axes, runs: Sequence[Run], name: str, labels: Mapping[str, str] | None = None) -> None:
-    """Distributions of a figure of samples, or of `TIMES`, over all seeds of each setting.
-
-    With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart): seeds
-    share their test samples, whose number counts once.
-    """
-    for (setting, group), style in _styled(runs):
-        every = [run.render_ms if name == TIMES else error_sizes(run, name) for run in group]
-        every = [values[np.isfinite(values)] for values in every]
-        values = np.sort(np.concatenate(every))
-        if not len(values):
-            continue
-        share = np.arange(1, len(values) + 1) / len(values)
-        count = len(values) if name == TIMES else max(map(len, every))
-        # DKW: P(sup |F_n - F| > e) <= 2 exp(-2 n e^2), Massart 1990 for the constant 2.
-        half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * count))
-        axes.step(values, share, where="post", lw=1.2, label=(labels or {}).get(setting, setting), **style)
-        low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
-        axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
+def _shares(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """All values (n,) sorted, and the share of them that each is at least as large as."""
+    values = np.sort(np.concatenate(parts))
+    return values, np.arange(1, len(values) + 1) / len(values)
 
 
 def _rivals(runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -162,19 +144,6 @@ def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, 
     unique = len(set(names)) == len(names)
     styles = [style_of(name).line if unique else numbered_style(i) for i, name in enumerate(names)]
     return list(zip(groups.items(), styles, strict=True))
-
-
-def _axes() -> Axes:
-    return panels(WIDE, TALL)[1][0, 0]
-
-
-def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
-    axes.set_xlabel(horizontal)
-    axes.figure.set_label(title)
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        axes.legend(handles, [shorten_setting(label, 44) for label in labels], fontsize=6.5)
-    return axes.figure  # type: ignore[return-value]
 
 
 def shorten_setting(text: str, most: int = 32) -> str:

@@ -90,7 +90,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
-        plots.draw_distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
+        plots.draw_sweep(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
         seeds = {run.config.get("split.seed") for run in group}
         if study[1] == "random" and len(seeds) > 1 == len({run.row["draw"] for run in group}):

@@ -211,16 +211,15 @@ def table_of_worst(runs: Sequence[Run]) -> Table:
     rows, who = [], _run_columns(runs)
     columns = [*who, Column("sample", ""), Column("where [m]", ""), *numbers]
     for run in runs:
-        own = run.samples
-        if name not in own:
+        if name not in run.samples:
             continue
+        every = pd.DataFrame(run.samples)
         # Decibels of quality are negated, so that the worst samples have the largest error.
-        error = np.abs(own[name]) if name == "error_db" else -own[name]
-        for i in np.argsort(-np.nan_to_num(error, nan=-np.inf))[:WORST]:
-            place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
-            there = [float(own[rival][i]) if rival in own else None for _ in beside]
-            figures = float(own[name][i]), *there, float(own["confidence"][i])
-            rows.append([*(one.value(run.row) for one in who), str(own["name"][i]), place, *figures])
+        error = every[name].abs() if name == "error_db" else -every[name]
+        for row in every.loc[error.nlargest(WORST).index].to_dict("records"):
+            place = ", ".join(f"{row[axis]:.2f}" for axis in ("x_m", "y_m", "z_m"))
+            figures = row[name], *([row.get(rival)] if beside else []), row["confidence"]
+            rows.append([*(one.value(run.row) for one in who), str(row["name"]), place, *figures])
     hard = "; the Gaussian process there shows whether it is hard for all" if beside else ""
     note = f"The moving end's position{hard}."
     return Table("The three worst places", columns, rows, note)

@@ -5,19 +5,21 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsparc.data import limits
 from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import finite_array
+from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
+from gsparc.data.walls import RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.receivers import Ground, layout_from_config, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.receivers import Ground, Layout, place_receivers, stands_clear_of
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.survey import Engine, Survey
@@ -26,7 +28,8 @@ log = logging.getLogger(__name__)
 
 BUILDERS = {"conference_room": conference_room}
 SOURCES = ("builder", "builtin", "xml", "file", "room")
-OVER = ("zero", "ground", "roofs")
+PLACE = limits.Limit("three finite numbers [m]", lambda value: limits.finite_array(value).shape == (3,))
+SEVERAL = limits.Limit("a list of one transmitter or more", bool)
 MIN_RECEIVERS = 20
 SAME_PLACE_M = 0.01  # a station nearer to a transmitter of the scene is that transmitter
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
@@ -36,7 +39,7 @@ CEILING = 0.85  # and its share of the height of a closed room
 
 
 @dataclass(frozen=True)
-class SceneSettings:
+class SceneSettings(Checked):
     """One scene, chosen by exactly one of `SOURCES`.
 
     Attributes:
@@ -64,17 +67,17 @@ class SceneSettings:
 
     name: str
     num_receivers: int
-    carrier_hz: float
-    bandwidth_hz: float
-    subcarriers: int
-    transmitter_m: tuple[float, float, float] | None = None
-    transmitters: Sequence[Mapping[str, Any]] | None = None
+    carrier_hz: float = setting(MISSING, limits.POSITIVE)
+    bandwidth_hz: float = setting(MISSING, limits.number(0))
+    subcarriers: int = setting(MISSING, whole(1))
+    transmitter_m: tuple[float, float, float] | None = setting(None, or_null(PLACE))
+    transmitters: Sequence[Mapping[str, Any]] | None = setting(None, or_null(SEVERAL))
     area_m: tuple[tuple[float, float], tuple[float, float]] | None = None
     height_m: tuple[float, float] = (1.2, 1.8)
-    over: str = "zero"
+    over: str = setting("zero", choice("zero", "ground", "roofs"))
     receivers: Mapping[str, Any] | None = None
-    test_share: float = 0.3
-    builder: str | None = None
+    test_share: float = setting(0.3, limits.SHARE)
+    builder: str | None = setting(None, or_null(choice(*BUILDERS)))
     builtin: str | None = None
     xml: str | None = None
     file: str | None = None
@@ -84,24 +87,20 @@ class SceneSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         sources = [k for k in SOURCES if getattr(self, k) is not None]
         if len(sources) != 1:
             names = ", ".join(sources) or "none"
             raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {names}")
         if self.transmitter_m is not None and self.transmitters is not None:
             raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
-        if self.transmitters is not None and not self.transmitters:
-            raise ValueError("scene.transmitters: an empty list; expected a transmitter or more")
-        if self.transmitter_m is not None and finite_array(self.transmitter_m).shape != (3,):
-            raise ValueError(f"scene.transmitter_m={self.transmitter_m}: expected three finite numbers [m]")
-        if self.over not in OVER:
-            raise ValueError(f"scene.over={self.over}: expected one of {', '.join(OVER)}")
-        if layout_from_config(self.receivers).kind == "area" and self.num_receivers < MIN_RECEIVERS:
+        if self.layout.kind == "area" and self.num_receivers < MIN_RECEIVERS:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
-        if not (self.carrier_hz > 0 and self.bandwidth_hz >= 0 and self.subcarriers >= 1):
-            raise ValueError("scene: carrier_hz is positive, bandwidth_hz at least 0, subcarriers at least 1")
-        if not 0 < self.test_share < 1:
-            raise ValueError(f"scene.test_share={self.test_share}: expected a share between 0 and 1")
+
+    @property
+    def layout(self) -> Layout:
+        """Where receivers are."""
+        return from_settings(Layout, self.receivers or {}, "scene.receivers")
 
     @property
     def frequency_hz(self) -> np.ndarray:
@@ -134,13 +133,10 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
         log.info("%s: %s", scene.file, note)
     area = _area(scene, tracer.bounding_box()[:, :2] if town is None else town.box)
     ground = _around(scene, tracer, area) if allowed is None else Ground(allowed)
-    georeference, streets = (None, ()) if town is None else (town.georeference, town.streets)
+    georeference = None if town is None else town.georeference
     # Heights of masts count from the highest surface, a roof where there is one.
     masts = _stated(scene, tracer.surface_height, georeference) or [_in_the_middle(tracer, ground, area)]
-    placed = place_receivers(
-        layout_from_config(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed,
-        ground, streets, georeference,
-    )  # fmt: skip
+    placed = place_receivers(scene, area, ground, town)
     # Copies that share the scene, which is loaded once.
     engines = [tracer.with_transmitter(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
@@ -201,24 +197,16 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
 
 def _shoebox(scene: SceneSettings) -> Survey:
     """Our own exact image sources, whose transmitters are isotropic."""
-    assert scene.room is not None
-    boxes = np.array(scene.room.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
-    reflection = np.array(scene.room.get("reflection", -0.7), dtype=np.complex128)
-    room = Room.from_size(scene.room["size_m"], reflection, occluders=boxes)
-    area = _area(scene, np.stack([np.zeros(2), np.array(scene.room["size_m"][:2], dtype=np.float64)]))
-    middle = np.append(area.mean(0), CEILING * float(scene.room["size_m"][2]))
+    stated = from_settings(RoomSettings, scene.room or {}, "scene.room")
+    size, reflection = np.array(stated.size_m, float), np.array(stated.reflection, complex)
+    room = Room.from_size(size, reflection, occluders=stated.boxes)
+    area = _area(scene, np.stack([room.lower, room.upper])[:, :2])
+    middle = np.append(area.mean(0), CEILING * room.upper[2])
     masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
     if any(mast.antenna.pattern != "iso" for mast in masts):
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
     engines: list[Engine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
-    placed = place_receivers(
-        layout_from_config(scene.receivers),
-        scene.num_receivers,
-        area,
-        scene.height_m,
-        scene.seed,
-        Ground(room.contains),
-    )
+    placed = place_receivers(scene, area, Ground(room.contains))
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 
 
@@ -232,8 +220,6 @@ def _load(
         town = read_town(scene.file, scene.carrier_hz)
         source = town.solids
     elif scene.builder is not None:
-        if scene.builder not in BUILDERS:
-            raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")
         source = BUILDERS[scene.builder](scene.seed)
         # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
         allowed = stands_clear_of(source)

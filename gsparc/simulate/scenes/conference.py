@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.data.files import read_shipped_table
 from gsparc.simulate.scenes.solid import Solid, box, sheet
 
 SIZE = np.array([14.0, 10.0, 4.0])
@@ -22,7 +23,8 @@ WALLS = (  # material along the four walls, in panels from corner to corner
 def conference_room(seed: int = 0) -> list[Solid]:
     """Return all objects of the room; the seed moves furniture and wall panels by decimetres."""
     rng = np.random.default_rng(seed)
-    return [*_shell(rng), *_partitions(), *_tables(rng), *_furniture(rng)]
+    shell, chairs, shift = _shell(rng), _chairs(rng), rng.uniform(-0.2, 0.2)
+    return [*shell, *_listed("fixed"), *chairs, *_listed("shifted", shift)]
 
 
 def _shell(rng: np.random.Generator) -> list[Solid]:
@@ -53,31 +55,21 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
     return solids
 
 
-def _partitions() -> list[Solid]:
-    """Glass: two sheets that cut a corner office off, open at a door, and a free-standing one; pillars."""
-    return [
-        sheet("glass_office_a", "glass", (9.6, 6.4, 0), (4.3, 0, 0), (0, 0, 2.8)),
-        sheet("glass_office_b", "glass", (9.6, 7.5, 0), (0, 2.4, 0), (0, 0, 2.8)),
-        sheet("glass_free", "glass", (3.2, 2.0, 0), (2.6, 0.5, 0), (0, 0, 2.2)),
-        box("pillar_a", "concrete", (4.7, 6.6, 0), (5.2, 7.1, 4.0)),
-        box("pillar_b", "concrete", (9.1, 3.0, 0), (9.6, 3.5, 4.0)),
-    ]
-
-
-def _tables(rng: np.random.Generator) -> list[Solid]:
-    """A long table of the meeting with chairs around, and two desks."""
+def _listed(group: str, shift: float = 0.0) -> list[Solid]:
+    """Sheets (a corner, two sides) and boxes (two corners) of conference.csv; some moved along an axis."""
     solids = []
-    tables = {
-        "table_long": (6.9, 5.0, 4.8, 1.4),
-        "desk_a": (2.2, 8.4, 1.8, 0.9),
-        "desk_b": (12.0, 8.3, 1.8, 0.9),
-    }
-    for name, (x, y, length, width) in tables.items():
-        a, b = length / 2, width / 2
-        solids.append(box(name, "wood", (x - a, y - b, 0.70), (x + a, y + b, 0.74)))
-        for i, foot in enumerate((x - (a - 0.35), x + (a - 0.35))):
-            low, high = (foot - 0.06, y - (b - 0.15), 0.0), (foot + 0.06, y + (b - 0.15), 0.69)
-            solids.append(box(f"{name}_leg{i}", "metal", low, high))
+    for row in read_shipped_table(__package__, "conference.csv"):
+        metres = np.array(row["metres"].split(), dtype=float).reshape(-1, 3)
+        if row["moves"]:
+            metres[:, "xy".index(row["moves"])] += shift
+        shape = box if len(metres) == 2 else sheet
+        solids += [shape(row["name"], row["material"], *metres)] * (row["group"] == group)
+    return solids
+
+
+def _chairs(rng: np.random.Generator) -> list[Solid]:
+    """Two rows of six at the long table, and one at each desk."""
+    solids = []
     places = [(4.9 + 0.8 * i, 5.0 + side * 1.15, side) for i in range(6) for side in (-1, 1)]
     places += [(2.2, 7.5, -1), (12.0, 7.4, -1)]
     for i, (x, y, side) in enumerate(places):
@@ -89,14 +81,3 @@ def _tables(rng: np.random.Generator) -> list[Solid]:
         low, high = (x - 0.21, back - 0.02, 0.47), (x + 0.21, back + 0.02, 0.95)
         solids.append(box(f"chair{i}_back", "plywood", low, high, turn))
     return solids
-
-
-def _furniture(rng: np.random.Generator) -> list[Solid]:
-    """A bookcase, two cabinets, a screen."""
-    shift = rng.uniform(-0.2, 0.2)
-    return [
-        box("bookcase", "wood", (0.15, 2.0 + shift, 0), (0.55, 4.4 + shift, 2.1)),
-        box("cabinet_a", "metal", (11.0, 0.15, 0), (12.6, 0.65, 1.3)),
-        box("cabinet_b", "chipboard", (6.0 + shift, 9.3, 0), (8.2 + shift, 9.85, 1.6)),
-        box("screen", "metal", (0.14, 5.6, 1.1), (0.2, 7.6, 2.3)),
-    ]

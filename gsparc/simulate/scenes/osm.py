@@ -17,21 +17,15 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
-from gsparc.simulate.scenes.solid import Solid, sheet
+from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid, sheet
 
 LEVEL_M = 3.0  # of a storey
 USUAL_LEVELS = 3  # of a building that says neither height nor levels
 TALLEST_M = 1000.0
 MARGIN_M = 50.0  # of ground around everything
 GROUND = "ground"
-MATERIALS = {  # words of building:material, facade and wall tags, by the material of ITU-R P.2040
-    "brick": "brick", "brickwork": "brick", "clay": "brick",
-    "concrete": "concrete", "cement_block": "concrete", "plaster": "concrete", "stone": "concrete",
-    "sandstone": "concrete", "limestone": "concrete", "granite": "concrete",
-    "glass": "glass", "mirror": "glass", "wood": "wood", "timber_framing": "wood", "bamboo": "wood",
-    "metal": "metal", "steel": "metal", "tin": "metal", "copper": "metal", "aluminium": "metal",
-    "marble": "marble",
-}  # fmt: skip
+# Materials of ITU-R P.2040 by words of building:material, facade and wall tags.
+MATERIALS = {word: row["material"] for row in LISTED_MATERIALS for word in row["words"].split()}
 TAGS = ("building:material", "building:facade:material", "facade:material", "wall")
 WALKED = ("motorway", "motorway_link", "construction", "proposed")  # highways that nobody stands on
 FEET_M = 0.3048

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import from_settings
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting
 from gsparc.data.query_places import read_query_places, read_times
 from gsparc.simulate.scenes.solid import Solid
 
+if TYPE_CHECKING:
+    from gsparc.simulate.scenes.build import SceneSettings
+    from gsparc.simulate.scenes.osm import Town
+
 log = logging.getLogger(__name__)
 
-KINDS = ("area", "grid", "streets", "file")
-INSIDE = ("drop", "refuse")
 MOST = 1_000_000  # places
 
 
@@ -39,7 +40,7 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class Layout:
+class Layout(Checked):
     """The settings `scene.receivers`.
 
     Attributes:
@@ -50,18 +51,10 @@ class Layout:
             None: an error out of a file, else left out.
     """
 
-    kind: str = "area"
-    spacing_m: float = 5.0
+    kind: str = setting("area", choice("area", "grid", "streets", "file"))
+    spacing_m: float = setting(5.0, POSITIVE)
     file: str | None = None
-    inside: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"scene.receivers.kind={self.kind}: expected one of {', '.join(KINDS)}")
-        if self.inside not in (None, *INSIDE):
-            raise ValueError(f"scene.receivers.inside={self.inside}: expected {' or '.join(INSIDE)}")
-        if not 0 < self.spacing_m < np.inf:
-            raise ValueError(f"scene.receivers.spacing_m={self.spacing_m}: expected a positive number")
+    inside: str | None = setting(None, or_null(choice("drop", "refuse")))
 
 
 class Placed(NamedTuple):
@@ -71,49 +64,32 @@ class Placed(NamedTuple):
     time_s: np.ndarray | None = None
 
 
-def layout_from_config(config: Mapping[str, Any] | None) -> Layout:
-    """Return settings from `scene.receivers`.
-
-    Raises:
-        ValueError: a setting that does not exist or cannot be.
-    """
-    return from_settings(Layout, config or {}, "scene.receivers")
-
-
 def place_receivers(
-    how: Layout,
-    count: int,
-    area: np.ndarray,
-    height: Sequence[float],
-    seed: int,
-    ground: Ground,
-    streets: Sequence[np.ndarray] = (),
-    georeference: Georeference | None = None,
+    scene: SceneSettings, area: np.ndarray, ground: Ground, town: Town | None = None
 ) -> Placed:
-    """Return places of the layout that stand nowhere else than on the ground.
+    """Return places of the scene's layout that stand nowhere else than on the ground.
 
     Args:
-        how, count: the layout, and the number of receivers over an area.
+        scene: says how many and how high they are, which is drawn for each but out of a file.
         area: (2, 2) [m] lower and upper corner in x and y.
-        height: lowest and highest, drawn for each, but out of a file [m].
-        seed: of places and heights.
-        ground, streets, georeference: of the scene; streets are (n, 2) [m] each, of a map.
+        ground, town: of the scene.
 
     Raises:
         ValueError: no places, or places inside of something where that is refused.
     """
+    how, height, seed = scene.layout, scene.height_m, scene.seed
     if how.kind == "area":
 
         def allowed(points: np.ndarray) -> np.ndarray:
             return ground.allowed(ground.lift(points))
 
         # Drawn with heights above the ground, tested and returned in the world.
-        return Placed(ground.lift(draw_places(count, area, height, allowed, seed)))
+        return Placed(ground.lift(draw_places(scene.num_receivers, area, height, allowed, seed)))
     if how.kind == "file":
-        flat, time_s = _of_file(how, georeference, float(np.mean(height)))
+        flat, time_s = _of_file(how, town, float(np.mean(height)))
         names = [f"row {i}" for i in range(len(flat))]
     else:
-        across, time_s = _along(how, area, streets), None
+        across, time_s = _along(how, area, () if town is None else town.streets), None
         if not 0 < len(across) <= MOST:
             raise ValueError(f"scene.receivers: {len(across)} places; expected 1 to {MOST:,}")
         heights = np.random.default_rng(seed).uniform(min(height), max(height), len(across))
@@ -161,9 +137,7 @@ def _steps(line: np.ndarray, spacing: float) -> np.ndarray:
     return np.column_stack([np.interp(steps, along, line[:, i]) for i in range(2)])
 
 
-def _of_file(
-    how: Layout, georeference: Georeference | None, height: float
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _of_file(how: Layout, town: Town | None, height: float) -> tuple[np.ndarray, np.ndarray | None]:
     """Places (n, 3) and times (n,) of a file; heights that it does not give are the middle of the scene's."""
     if how.file is None:
         raise ValueError("scene.receivers.file is missing; expected a table with x and y, or degrees")
@@ -176,9 +150,9 @@ def _of_file(
     listed = table.ends["rx"]
     across = listed.across
     if listed.degrees:
-        if georeference is None:
+        if town is None:
             raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
-        across = georeference.from_degrees(*across.T)
+        across = town.georeference.from_degrees(*across.T)
     above = np.full(len(across), height) if listed.height is None else listed.height
     return np.column_stack([across, above]), time_s
 

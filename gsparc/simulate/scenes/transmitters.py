@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import from_settings
+from gsparc.data.limits import Checked, Limit, choice, finite_array, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
 
+NUMBERS = Limit("a list of two or three finite numbers", lambda v: finite_array(v).shape in ((2,), (3,)))
 PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1
 
 
@@ -48,7 +50,7 @@ class Transmitter:
 
 
 @dataclass(frozen=True)
-class Mast:
+class Mast(Checked):
     """An entry of `scene.transmitters`.
 
     Attributes:
@@ -62,13 +64,13 @@ class Mast:
     """
 
     name: str | None = None
-    position_m: Sequence[float] | None = None
-    position_deg: Sequence[float] | None = None
+    position_m: Sequence[float] | None = setting(None, or_null(NUMBERS))
+    position_deg: Sequence[float] | None = setting(None, or_null(NUMBERS))
     height_m: float | None = None
-    pattern: str | None = None
+    pattern: str | None = setting(None, or_null(choice(*PATTERNS)))
     azimuth_deg: float = 0.0
     downtilt_deg: float = 0.0
-    sectors: int = 1
+    sectors: int = setting(1, whole(1, 12))
 
 
 def place_transmitters(
@@ -90,12 +92,8 @@ def place_transmitters(
     for number, entry in enumerate(entries):
         where = f"scene.transmitters[{number}]"
         mast = from_settings(Mast, entry, where)
-        if not 1 <= mast.sectors <= 12:
-            raise ValueError(f"{where}.sectors={mast.sectors}: expected 1 to 12")
         # Isotropic sectors of a mast would all be the same station.
         pattern = mast.pattern or ("tr38901" if mast.sectors > 1 else "iso")
-        if pattern not in PATTERNS:
-            raise ValueError(f"{where}.pattern={pattern}: expected one of {', '.join(PATTERNS)}")
         position = _position(mast, where, surface, georeference)
         name = mast.name or f"tx{number}"
         for sector in range(mast.sectors):
@@ -121,8 +119,6 @@ def _position(
     if len(names) != 1:
         raise ValueError(f"{where}: give position_m=[x,y,z] or position_deg=[latitude,longitude]")
     values = np.array(getattr(mast, names[0]), dtype=np.float64)
-    if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
-        raise ValueError(f"{where}.{names[0]}={values.tolist()}: expected two or three finite numbers")
     if names[0] == "position_deg":
         if georeference is None:
             raise ValueError(f"{where}.position_deg: this scene is nowhere on Earth; give position_m")

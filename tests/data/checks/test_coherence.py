@@ -69,7 +69,7 @@ def test_the_setting_wins_over_the_verdict(caplog):
         assert set_freedom(own, "auto").site.freedom == "phase"
     assert "every row has a phase of its own" in caplog.text and "dataset.align=none" in caplog.text
     assert set_freedom(own, "none").site.freedom == "none"
-    with pytest.raises(SettingError, match=r"dataset\.align=level"):
+    with pytest.raises(SettingError, match=r"dataset\.align='level'"):
         set_freedom(data, "level")
 
 

@@ -62,7 +62,7 @@ def test_bad_folders_are_refused_in_words(tmp_path, change, words) -> None:
 
 
 def test_no_such_antenna_or_positions(tmp_path) -> None:
-    with pytest.raises(DataError, match="from 0 to 63"):
+    with pytest.raises(DataError, match="at least 0 and at most 63, or all"):
         city(64)
     with pytest.raises(DataError, match="true positions exist in the stand-in only"):
         load_argos(_copy(tmp_path), positions="true")

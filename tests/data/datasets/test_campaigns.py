@@ -21,13 +21,14 @@ from measured import (
 )
 from releases import real
 
-from gsparc.data.datasets.own import LOADERS, read_any
+from gsparc.data.datasets.own import CAMPAIGNS, read_any
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.raw import Raw, read_raw, write_raw
 
+LOADERS = {kind.choice: kind.reader for kind in CAMPAIGNS}
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)
 
 
@@ -155,7 +156,7 @@ def test_noise_of_powder_receivers_could_not_be_told_from_levels(tmp_path, refus
     side = after.censored_side(np.arange(len(after)))
     assert before.censored is None and set(after.station[side > 0]) == {0}
     assert ((side == 0) & (after.station == 0)).sum() == np.isfinite(level[5:]).sum()
-    refused("sensitivity_db: no ebc", lambda _: load({**own, "sensitivity_db": {"ebc": -90}}), tmp_path)
+    refused("sensitivity_db='ebc': one of", lambda _: load({**own, "sensitivity_db": {"ebc": -90}}), tmp_path)
 
 
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")

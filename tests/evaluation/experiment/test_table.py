@@ -7,9 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gsparc.evaluation.experiment import pictures
+from gsparc.evaluation.experiment import latency, pictures
 from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.latency import Latency
 from gsparc.evaluation.experiment.pictures import draw_budgets
 from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.experiment.table import (
@@ -42,7 +41,10 @@ FOUND = [
     *(filled("gsrf", 20.0 + s, s, 60.0, **{"machine/load": 3.0}) for s in (0.0, 2.0)),
     filled("gsrf", 25.0, 0, 300.0), filled("gp", 31.0, split="grouped"),
 ]  # fmt: skip
-TIMED = {"rfid": {"gp": Latency(2.0, 3.0, 1.5, 60), "gsparc": Latency(0.5, 0.6, 0.4, 60)}}
+TIMED = pd.DataFrame(
+    [["rfid", "random", "gp", 2.0, 3.0, 1.5], ["rfid", "random", "gsparc", 0.5, 0.6, 0.4]],
+    columns=latency.TIMED,
+)
 
 
 def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
@@ -65,7 +67,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
         for seed, level in enumerate((5.0, 7.0, 9.0))
         for method, error in (("gp", level), ("idw", level + 1.0 + 0.1 * seed))
     ]
-    (block,) = split_by_problem(average_cells(found, {}))
+    (block,) = split_by_problem(average_cells(found))
     gp, idw = block.itertuples()
     assert (gp.method, gp.behind_db, idw.behind_db) == ("gp", 0.0, pytest.approx(1.1))
     assert idw.behind_error_db == pytest.approx(0.1 / 3**0.5) and gp.spread_db == pytest.approx(2 / 3**0.5)
@@ -82,7 +84,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
 def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
     there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
     drawn = {"kind": "rssi", "drawn": True}
-    found = average_cells([filled(method, 5.0, 0, split=split, **drawn) for split, method in there], {})
+    found = average_cells([filled(method, 5.0, 0, split=split, **drawn) for split, method in there])
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
     pictures.draw_splits(found, tmp_path / "city.png")
@@ -112,14 +114,14 @@ def test_losers_are_not_hidden():
     assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
     assert "busy (load 0.1 to 3.0 per core)" in said
     far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
-    said = " | ".join(remarks(split_by_problem(average_cells(far, {}))[0], "gsparc"))
+    said = " | ".join(remarks(split_by_problem(average_cells(far))[0], "gsparc"))
     assert "2.00 dB behind gp" in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
 
 
 def test_what_an_earlier_program_measured_is_said():
     old = filled("gsrf", 29.0, 0, 60.0, earlier="0123abcd")
-    found = split_by_problem(average_cells([*FOUND[:1], old], {}))[0]
+    found = split_by_problem(average_cells([*FOUND[:1], old]))[0]
     assert list(found.earlier) == ["", "0123abcd"]
     assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
 
@@ -127,7 +129,7 @@ def test_what_an_earlier_program_measured_is_said():
 def test_how_a_method_approximates_stands_behind_its_name():
     labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
     found = [filled("gp", 30.0, i, 60.0, **{"model/label": label}) for i, label in enumerate(labels)]
-    (block,) = split_by_problem(average_cells(found, {}))
+    (block,) = split_by_problem(average_cells(found))
     assert list(block.label) == [" (Vecchia 30)"] and "gp (Vecchia 30)" in markdown([block], "gsparc")
 
 
@@ -135,7 +137,7 @@ def test_lists_were_compared_by_their_listed_rows_alone():
     """kriging was first by these, while the pages and `train` name the figure with unlisted rows."""
     errors = (("kriging", 4.6, 5.2), ("gsparc", 4.9, 4.2))
     found = [filled(m, e, 0, kind="rssi", **{"test/rmse_db_with_silent": silent}) for m, e, silent in errors]
-    (block,) = split_by_problem(average_cells(found, {}))
+    (block,) = split_by_problem(average_cells(found))
     first = next(block.itertuples())
     assert (first.method, first.figure, first.second_figure) == ("gsparc", "rmse_db_with_silent", "rmse_db")
 
@@ -143,7 +145,7 @@ def test_lists_were_compared_by_their_listed_rows_alone():
 def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
     """Its figure had no heading; that of errors was `-RMSE dB`, with negative numbers."""
     facts = {"test/rmse_db_with_silent": 4.2, "test/reduced_chi2": 25.0}
-    found = average_cells([filled("gp", 5.0, 0, 9.0, kind="rssi", **facts)], {})
+    found = average_cells([filled("gp", 5.0, 0, 9.0, kind="rssi", **facts)])
     page = markdown(split_by_problem(found), "gsparc")
     assert "| RMSE dB, silent too (less is better) |" in page and "gp, RMSE dB, silent too 4.20" in page
     assert "std of gp is 5 times too small" in page and "gsparc map" in page
@@ -158,7 +160,7 @@ def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
         (tmp_path / method).mkdir()
         pd.DataFrame({"row": range(4), "psnr_db": level}).to_csv(tmp_path / method / "per_sample.csv")
         cells.append(replace(filled(method, level.mean()), folder=tmp_path / method))
-    (block,) = split_by_problem(average_cells(cells, {}))
+    (block,) = split_by_problem(average_cells(cells))
     (said, *_) = remarks(block, "gsparc")
     assert "; 2.00 ± 0.41 dB before idw (standard error over the same 4 test rows): they are told" in said
 
@@ -194,7 +196,7 @@ def test_methods_with_the_same_figures_in_every_draw_had_a_winner():
         for draw in range(3)
         for method in ("gp", "gsparc")
     ]
-    (block,) = split_by_problem(average_cells(cells, {}))
+    (block,) = split_by_problem(average_cells(cells))
     said = " | ".join(remarks(block, "gsparc"))
     assert "; the same as gsparc (standard error over the same 3 draws)" in said
     assert "gp and gsparc have the same RMSE dB over 3 draws" in said
@@ -207,7 +209,7 @@ def test_a_simple_baseline_won_by_chance():
     cells = [filled("gsparc", 30.0, draw, drawn=True) for draw in range(3)]
     cells += [filled("gp", 30.0 + gain, draw, drawn=True) for draw, gain in enumerate(gains)]
     cells += [filled("nearest", 30.0 + gain / 2, draw, drawn=True) for draw, gain in enumerate(gains)]
-    (block,) = split_by_problem(average_cells(cells, {}))
+    (block,) = split_by_problem(average_cells(cells))
     said = " | ".join(remarks(block, "gsparc"))
     assert "gp and gsparc are not told apart in PSNR dB: gp is 0.30 ± 1.01 dB better over 3 draws" in said
     assert (
@@ -221,10 +223,10 @@ def test_budgets_called_equal_were_spent_by_half():
     """newrf spent 6.43 of 12 processor seconds, gsparc 14.2, under a title that gave 12 to each."""
     cpu = {"gsparc": 14.2, "newrf": 6.43, "blind": 12.5}
     found = [filled(name, 20.0, 0, 12.0, **{"time/train_cpu_s": own}) for name, own in cpu.items()]
-    said = remarks(split_by_problem(average_cells(found, {}))[0], "gsparc")
+    said = remarks(split_by_problem(average_cells(found))[0], "gsparc")
     more = "newrf used 54% of its budget: budgets=[{seconds: 22, seeds: [0]}] gives it as much, unless"
     assert f"spent of 12 processor seconds: gsparc 14.2, newrf 6.43; {more} it ended by itself" in said
-    said = " ".join(remarks(split_by_problem(average_cells(found[1:2], {}))[0], "gsparc"))
+    said = " ".join(remarks(split_by_problem(average_cells(found[1:2]))[0], "gsparc"))
     assert "newrf 6.43" in said and "as much" not in said
 
 
@@ -232,16 +234,16 @@ def test_the_csv_file_had_other_signs_than_the_console():
     """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws, a spread was an error."""
     drawn = [filled("gp", 5.0 + draw, draw, kind="rssi", split="drawn", drawn=True) for draw in range(3)]
     seeds = [filled("gsparc", 5.0 + seed, seed, 60.0, kind="rssi") for seed in range(2)]
-    gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*drawn, *seeds], {}))).itertuples()
+    gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*drawn, *seeds]))).itertuples()
     assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
     assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
     assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(gsparc.score_error_db)
 
 
 def test_what_methods_were_given_besides_places_was_not_said():
-    (block,) = split_by_problem(average_cells([*FOUND[:1], filled("newrf", 29.0, 0, 60.0)], {}))
+    (block,) = split_by_problem(average_cells([*FOUND[:1], filled("newrf", 29.0, 0, 60.0)]))
     assert any("gsparc were given directions of arrival" in line for line in remarks(block, "gsparc"))
-    (block,) = split_by_problem(average_cells(FOUND[:1], {}))
+    (block,) = split_by_problem(average_cells(FOUND[:1]))
     assert not any("were given" in line for line in remarks(block, "gsparc"))
 
 
@@ -249,10 +251,10 @@ def test_draws_with_the_same_test_rows_had_a_standard_error():
     """`split=random, draws: 3` of a release that names its test rows gave three copies of one split."""
     same = {"split/test_sha256": "t", "drawn": True}
     found = [filled("gp", 30.0 + draw, draw, **same) for draw in range(3)]
-    (block,) = split_by_problem(average_cells(found, {}))
+    (block,) = split_by_problem(average_cells(found))
     (row,) = block.itertuples()
     assert not row.draws and row.seeds == 3 and "draws" not in title_of(block)
-    (block,) = split_by_problem(average_cells(found[:1], {}))
+    (block,) = split_by_problem(average_cells(found[:1]))
     assert title_of(block).endswith("one draw")
 
 
@@ -263,10 +265,10 @@ def test_the_last_of_three_was_bold_in_a_comparison():
         for method, behind in (("gsparc", 0.0), ("gp", 1.0), ("complex_gp", 14.0))
         for draw in range(3)
     ]
-    (block,) = split_by_problem(average_cells(cells, {}))
+    (block,) = split_by_problem(average_cells(cells))
     page = markdown([block], "complex_gp")
     assert "| **gsparc** |" in page and "| complex_gp (ours) |" in page and page.count("**gsparc**") == 1
-    (alone,) = split_by_problem(average_cells(cells[:3], {}))
+    (alone,) = split_by_problem(average_cells(cells[:3]))
     assert "**" not in markdown([alone], "gsparc")
 
 
@@ -276,5 +278,5 @@ def test_the_lead_of_the_first_had_no_verdict():
     for gains, verdict in leads:
         cells = [filled("gp", 30.0, draw, drawn=True) for draw in range(3)]
         cells += [filled("gsparc", 30.0 + gain, draw, drawn=True) for draw, gain in enumerate(gains)]
-        (block,) = split_by_problem(average_cells(cells, {}))
+        (block,) = split_by_problem(average_cells(cells))
         assert remarks(block, "gsparc")[0].endswith(f"over the same 3 draws): {verdict}")

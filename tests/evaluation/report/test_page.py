@@ -60,7 +60,7 @@ def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
     for name in ("gsparc", "gp"):
         run_dir(tmp_path / name, name=name)
     runs = find_runs([tmp_path])
-    axes = plots.draw_accuracy_cdf(runs).axes[0]
+    axes = plots.draw_distributions(runs, ["psnr_db"]).axes[0]
     assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
     colours = {to_hex(one.get_color()).upper() for one in axes.lines if one.get_label() in ("gsparc", "gp")}
     assert colours == {style_of(name).colour for name in ("gsparc", "gp")}
