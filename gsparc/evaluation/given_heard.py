@@ -16,6 +16,7 @@ from gsparc.processes.censored import truncated_moments
 
 NEAREST = 30  # silent rows of a station
 DRAWS = 100  # of the levels of all that may be listed
+FARTHEST = -8.0  # deviations that a level moves by: one that says it is farther below is wrong
 
 
 def levels_given_heard(
@@ -41,9 +42,9 @@ def levels_given_heard(
     mine, own = (np.zeros(len(d), int) if d.station is None else d.station for d in (asked, learned))
     others, told = None, method.uses_censored and (spread_db > 0).any()
     if told and learned.place is not None and learned.site.stations is not None:
-        heard = (part[~silent] for part in (learned.place, own, level, learned.moving))
-        lists = StrongestLists.from_rows(*heard, count=len(learned.site.stations))
-        others = _draw_others(method, lists, learned, asked) if lists.are_strongest() else None
+        heard = learned.place[~silent], own[~silent], level[~silent], learned.moving[~silent]
+        lists = StrongestLists.from_rows(*heard, len(learned.site.stations))
+        others = _draw_others(method, lists, own, asked, mine) if lists.are_strongest() else None
     chance, mean, spread = np.full(len(asked), np.nan), mean_db.copy(), spread_db.copy()
     for station in np.intersect1d(mine, own[silent]):
         at = np.flatnonzero((mine == station) & (spread_db > 0))
@@ -55,7 +56,7 @@ def levels_given_heard(
             limit = level[rows[near[1]]]
         else:  # what is below all that is listed is in no list
             limit = np.maximum(others[at], level[rows].min())
-        above = torch.from_numpy((mean_db[at, None] - limit) / spread_db[at, None])
+        above = torch.from_numpy((mean_db[at, None] - limit) / spread_db[at, None]).clamp_min(FARTHEST)
         chance[at] = torch.special.ndtr(above).mean(1)
         if others is not None:
             # Each limit counts by how probable it makes the list. Above 0 is a mirror image.
@@ -68,14 +69,22 @@ def levels_given_heard(
 
 
 def _draw_others(
-    method: Method, lists: StrongestLists, learned: Measurements, asked: Measurements
+    method: Method, lists: StrongestLists, learned: np.ndarray, asked: Measurements, mine: np.ndarray
 ) -> np.ndarray:
-    """Draws (n, DRAWS) of the level [dB] of the other station that fills the list."""
+    """Draws (n, DRAWS) of the level [dB] of the other station that fills the list.
+
+    Args:
+        method: states variances.
+        lists: of the rows that it learned from.
+        learned, mine: stations of all rows learned from, and of those asked (n,).
+        asked: n rows.
+    """
     places, which = np.unique(asked.moving, axis=0, return_inverse=True)
-    enough = np.bincount(learned.station, minlength=lists.level.shape[1]) >= LEAST_ROWS
+    enough = np.bincount(learned, minlength=lists.level.shape[1]) >= LEAST_ROWS
     station, at = np.nonzero((lists.listed_near(places) & enough).T)
     query = Query.from_places(asked.site, torch.from_numpy(places[at]).float(), torch.from_numpy(station))
     said, unit = method.predict(query), asked.site.target_scale
+    assert said.variance is not None
     power, variance = said.mean[:, 0].double().numpy() * unit, said.variance.double().numpy() * unit**2
     level = np.full((2, len(places), len(enough)), -np.inf)  # and deviation
     level[:, at, station] = power_in_decibels(power, variance)
@@ -86,7 +95,7 @@ def _draw_others(
         drawn = mean + spread.clip(0) * rng.normal(size=(len(enough), DRAWS))
         beyond, last = np.partition(drawn, (kept - 1, kept), axis=0)[[kept - 1, kept]]
         # One that has a place itself leaves the others one less.
-        result[rows] = np.where(drawn[asked.station[rows]] >= last, beyond, last)
+        result[rows] = np.where(drawn[mine[rows]] >= last, beyond, last)
     return result
 
 
@@ -96,6 +105,7 @@ def levels_of_nearest_moment(learned: Measurements, asked: Measurements) -> np.n
     The strongest of the nearest moment, as anyone would tell a best server; levels of each station's own
     nearest moments tell it worse (simulated lists of three .30 to .36 for .48 to .76 of the places).
     """
+    assert learned.station is not None and asked.station is not None
     heard = np.flatnonzero(learned.censored_side(np.arange(len(learned))) <= 0)
     places, which = np.unique(learned.moving[heard], axis=0, return_inverse=True)
     table = np.zeros((len(places), max(learned.station.max(), asked.station.max()) + 1))
