@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from gsparc.data.links.strongest import StrongestLists
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import LEAST_ROWS
 from gsparc.data.units import power_in_decibels
 from gsparc.models.method import Method
+from gsparc.models.per_station import UNHEARD, PerStation
 from gsparc.processes.censored import truncated_moments
 
 NEAREST = 30  # silent rows of a station
@@ -44,7 +44,7 @@ def levels_given_heard(
     if told and learned.place is not None and learned.site.stations is not None:
         heard = learned.place[~silent], own[~silent], level[~silent], learned.moving[~silent]
         lists = StrongestLists.from_rows(*heard, len(learned.site.stations))
-        others = _draw_others(method, lists, own, asked, mine) if lists.are_strongest() else None
+        others = _draw_others(method, lists, asked, mine) if lists.are_strongest() else None
     chance, mean, spread = np.full(len(asked), np.nan), mean_db.copy(), spread_db.copy()
     for station in np.intersect1d(mine, own[silent]):
         at = np.flatnonzero((mine == station) & (spread_db > 0))
@@ -68,31 +68,30 @@ def levels_given_heard(
     return {"heard_share": chance, "heard_db": mean, "heard_std_db": spread}
 
 
-def _draw_others(
-    method: Method, lists: StrongestLists, learned: np.ndarray, asked: Measurements, mine: np.ndarray
-) -> np.ndarray:
+def _draw_others(method: Method, lists: StrongestLists, asked: Measurements, mine: np.ndarray) -> np.ndarray:
     """Draws (n, DRAWS) of the level [dB] of the other station that fills the list.
 
     Args:
         method: states variances.
         lists: of the rows that it learned from.
-        learned, mine: stations of all rows learned from, and of those asked (n,).
-        asked: n rows.
+        asked, mine: n rows, and their stations (n,).
     """
     places, which = np.unique(asked.moving, axis=0, return_inverse=True)
-    enough = np.bincount(learned, minlength=lists.level.shape[1]) >= LEAST_ROWS
-    station, at = np.nonzero((lists.listed_near(places) & enough).T)
+    known = {number for number, _ in method} if isinstance(method, PerStation) else {UNHEARD}
+    count = lists.level.shape[1]
+    answered = np.array([t in known or UNHEARD in known for t in range(count)])
+    station, at = np.nonzero((lists.listed_near(places) & answered).T)
     query = Query.from_places(asked.site, torch.from_numpy(places[at]).float(), torch.from_numpy(station))
     said, unit = method.predict(query), asked.site.target_scale
     assert said.variance is not None
     power, variance = said.mean[:, 0].double().numpy() * unit, said.variance.double().numpy() * unit**2
-    level = np.full((2, len(places), len(enough)), -np.inf)  # and deviation
+    level = np.full((2, len(places), count), -np.inf)  # and deviation
     level[:, at, station] = power_in_decibels(power, variance)
     rng, result, kept = np.random.default_rng(0), np.empty((len(asked), DRAWS)), -lists.length
     for place in range(len(places)):
         rows = which.reshape(-1) == place
         mean, spread = level[:, place, :, None]
-        drawn = mean + spread.clip(0) * rng.normal(size=(len(enough), DRAWS))
+        drawn = mean + spread.clip(0) * rng.normal(size=(count, DRAWS))
         beyond, last = np.partition(drawn, (kept - 1, kept), axis=0)[[kept - 1, kept]]
         # One that has a place itself leaves the others one less.
         result[rows] = np.where(drawn[mine[rows]] >= last, beyond, last)
