@@ -14,7 +14,6 @@ from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.field.schedule import INTERVAL, to_steps
-from gsparc.models.method import Prediction
 from gsparc.training.tracking import log_picture
 
 
@@ -51,9 +50,10 @@ class Pictures(Checked, L.Callback):
         ledger = next((one for one in trainer.callbacks if isinstance(one, CostLedger)), None)  # type: ignore[attr-defined]
         with nullcontext() if ledger is None else ledger.paused(), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)
-            said = Prediction(module.mean(batch).cpu())
+            predicted = module.mean(batch)
             title = f"validation, step {step}"
             title += "" if ledger is None else f", {ledger.elapsed():.0f} s of training"
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
-            draw_spectra(batch.target.cpu().numpy(), said, rows, module.site.grid.edges(), title, path)
+            true, result = batch.target.cpu().numpy(), predicted.cpu().numpy()
+            draw_spectra(true, result, rows, module.site.grid.edges(), title, path)
             log_picture(trainer.loggers, "predictions", path, step)

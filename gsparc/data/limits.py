@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import DataError, suggest_name
+from gsparc.data.errors import DataError, list_first, suggest_name
 
 
 class SettingError(DataError):
@@ -80,7 +80,7 @@ def choice(*values: str) -> Limit:
         ...
     gsparc.data.limits.SettingError: name='blok': one of random, blocks is needed; did you mean 'blocks'?
     """
-    return Limit(f"one of {', '.join(values)}", lambda v: v in values, values)
+    return Limit(f"one of {list_first(values, MOST_NAMED)}", lambda v: v in values, values)
 
 
 def switch(*more: str) -> Limit:
@@ -107,6 +107,7 @@ def or_null(limit: Limit) -> Limit:
     return Limit(f"{limit.words}, or null", lambda v: v is None or limit.holds(v), limit.known)
 
 
+MOST_NAMED = 30  # of the words that may stand in a setting
 POSITIVE = number(0, open_low=True)
 SHARE = number(0, 1, open_low=True, open_high=True)
 

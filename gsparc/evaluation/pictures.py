@@ -11,7 +11,7 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method
 from gsparc.prediction.confidence import predict_rows
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
 
@@ -25,13 +25,15 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     said, true = predict_rows(method, data, rows), data.targets(rows).numpy()
+    predicted = said.mean.numpy()
     if not spectra:
         scale = data.site.target_scale
         unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         measured = data.censored_side(rows) == 0  # of a silent row the target is its level
-        return draw_points(true[measured] * scale, said.mean.numpy()[measured] * scale, title, path, unit)
+        return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
     assert data.site.grid is not None
-    return draw_spectra(true, said, rows, data.site.grid.edges(), title, path)
+    confidence = None if said.confidence is None else said.confidence.numpy()
+    return draw_spectra(true, predicted, rows, data.site.grid.edges(), title, path, confidence)
 
 
 def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
@@ -66,18 +68,18 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
 
 
 def draw_spectra(
-    target: np.ndarray, said: Prediction, rows: np.ndarray, edges: Sequence[float], title: str, path: Path
-) -> None:
+    target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, edges: Sequence[float], title: str,
+    path: Path, confidence: np.ndarray | None = None,
+) -> None:  # fmt: skip
     """Save a line per sample as PNG: measured, predicted and difference beside each other.
 
     Args:
-        target: (B, H, W) in [0, 1].
-        said: their prediction, and the confidence that is written into it, if any.
+        target, predicted: (B, H, W) in [0, 1].
         rows: (B,) dataset rows, for the labels.
         edges: least and largest azimuth, least and largest elevation [degrees].
         title, path: of the figure.
+        confidence: (B,) in [0, 1], written into the predictions.
     """
-    predicted, confidence = said.mean.numpy(), said.confidence
     how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
     figure, axes = panels(8.5, 1.35 * len(target) + 1.2, len(target), 3, **how)
     options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}

@@ -2,12 +2,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from gsparc.callbacks import Pictures
 from gsparc.callbacks.pictures import draw_spectra
-from gsparc.models.method import Prediction
 
 
 def stage(data, fold, run_dir, step):
@@ -48,8 +46,7 @@ def test_the_worst_prediction_is_the_most_colourful(tmp_path):
     target = np.linspace(0, 1, 12 * 24).reshape(1, 12, 24)
     colours = []
     for name, predicted in (("good", target), ("bad", 1 - target)):
-        said, edges = Prediction(torch.from_numpy(predicted)), (0, 360, 0, 90)
-        draw_spectra(target, said, np.array([3]), edges, "title", tmp_path / f"{name}.png")
+        draw_spectra(target, predicted, np.array([3]), (0, 360, 0, 90), "title", tmp_path / f"{name}.png")
         with Image.open(tmp_path / f"{name}.png") as image:
             pixels = np.asarray(image.convert("RGB")).astype(int)
         third = pixels[: pixels.shape[0] // 2, 2 * pixels.shape[1] // 3 :]  # above the colour bar

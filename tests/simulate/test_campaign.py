@@ -410,6 +410,16 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
     assert row > 4000 and many - few < 0.25 * 900 * row and len(stored["path_offsets"]) == 1001
 
 
+@pytest.mark.parametrize("room, words", [
+    ({"reflection": -0.5}, r"scene\.room\.size_m=None: a list of three lengths"),
+    ({"size_m": [4, 3, 2], "hight": 3}, r"scene\.room\.hight: no such setting"),
+    ({"size_m": [4, 3, 2], "boxes_m": [[[1, 1, 1], [0, 2, 2]]]}, r"scene\.room\.boxes_m=.*lower corner"),
+])  # fmt: skip
+def test_a_room_without_its_size_ended_in_a_key_error(tmp_path, room, words):
+    with pytest.raises(ValueError, match=words):
+        simulate(plan(scene=replace(SCENE, room=room)), tmp_path / "box.h5")
+
+
 @pytest.mark.parametrize("changes, words", [
     ({"builder": "conference_room"}, "exactly one of"),
     ({"num_receivers": 3}, "at least 20"),

@@ -248,13 +248,17 @@ def add_position_errors(data: Measurements, rows: np.ndarray, error_m: float, se
     return move_rows(data, rows, offset[first][place.reshape(-1)])
 
 
-def add_direction_errors(data: Measurements, error_deg: float, seed: int) -> Measurements:
+def add_direction_errors(
+    data: Measurements, error_deg: float, seed: int, *, missing: float = 0.0, false: float = 0.0
+) -> Measurements:
     """Disturb directions of arrival as a receiver measures them; all else stays.
 
     Args:
         data: with directions.
         error_deg: standard deviation about each of two axes across a direction [degrees].
         seed: of the draw.
+        missing: share of the directions that are not there.
+        false: number of directions from anywhere, as a share of those that are there.
 
     Raises:
         ValueError: no directions.
@@ -268,6 +272,9 @@ def add_direction_errors(data: Measurements, error_deg: float, seed: int) -> Mea
         aside = rng.normal(scale=sigma, size=ray.shape)
         # Only the part across the ray: to first order a rotation by `aside`, in radians.
         ray = ray + aside - (aside * ray).sum(1, keepdims=True) * ray
+        ray = ray[rng.random(len(ray)) >= missing]
+        # Directions of a normal vector are uniform on the sphere.
+        ray = np.concatenate([ray, rng.normal(size=(rng.binomial(len(ray), false), 3))])
         measured.append((ray / np.linalg.norm(ray, axis=1, keepdims=True)).astype(np.float32))
     return replace(data, directions=measured)
 

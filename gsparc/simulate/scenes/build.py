@@ -15,7 +15,7 @@ from gsparc.data import limits
 from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
-from gsparc.data.walls import RoomSettings
+from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.osm import Town, read_town
@@ -198,6 +198,7 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
 def _shoebox(scene: SceneSettings) -> Survey:
     """Our own exact image sources, whose transmitters are isotropic."""
     stated = from_settings(RoomSettings, scene.room or {}, "scene.room")
+    SIZE.check("scene.room.size_m", stated.size_m)
     size, reflection = np.array(stated.size_m, float), np.array(stated.reflection, complex)
     room = Room.from_size(size, reflection, occluders=stated.boxes)
     area = _area(scene, np.stack([room.lower, room.upper])[:, :2])

@@ -23,8 +23,12 @@ def test_directions_turn_by_what_was_asked_and_nothing_else():
     angle = np.linalg.norm(np.concatenate(there.directions) - np.concatenate(data.directions), axis=1)
     assert abs(np.degrees(np.sqrt(np.mean(angle**2) / 2)) - 2) < 0.2
     assert there.target is data.target and there.rx_position is data.rx_position
+    few = add_direction_errors(data, 0.0, seed=0, missing=0.5)
+    more = add_direction_errors(data, 0.0, seed=0, false=0.5)
+    counts = [sum(map(len, d.directions)) for d in (few, data, more)]
+    assert counts[0] < 0.6 * counts[1] and counts[2] > 1.4 * counts[1]
     with pytest.raises(ValueError, match="no directions of arrival"):
-        add_direction_errors(replace(data, directions=None), 1.0, seed=0)
+        add_direction_errors(replace(few, directions=None), 1.0, seed=0)
 
 
 def test_smaller_training_sets_are_subsets_of_larger_ones():
