@@ -38,9 +38,10 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
     # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
     most = np.where(data.censored_side(row) < 0, data.target[row, 0] * data.site.target_scale, np.nan)
+    told = scores.samples.get("served", scores.samples["prediction"])
     every = pd.DataFrame({
         "fold": scores.fold, "place": place[row], "station": data.station[row],
-        "predicted": scores.samples["prediction"], "measured": np.fmax(scores.samples["target"], most),
+        "predicted": told, "measured": np.fmax(scores.samples["target"], most),
     })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.
     links = every.groupby(["fold", "place", "station"]).max()

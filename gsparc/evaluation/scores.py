@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.data.units import power_in_decibels
-from gsparc.evaluation.given_heard import levels_given_heard
+from gsparc.evaluation.given_heard import levels_given_heard, levels_of_nearest_moment
 from gsparc.evaluation.metrics import METRICS, power_errors
 from gsparc.models.method import Method, predict_in_batches
 
@@ -169,13 +169,15 @@ def score_methods(
         # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
+        # Rows of `val` are not among those learned from where they are the ones scored.
+        known = np.sort(taught.train if eval_on == "val" else np.concatenate([taught.train, taught.val]))
+        if method.name == "nearest" and data.site.kind == "rssi" and data.station is not None:
+            scored["served"] = levels_of_nearest_moment(own.subset(known), data.subset(rows))
         if limited:
-            # Rows of `val` are not among those learned from where they are the ones scored.
-            known = taught.train if eval_on == "val" else np.concatenate([taught.train, taught.val])
-            silent, variance = own.censored_side(known) > 0, scored["variance"] * data.site.target_scale**2
+            variance = scored["variance"] * data.site.target_scale**2
             with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
                 level = power_in_decibels(scored["prediction"], variance)
-            given = levels_given_heard(own.subset(known[silent]), data.subset(rows), *level)
+            given = levels_given_heard(method, own.subset(known), data.subset(rows), *level)
             # Who learned from heard rows alone predicts such levels.
             scored |= given if method.uses_censored else {"heard_share": given["heard_share"]}
         samples.append(scored)

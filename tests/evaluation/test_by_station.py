@@ -178,3 +178,16 @@ def test_a_lead_with_silent_rows_hid_a_loss_on_heard_ones():
         "baseline",
         "the baseline kriging is 0.64 ± 0.10 dB better over 300 test rows in rmse_db of heard rows",
     ]
+
+
+def test_the_strongest_at_the_nearest_moment_was_in_no_table():
+    """Levels of each station's own nearest moments tell a best server worse: 52 for 63 % of a drive."""
+    near = listed([0, 10, 20, 30], [0, 1, 1, 0], [-70.0, -75, -75, -70])
+    rows = np.arange(4)
+    split = Split("own", (Fold(rows, rows[:0], rows),), "")
+    asked = listed([9, 9, 1, 1], [0, 1, 0, 1], [-90.0, -76, -71, -95])
+    own = Split("asked", (Fold(rows[:0], rows[:0], rows),), "")
+    scores = fit_baseline("nearest", asked, own, learned=(near, split)).scores
+    assert best_server(scores, asked) == {"best_server": 1.0}
+    del scores.samples["served"]
+    assert best_server(scores, asked) == {"best_server": 0.5}

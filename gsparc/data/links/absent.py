@@ -9,7 +9,7 @@ import numpy as np
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.errors import Severe
-from gsparc.data.links.strongest import StrongestLists, number_lists
+from gsparc.data.links.strongest import StrongestLists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
 from gsparc.data.selection import take_rows
@@ -56,10 +56,9 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         return 0
     # Noise below a stated level has its place in a list, and bounds what is not listed by that level.
     levels = np.where(np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels)
-    moment = number_lists(arrays["place"][heard], of[heard])
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
-    lists = StrongestLists.from_rows(moment, of[heard], levels[heard], moving, count)
+    lists = StrongestLists.from_rows(arrays["place"][heard], of[heard], levels[heard], moving, count)
     strongest = lists.are_strongest()
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
     said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
@@ -75,9 +74,11 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         stated = np.full(count, np.nan if floor is None else floor)
         floor = np.nan_to_num(stated, nan=levels[heard].min())
-        may = np.isnan(lists.level)
+        lost = lists.short_are_lost(floor)
+        may = np.isnan(lists.level) & (lists.full[:, None] | (not lost))
         how = "one that a full list leaves out is below its weakest"
-        how += f", in lists shorter than {lists.length}: below {floor.min():.4g} dB"
+        how += f", in lists shorter than {lists.length}: "
+        how += "unknown, strong ones are lost there" if lost else f"below {floor.min():.4g} dB"
     if absent != "auto":
         does = "unlisted ones are predicted too high, and figures of listed rows do not show it"
         if absent == "silent":
@@ -87,7 +88,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         check.notes.append(Severe(f"{missing} with dataset.absent={absent}: {does}; leave absent out"))
         return 0
     most, every = UNLISTED_EACH * len(heard), int(may.sum())
-    of_list, station, below = lists.bound_unlisted(floor, stations.position, most, may)
+    of_list, station, below = lists.bound_unlisted(floor, most, may)
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"

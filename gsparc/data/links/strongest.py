@@ -10,20 +10,17 @@ were lost, in outages or at random, are missing beside strong ones, too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import log_ndtr
 
 FULL = 0.3  # of the moments, that hold as many as any
 LEAST_MOMENTS = 20
-LOOKED_AT = 2_000  # moments whose neighbours are looked at
 ABOVE_DB = 6.0  # of a neighbour's weakest, where a station drops out of lists, at most
 WHOLE = 0.5  # of the rows, those of moments that leave none out
 RUN = 3  # such moments in a row: how alike neighbours are
-FALL_DB = 35.0  # a decade: what a level far from its station is expected below one near it
-NEAREST_M = 20.0  # to a station: nearer, levels rise no more
-SHADOWING_DB, ALIKE_M = 10.0, 100.0  # deviation of levels far apart, and what is not far
+NEAREST = 30  # lists that tell which stations may be listed at a place
 FLOOR = 2.0  # per cent of a station's levels that may lie below its floor
 STRONG_DB, SPREADS = 10.0, 3.0  # above the floor, at least; and in deviations between neighbouring places
 LEAST_LINKS = 30  # of those missing beside levels, and of strong levels
@@ -72,9 +69,10 @@ class StrongestLists:
 
     @classmethod
     def from_rows(
-        cls, lists: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int
+        cls, place: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int
     ) -> StrongestLists:
-        """Build from rows (n,) of `lists`, stations `who` of `count`, levels [dB], places `at` (n, 3) [m]."""
+        """Build from rows (n,) of numbered places `at` (n, 3) [m], stations `who` of `count`, levels [dB]."""
+        lists = number_lists(place, who)
         number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)
         table[which.reshape(-1), who] = level
@@ -87,41 +85,46 @@ class StrongestLists:
 
     def are_strongest(self) -> bool:
         """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak."""
-        moments_, count = self.level.shape
         sizes = np.isfinite(self.level).sum(1)
         piled = self.full.mean() >= FULL and self.full.sum() > (sizes == self.length - 1).sum()
-        if moments_ < LEAST_MOMENTS or not 2 <= self.length < count or not piled:
+        if len(sizes) < LEAST_MOMENTS or not 2 <= self.length < self.level.shape[1] or not piled:
             return False
-        used = np.unique(np.linspace(0, moments_ - 1, LOOKED_AT).astype(np.int64))
-        used = used[np.isfinite(self.place[used]).all(1)]
-        if len(used) < 2:
-            return False
-        near = used[cKDTree(self.place[used]).query(self.place[used], k=2)[1][:, 1]]
-        gone = np.isfinite(self.level[used]) & ~np.isfinite(self.level[near]) & self.full[near, None]
-        above = (self.level[used] - np.nanmin(self.level[near], 1)[:, None])[gone]
+        above = self.beside - np.nanmin(self.level, 1)[:, None]
+        above = above[np.isnan(self.level) & self.full[:, None] & np.isfinite(above)]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
+
+    @cached_property
+    def beside(self) -> np.ndarray:
+        """(M, T) levels at the nearest other place, NaN where there are none."""
+        known = np.flatnonzero(np.isfinite(self.place).all(1))
+        places, first, which = np.unique(self.place[known], axis=0, return_index=True, return_inverse=True)
+        result = np.full(self.level.shape, np.nan)
+        if len(places) > 1:
+            near = cKDTree(places).query(places, k=2)[1][:, 1]
+            result[known] = self.level[known[first[near[which.reshape(-1)]]]]
+        return result
+
+    def strong_beside(self, floor: np.ndarray) -> np.ndarray:
+        """Return which of `beside`, (M, T), are well above floors (T,) [dB]."""
+        apart = np.abs(self.level - self.beside)
+        spread = 1.4826 * float(np.nanmedian(apart if np.isfinite(apart).any() else 0))
+        return self.beside > floor + max(STRONG_DB, SPREADS * spread)
+
+    def short_are_lost(self, floor: np.ndarray) -> bool:
+        """Tell whether lists that are not full lack stations that are strong beside them, as in outages."""
+        missing = np.isnan(self.level) & ~self.full[:, None] & np.isfinite(self.beside)
+        return bool((missing & self.strong_beside(floor)).sum() > BESIDE_STRONG * missing.sum())
 
     def below_floor(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return floors (T,) [dB] and which links (M, T) lie below; None where missing ones look lost.
 
         A link beside a strong one, and a station with several of these, are taken as lost in any case.
         """
-        known = np.flatnonzero(np.isfinite(self.place).all(1))
-        places, first, which = np.unique(self.place[known], axis=0, return_index=True, return_inverse=True)
-        if len(places) < 2:
-            return None
-        near = cKDTree(places).query(places, k=2)[1][:, 1]
-        beside = np.full(self.level.shape, np.nan)
-        beside[known] = self.level[known[first[near[which.reshape(-1)]]]]
-        missing, pairs = np.isnan(self.level), np.isfinite(self.level) & np.isfinite(beside)
-        if not pairs.any():
-            return None
-        floor = np.full(self.level.shape[1], np.nan)
+        missing, floor = np.isnan(self.level), np.full(self.level.shape[1], np.nan)
         heard = ~missing.all(0)
         floor[heard] = np.nanpercentile(self.level[:, heard], FLOOR, axis=0)
-        spread = 1.4826 * float(np.median(np.abs(self.level - beside)[pairs]))
-        strong = beside > floor + max(STRONG_DB, SPREADS * spread)
-        edges, lost = missing & np.isfinite(beside), missing & strong
+        strong = self.strong_beside(floor)
+        edges, lost = missing & np.isfinite(self.beside), missing & strong
         if min(edges.sum(), strong.sum()) < LEAST_LINKS:
             return None
         if lost.sum() > min(LOST * strong.sum(), BESIDE_STRONG * edges.sum()):
@@ -129,45 +132,34 @@ class StrongestLists:
         several = (lost.sum(0) > 1) & (lost.sum(0) > BESIDE_STRONG / 2 * edges.sum(0))
         return floor, missing & ~strong & heard & ~several
 
-    def bound_unlisted(self, floor: np.ndarray, stations: np.ndarray, most: int, may: np.ndarray) -> Silent:
+    def listed_near(self, places: np.ndarray) -> np.ndarray:
+        """Return which stations (n, T) any of the lists nearest to places (n, 3) [m] holds."""
+        known = np.isfinite(self.place).all(1)
+        listed, result = np.isfinite(self.level[known]), np.zeros((len(places), self.level.shape[1]), bool)
+        near = cKDTree(self.place[known]).query(places, range(1, min(NEAREST, len(listed)) + 1))[1]
+        for one in near.T:  # together they would take much memory
+            result |= listed[one]
+        return result
+
+    def bound_unlisted(self, floor: np.ndarray, most: int, may: np.ndarray) -> Silent:
         """Return moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
         Half of them are all that some moments leave out, spread over the drive: only those tell how strong
-        stations are that are seldom listed. The rest tell most: a row does where the nearest that lists its
-        station lets expect it, by distances to the station, and less for each other row nearby that does.
+        stations are that are seldom listed. The rest are drawn, first of stations that are listed nearby.
 
         Args:
             floor: (T,) level of lists that are not full [dB].
-            stations: (T, 3) places [m], NaN where unknown.
             most: of all.
             may: (M, T) which links, none with a level.
         """
-        weakest = np.nanmin(self.level, 1)[:, None]
-        below = np.where(self.full[:, None], weakest, floor)
+        below = np.where(self.full[:, None], np.nanmin(self.level, 1)[:, None], floor)
         known = np.isfinite(self.place).all(1)
-        square = np.floor(np.where(known[:, None], self.place, 0)[:, :2] / ALIKE_M)
-        square = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
         whole = max(round(WHOLE * most / (self.level.shape[1] - self.length)), 1)
         start = np.linspace(0, len(self.level) - RUN, max(whole // RUN, 1)).astype(np.int64)
-        several = np.unique(start[:, None] + np.arange(RUN))
-        parts = []
-        for t in range(self.level.shape[1]):
-            listed = np.isfinite(self.level[:, t])
-            own, heard = np.flatnonzero(may[:, t] & known), np.flatnonzero(listed & known)
-            expected = np.full(len(own), -FALL_DB)
-            if len(heard):
-                far, near = cKDTree(self.place[heard]).query(self.place[own])
-                expected = self.level[heard[near], t] - below[own, t]
-                if np.isfinite(stations[t]).all():
-                    away = np.linalg.norm(self.place - stations[t], axis=1).clip(NEAREST_M)
-                    expected -= FALL_DB * np.log10(away[own] / away[heard[near]])
-                expected /= SHADOWING_DB * np.sqrt(1.2 - np.exp(-far / ALIKE_M))
-            tells = -log_ndtr(-expected)
-            order = np.lexsort((-tells, square[own]))
-            turn = np.arange(len(order)) - np.searchsorted(square[own][order], square[own][order])
-            parts.append(np.stack([own[order], np.full(len(own), t), tells[order] / (1 + turn)], 1))
-        moment, station, tells = np.concatenate(parts).T
-        tells = np.where(np.isin(moment, several), np.inf, tells)
-        chosen = np.sort(np.argsort(-tells, kind="stable")[:most])
-        moment, station = moment[chosen].astype(np.int64), station[chosen].astype(np.int64)
+        turn = np.random.default_rng(0).random(may.shape)
+        turn[known] += self.listed_near(self.place[known])
+        turn[start[:, None] + np.arange(RUN)] = np.inf
+        links = np.flatnonzero(may & known[:, None])
+        links = np.sort(links[np.argsort(-turn.flat[links], kind="stable")[:most]])
+        moment, station = np.unravel_index(links, may.shape)
         return moment, station, below[moment, station]

@@ -188,3 +188,23 @@ def test_what_lists_leave_out_was_called_not_heard():
     for more, said in (({}, "not listed"), ({"sensitivity_db": floor}, "not listed or not heard")):
         notes = interpret(Raw(arrays | more), "drive").notes
         assert len([note for note in notes if f"powers were {said}: below" in note]) == 1
+
+
+def test_stations_that_short_lists_lack_were_taken_as_weak_though_they_were_off():
+    """Four strongest of a measured city with outages: listed rows 8.3 dB, without these links 6.7 dB."""
+    one = network(5)
+    level = one.measured.copy()
+    level[100::4, 3:] = np.nan  # all but one site
+    strong = np.argsort(np.argsort(-np.nan_to_num(level, nan=-999), 1), 1) < 4
+    moment, cell = np.nonzero(strong & np.isfinite(level))
+    arrays = one.arrays(6) | {
+        "rx_position": one.moment[moment],
+        "station": cell,
+        "rssi_db": level[moment, cell],
+    }
+    reading = interpret(Raw(arrays, {}), "drive")
+    assert any("shorter than 4: unknown, strong ones are lost there" in note for note in reading.notes)
+    short = {tuple(at) for at in one.moment[100::4].round(3)}
+    data = reading.data
+    silent = (data.moving + data.site.origin)[data.censored > 0].round(3)
+    assert len(silent) and not short & {tuple(at) for at in silent}
