@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
@@ -22,7 +21,7 @@ from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
 from gsparc.models.method import Method
 from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.candidates import Candidate
-from gsparc.models.mixture.weights import LEAST_HELD, in_error_unit
+from gsparc.models.mixture.weights import LEAST_HELD, HeldOutPair, in_error_unit
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.worker import end_when
@@ -212,23 +211,26 @@ def weigh_process(
         few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
         log.info("%s: a Gaussian process alone", few if field.count_components() else "no Gaussians")
         return (process, 1.0), None
-    products, explained = [], None
+    rows, explained, weight = [], None, 0.0
     val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
     if len(val):
         batch = data.batch(val)
         means = (method.predict(batch).mean for method in (field, process))
         own, plain, target = (in_error_unit(values, data.site) for values in (*means, batch.target))
         explained = solution_weights.explained_variance(own, target, data.site.kind != "csi")
-        products.append(solution_weights.error_products([own, plain], target))
+        if spectra:
+            rows.append(
+                HeldOutPair(*(part.detach().double().flatten(1).numpy() for part in (own, plain, target)))
+            )
+        else:
+            weight = solution_weights.stacking_weights([own, plain], target, np.arange(len(val)))[1]
     if left_out is not None:
-        own, plain, target = _held_out_images(left_out, distance)
-        products.append(solution_weights.error_products([own, plain], target))
+        rows.append(_held_out_pair(left_out, distance))
         if explained is None:
+            own, target = (torch.from_numpy(part) for part in (rows[-1].own, rows[-1].target))
             explained = solution_weights.explained_variance(own, target, True)
-    gram = np.concatenate(products)
-    # PSNR is a logarithm: a row of spectra counts alike however large its errors are.
-    gram = solution_weights.relative_products(gram) if spectra else gram
-    weight = float(solution_weights.choose_weights(gram, np.arange(len(gram)))[1])
+    if spectra:
+        weight = solution_weights.share_of_second(rows)
     log.info(
         "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
         len(val), 0 if left_out is None else len(left_out.centres), weight,
@@ -236,9 +238,8 @@ def weigh_process(
     return ((process, weight) if weight > 0 else None), explained
 
 
-def _held_out_images(left_out: LeftOut, distance: float | None) -> tuple[Tensor, ...]:
-    """Images (n, P) as field and process predict them and as measured, as far from others as queries are."""
+def _held_out_pair(left_out: LeftOut, distance: float | None) -> HeldOutPair:
+    """Training rows as far from what is left as held-out rows are, as field and process predict them."""
     gap = left_out.nearest_gap(distance)
     own, target = left_out.predictions_and_targets(gap, left_out.predicted)
-    plain, _ = left_out.predictions_and_targets(gap, left_out.predict_by_process())
-    return tuple(map(torch.from_numpy, (own, plain, target)))
+    return HeldOutPair(own, left_out.predictions_and_targets(gap, left_out.predict_by_process())[0], target)

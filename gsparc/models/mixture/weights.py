@@ -1,4 +1,4 @@
-"""Weights of several predictors: of least squared error on held-out rows, or of least relative to each row's.
+"""Weights of several predictors: of least squared error, or of largest PSNR, on held-out rows.
 
 Stacked regression with weights that are not negative and sum to one: L. Breiman, "Stacked regressions",
 Machine Learning 24 (1996). With e_ik the error of prediction k in row i, the squared error of a mixture w is
@@ -7,6 +7,9 @@ w^T G_i w, G_i = e_i e_i^T, so that weights are functions of these products alon
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from scipy.optimize import nnls
@@ -14,12 +17,15 @@ from scipy.stats import norm, t
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.models.target_rows import TINY_POWER, decibels
+from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER, decibels
 
 LEAST_HELD = 4  # rows, for weights to mean anything
+LEAST_GAIN_DB = 0.1  # for which a query may take several times as long
+FEW_ROWS = 40  # fewer do not tell a weight from a half, where the two differ by less than twice the error
 UNUSED = 0.05  # weight below which a predictor is left out of a mixture
+SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
-LEAST_ERROR = 1e-9  # of a row, squared: it is divided by
+LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
 
 def stacking_weights(
@@ -33,19 +39,46 @@ def stacking_weights(
         unit: (n,), rows of one unit are not independent.
         deviations: see `choose_weights`.
     """
-    chosen = choose_weights(error_products(predicted, target), unit, deviations)
+    missed = torch.stack([to_real_entries((one - target).detach()) for one in predicted], 1)  # (n, M, P)
+    chosen = choose_weights((missed @ missed.mT).numpy(), unit, deviations)
     return tuple(float(weight) for weight in chosen)
 
 
-def error_products(predicted: list[Tensor], target: Tensor) -> np.ndarray:
-    """Return products (n, M, M) of the errors of M predictions (n, ...) of targets (n, ...)."""
-    missed = torch.stack([to_real_entries((one - target).detach()) for one in predicted], 1)  # (n, M, P)
-    return (missed @ missed.mT).numpy()
+@dataclass(frozen=True)
+class HeldOutPair:
+    """Rows that two predictors did not learn from.
+
+    Attributes:
+        own, plain: (n, P) predictions of the first and the second.
+        target: (n, P), the same entries as measured.
+    """
+
+    own: np.ndarray
+    plain: np.ndarray
+    target: np.ndarray
+
+    def log_errors(self, weight: float) -> np.ndarray:
+        """Return the log (n,) of each row's mean squared error, the second weighed by `weight`."""
+        mixed = (1 - weight) * self.own + weight * self.plain
+        return np.log(((mixed - self.target) ** 2).mean(1) + LEAST_ERROR)
 
 
-def relative_products(gram: np.ndarray) -> np.ndarray:
-    """Return products (n, M, M) of errors relative to each row's own, as means of logarithms count them."""
-    return gram / np.maximum(np.einsum("nkk->n", gram), LEAST_ERROR)[:, None, None]
+def share_of_second(parts: Sequence[HeldOutPair]) -> float:
+    """Return the weight in [0, 1] of the second of two predictors that makes the mean PSNR of rows largest.
+
+    0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
+    second alone is better than the first: a query may take longer rather than lose to it. Few rows that
+    do not tell the two apart weigh them alike (J. M. Bates and C. W. J. Granger, 1969).
+    """
+    first, second = (np.concatenate([part.log_errors(share) for part in parts]) for share in (0.0, 1.0))
+    gain, unsure = mean_and_error(first - second, np.arange(len(first)))
+    if len(first) < FEW_ROWS and abs(gain) < 2 * unsure:
+        return 0.5
+    means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
+    if means[0] <= means[-1] and DECIBELS_PER_NAT * (means[0] - min(means)) < LEAST_GAIN_DB:
+        return 0.0
+    best = float(SHARES[int(np.argmin(means))])
+    return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
 
 
 def explained_variance(predicted: Tensor, target: Tensor, remove_mean: bool) -> float:
