@@ -131,8 +131,9 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
         known = (told >= splits.LEAST_ROWS) | ((asked > 0) & np.isfinite(places).all(1))
         kept = fold.test[known[data.station[fold.test]]]
         folds.append(replace(fold, test=kept) if len(kept) else fold)
-    if sum(len(fold.test) for fold in folds) < sum(len(fold.test) for fold in split.folds):
-        log.warning("split: stations of under %d training rows are not asked about", splits.LEAST_ROWS)
+    if left := sum(len(old.test) - len(new.test) for old, new in zip(split.folds, folds, strict=True)):
+        said = "split: %d test rows are left out, of stations with under %d training rows"
+        log.warning(said, left, splits.LEAST_ROWS)
     return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
 
 

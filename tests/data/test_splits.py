@@ -361,7 +361,7 @@ def test_a_survey_whose_transmitters_were_rarely_heard_had_no_table(caplog):
     split = split_for({"name": "random", "test_fraction": 0.4}, data)
     (fold,) = split.folds
     assert set(data.station[fold.test]) == {0, 1, 2} and {3, 4} & set(data.station[fold.train])
-    assert "split: stations of under 4 training rows are not asked about" in caplog.text
+    assert "test rows are left out, of stations with under 4 training rows" in caplog.text
     assert split.sha256 == hash_indices(split.folds)
     for name in ("zero", "gp", "kriging"):
         wrap_per_station(method_class(name)(), data).fit(data, fold, FitContext(Path()))
