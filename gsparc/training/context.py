@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -64,6 +64,7 @@ class FitContext:
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
         leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
         race: the best of other solutions on these groups: searches end that fall behind.
+        beside: solutions that were fitted before this one, by name.
         resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -89,6 +90,7 @@ class FitContext:
     split: SplitSettings | FileSettings | None = None
     leave_out: tuple[np.ndarray, ...] = ()
     race: Race | None = None
+    beside: Mapping[str, Any] = field(default_factory=dict)
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16

@@ -24,7 +24,7 @@ from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.frame import Frame, SourcePaths, SourcesInFrame, require_static_phase
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
-from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import TimeBudget
@@ -152,6 +152,10 @@ class DirectionalGP(SourcesInFrame):
             self.posterior = replace(self.posterior, visibility=again)
             self._refit_powers_and_kernel()
         return changed
+
+    def points_and_amplitudes(self) -> Found:
+        """Return places [m], local, and amplitudes of the sources, to start a search from."""
+        return self.posterior.positions.points + self._fitted_frame().middle, self.posterior.power.sqrt()
 
     # ---- answers ----
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:

@@ -18,7 +18,7 @@ from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
 from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene
-from gsparc.models.image_sources.search import Search, SearchSettings
+from gsparc.models.image_sources.search import Found, Search, SearchSettings
 from gsparc.processes.worker import Cancelled, cancel_when, end_when, step_limit
 from gsparc.training.time_budget import TimeBudget
 
@@ -49,7 +49,7 @@ class Member:
 
 def run_searches(
     row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
-    budget: TimeBudget, look: Look | None = None,
+    budget: TimeBudget, look: Look | None = None, start: Found | None = None,
 ) -> list[Member]:  # fmt: skip
     """Run one search per set of rows, best first; at least one, others while the budget lasts.
 
@@ -63,6 +63,7 @@ def run_searches(
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: effort of each, and what ends all together.
         look: at the first search after each of its rounds, and after the last.
+        start: sources that each starts from.
 
     Raises:
         Behind: a look says so.
@@ -90,7 +91,7 @@ def run_searches(
                 look(rows, estimate_phases(rows, search.scene, QUADRATURE, noise_floor))
             return ended()
 
-        search = Search(rows, transmitter, settings, number, look_then_has_ended)
+        search = Search(rows, transmitter, settings, number, look_then_has_ended, start)
         scene = estimate_phases(rows, search.run(), QUADRATURE, noise_floor)
         scene = refine_scene(rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS)
         if look is not None and number == 0:

@@ -33,7 +33,7 @@ from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
 from gsparc.models.image_sources.refine import POLISHING_STEPS
 from gsparc.models.image_sources.rows import Rows, draw_rows, measured_places, ranges_at, static_array
 from gsparc.models.image_sources.scene import JITTER, Scene
-from gsparc.models.image_sources.search import SearchSettings
+from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import hesse_form, image_rotations
@@ -59,6 +59,9 @@ class ImageSourceGP(SourcesInFrame):
 
     Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
 
+    Attributes:
+        start: places [m], local, and amplitudes of sources that each search starts from, or None.
+
     Raises:
         SettingError: a setting that cannot be.
     """
@@ -67,6 +70,7 @@ class ImageSourceGP(SourcesInFrame):
     members: tuple[Posterior, ...] = ()
     _groups: tuple[np.ndarray, ...] = ()
     takes_budget = True
+    start: Found | None = None
 
     def __init__(
         self, searches: int = SearchSettings.searches, search_rows: int = SearchSettings.search_rows,
@@ -116,7 +120,8 @@ class ImageSourceGP(SourcesInFrame):
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = partial(self._log_look, context.race, group, data.batch(group), [math.inf])
-        members = self._run_searches(row_sets, settings, budget, look)
+        given = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
+        members = self._run_searches(row_sets, settings, budget, look, given)
         if calibrated:
             again = self._calibrate_antennas(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
@@ -169,12 +174,13 @@ class ImageSourceGP(SourcesInFrame):
         return replace(data, target=data.target * factors.numpy()[:, None])
 
     def _run_searches(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, look: Look | None = None
-    ) -> list[Member]:
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        look: Look | None = None, start: Found | None = None,
+    ) -> list[Member]:  # fmt: skip
         """What `run_searches` finds about the static end, best first."""
         still, floor = self._transmitter_in_frame(), self.noise_floor
         self.asks_visibility = ensemble.occludes_antennas_alike(row_sets[0])
-        return ensemble.run_searches(row_sets, still, settings, floor, budget, look)
+        return ensemble.run_searches(row_sets, still, settings, floor, budget, look, start)
 
     def _log_look(
         self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene

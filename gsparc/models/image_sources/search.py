@@ -42,6 +42,7 @@ PARENTS = 4  # of a new source, tried in turn until one is found
 SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
 PRUNE = 5.0  # least gain of a source kept [nats]
+Found = tuple[Tensor, Tensor]  # places and amplitudes of sources
 PATIENCE, PROGRESS = 3, SEQUENCE_SCORE  # rounds without a gain of a source's nats, that end the search
 REARRANGED_EVERY = 3  # rounds between attempts at walls, and at the visibility's lengths
 LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
@@ -85,11 +86,12 @@ class Search:
         settings: how.
         number: of the search, added to the seed of the candidates.
         after_round: called after every round; no other starts when it says so.
+        found: places (K, 3) float64 [m] of sources to start from, and their amplitudes (K,).
     """
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
-        after_round: Callable[[], bool],
+        after_round: Callable[[], bool], found: Found | None = None,
     ) -> None:  # fmt: skip
         self.rows, self.settings, self.after_round = rows, settings, after_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
@@ -98,11 +100,18 @@ class Search:
         self.box = torch.stack([measured.amin(0) - settings.margin, measured.amax(0) + settings.margin])
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
         self.scene = Scene.from_static_end(transmitter, loudness, math.log(NOISE))
+        if found is not None and settings.order:
+            places, amplitude = (each[: settings.max_sources - 1] for each in found)
+            images = (places - transmitter).norm(dim=1) > 2 * orders.MIN_IMAGE_SHIFT_M
+            planes = bisector(transmitter, places[images])
+            words: list[Reflections] = [(i,) for i in range(len(planes))]
+            self.scene = replace(self.scene, planes=planes).add_sequences(words, amplitude[images])
 
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
         self._refine(ROUND_STEPS)
+        self._try_paired_walls()  # among sources that it starts from
         for number in count():
             added = self._add_sequences()
             free = not added

@@ -26,8 +26,14 @@ Candidate = Callable[[InitSettings, bool, FitContext], ClosedForm]
 
 
 def make_sources(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
-    """Return image sources of several searches."""
-    return ImageSourceGP(**_search_arguments(init, clutter, context))
+    """Return image sources of several searches.
+
+    Searches start where measured directions meet, where these were solved before.
+    """
+    method = ImageSourceGP(**_search_arguments(init, clutter, context))
+    if "rays" in context.beside:
+        method.start = context.beside["rays"].points_and_amplitudes()
+    return method
 
 
 def make_scene(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:

@@ -78,7 +78,7 @@ def fit_candidates(
             leave_out = groups if name in OPEN_ENDED else ()  # these predict the groups themselves
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
-            within = replace(within, leave_out=leave_out, race=race)
+            within = replace(within, leave_out=leave_out, race=race, beside=fields)
             with heeded.set_apart() as read[name], end_when(budget.is_spent):
                 field = parts[name](settings, effects.visibility is not False, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)

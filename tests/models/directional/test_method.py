@@ -17,7 +17,10 @@ from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.directional.position_refine import UncertainPositions
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.method import ImageSourceGP
+from gsparc.models.image_sources.rows import draw_rows
 from gsparc.models.image_sources.scene import spherical_waves
+from gsparc.models.image_sources.search import Search, SearchSettings
+from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.kernel import matern32_of_squares
@@ -47,6 +50,21 @@ def test_few_receivers_are_enough_with_directions():
     assert len(found) == len(sources) == 7 and float(apart.max()) < 0.02
     assert error(method, data, fold.test) < 0.02
     assert "7 triangulated sources" in note
+
+
+def test_a_search_starts_from_sources_where_rays_meet():
+    data, _, sources = directed(60)
+    rows = np.arange(60)
+    fold, still = Fold(rows, rows[:0], rows[:0]), torch.from_numpy(data.site.static_position).double()
+    method = fitted(data, fold)[0]
+    found = method.points_and_amplitudes()
+    for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
+        settings = SearchSettings(order=order)
+        start = Search(draw_rows(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
+        assert len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
+    context, init = FitContext(beside={"rays": method}), InitSettings()
+    assert torch.equal(CANDIDATES["sources"](init, True, context).start[0], found[0])
+    assert CANDIDATES["sources"](init, True, FitContext()).start is None
 
 
 def test_occlusion_by_a_pillar_is_learned(pillar):

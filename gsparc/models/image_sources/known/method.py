@@ -20,7 +20,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
-from gsparc.models.image_sources.search import NOISE, SearchSettings
+from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections, hesse_form
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import end_when
@@ -58,9 +58,10 @@ class KnownWallsGP(ImageSourceGP):
         return ImageSourceGP
 
     def _run_searches(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, look: Look | None = None
-    ) -> list[Member]:
-        """The images in the walls, refined; no search, so that nothing is looked at."""
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        look: Look | None = None, start: Found | None = None,
+    ) -> list[Member]:  # fmt: skip
+        """The images in the walls, refined; no search, so that nothing is looked at or started from."""
         rows = row_sets[0]
         given = self._initial_scene(rows, settings)
 
