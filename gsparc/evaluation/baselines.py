@@ -23,7 +23,9 @@ BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 
 def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     """Return names of all plain methods that serve these measurements and rows."""
-    site, names = data.site, BASELINES
+    site = data.site
+    # Of a band from the other at the same moment, a linear map is the plainest.
+    names = BASELINES if data.uplink is None else (*BASELINES, "ridge")
     if site.kind == "rssi":
         # Both fit decibels over distance, which only powers have.
         return (*names, "distance_law", "kriging")

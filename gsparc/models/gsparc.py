@@ -20,6 +20,7 @@ from gsparc.models.refined_places import position_errors
 from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import EffectSettings, resolve_terms
+from gsparc.models.uplink.method import UplinkField
 
 log = logging.getLogger(__name__)
 
@@ -45,8 +46,10 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
         # No Gaussians means the residual alone, where that is not switched off.
         placed = count > 0 or not plain
         residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
-        # The first that is called for: phases relative to neighbours leave no source to be placed.
+        # The first that is called for: what was heard at the same moment tells more than where it was
+        # heard; phases relative to neighbours leave no source to be placed.
         table: tuple[tuple[bool, type[Method]], ...] = (
+            (data.uplink is not None, UplinkField),
             (site.phase_reference == "neighbours", Channels),
             (terms.power, Powers),
             (terms.moving_array and placed, Bearings),
@@ -64,8 +67,8 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
             why = "spectra of a moving array hide nothing" if hides else why
             raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
         reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
-        if site.phase_reference == "neighbours":
-            options = []  # whatever is said, it is one process
+        if kind is UplinkField or site.phase_reference == "neighbours":
+            options = []  # whatever is said, it is one method
         elif kind is Channels:
             why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
             reasons.append(f"the residual is all there is: {why}")
@@ -120,6 +123,8 @@ class Gsparc(LearnsTogether):
 
     def create_as(self, target: str) -> Method:
         """See `MethodFactory`; under its own name."""
+        if target == import_path(UplinkField):
+            return UplinkField()
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count

@@ -38,14 +38,14 @@ class UplinkField(UplinkMethod):
         search: source search.
         teachers: largest number of training snapshots of the error model.
         shrink: shrink predictions towards zero by the expected error.
-        seed: of the subsample of training snapshots.
+        seed: of the subsample of training snapshots; None: that of the run.
     """
 
     name = "uplink"
 
     def __init__(
         self, search: SearchSettings = SearchSettings(), teachers: int = 1200,
-        shrink: bool = True, seed: int = 0,
+        shrink: bool = True, seed: int | None = None,
     ) -> None:  # fmt: skip
         if teachers < 50:
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
@@ -59,7 +59,7 @@ class UplinkField(UplinkMethod):
         started = TimeBudget()
         self.site = self._require_uplink(data)
         self.error_model = None
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng(context.seed if self.seed is None else self.seed)
         few = rng.permutation(fold.val if len(fold.val) else fold.train)[:100]
         errors = {}
         for leakage in LEAKAGES:
