@@ -200,7 +200,7 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
             config.dataset[key] = str(Path(given).resolve())
     if start is not None:
         try:
-            module.measurements = align_to_site(module.measurements, checkpoint.read(start).site)
+            module.measurements = align_to_site(module.measurements, checkpoint.read(start).site, whole=True)
         except ValueError as error:
             raise ValueError(f"init_from={start}: {error}") from None
     return module

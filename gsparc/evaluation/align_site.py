@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -13,14 +14,18 @@ from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.units import WATTS
 from gsparc.prediction.query import SAME_PLACE_M
 
+log = logging.getLogger(__name__)
+
 ANOTHER = "give data with as many, or another ckpt"
 
 
-def align_to_site(data: Measurements, site: Site) -> Measurements:
+def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Measurements:
     """Return `data` in the local coordinates and target units (watts, milliwatts) of a model's training.
 
+    Rows of stations that the model does not know are left out, which is logged; `whole`: they are refused.
+
     Raises:
-        ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
+        ValueError: another kind, grid, moving end or static place, or no station that the model knows.
     """
     own = data.site
     for what in ("kind", "static_end", "grid"):
@@ -36,7 +41,7 @@ def align_to_site(data: Measurements, site: Site) -> Measurements:
         gap = float(np.linalg.norm(own.static_position + shift - site.static_position))
         if gap > SAME_PLACE_M:
             raise ValueError(f"the static {own.static_end} of {own.name} is {gap:.3g} m from the model's")
-    data = _renumbered(data, site, shift)
+    data = _renumbered(data, site, shift, whole)
     own = data.site
     units, rescale = (own.level_unit, site.level_unit), own.target_scale / site.target_scale
     if set(units) <= set(WATTS):  # what is called dB may be either
@@ -79,7 +84,7 @@ def _about(data: Measurements, site: Site) -> Measurements:
     return replace(data, site=facts, tx=moved(data.tx), rx_position=moved(data.rx_position))
 
 
-def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measurements:
+def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) -> Measurements:
     """`data` with the numbers that a model of `site` has for its stations; `shift` (3,) [m] leads there.
 
     Another file, or part of one, may list them in another order. They are known by their places, and where
@@ -92,18 +97,24 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
         have = ["one static end" if of is None else f"{len(of)} stations" for of in (ours, theirs)]
         raise ValueError(f"{data.site.name} has {have[0]}, the model {have[1]}; {ANOTHER}")
     # A list of cells has names of its own beside those that a drive gives them.
-    called, known = ([*map(set, zip(of.name, of.label or of.name, strict=True))] for of in (ours, theirs))
+    called, learned = ([*map(set, zip(of.name, of.label or of.name, strict=True))] for of in (ours, theirs))
     gap = np.linalg.norm(ours.position[:, None] + shift - theirs.position, axis=2)
     number = np.full(len(ours), -1)
     for t, names in enumerate(called):
         # Sectors of one mast share a place: there the name decides, as it does where nobody knows the place.
-        alike = [i for i, own in enumerate(known) if names & own and not gap[t, i] > SAME_PLACE_M]
+        alike = [i for i, own in enumerate(learned) if names & own and not gap[t, i] > SAME_PLACE_M]
         near = np.flatnonzero(gap[t] <= SAME_PLACE_M).tolist()
         if alike or len(near) == 1:
             number[t] = (alike or near)[0]
-    if (number < 0).any():
-        raise ValueError(_explain_unknown(data.site.name, ours, theirs, number < 0))
     assert data.station is not None
+    known = number[data.station] >= 0
+    if not known.all():
+        told = _explain_unknown(data.site.name, ours, theirs, number < 0)
+        if whole or not known.any():
+            raise ValueError(told + "; dataset.stations=[NAME,...] keeps the others" * bool(known.any()))
+        log.warning("%s: %d of %d rows are left out", told, (~known).sum(), len(known))
+        data = data.subset(np.flatnonzero(known))
+        assert data.station is not None
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
     end = "tx" if facts.static_end == "tx" else "rx_position"
     there = (theirs.position - shift)[number[data.station]]
@@ -114,13 +125,13 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
 
 
 def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.ndarray) -> str:
-    """Which stations of a file a model does not know, and what to do."""
-    lost, kept = ([ours.name[t] for t in np.flatnonzero(flags)] for flags in (unknown, ~unknown))
+    """Which stations of a file a model does not know, and what to do where it knows none."""
+    lost = [ours.name[t] for t in np.flatnonzero(unknown)]
     fault = f"stations {list_first(lost)} of {source} are none of the model's, {list_first(theirs.name)}"
     if not {*all_names(ours)} & {*all_names(theirs)}:
         way = "dataset.columns.station=COLUMN takes another column, dataset.stations_file=FILE a list"
         return f"{fault}: no name in common; {way} that has both"
-    return f"{fault}, by name and place; leave them out: dataset.stations=[{list_first(kept, 9)}]"
+    return f"{fault}, by name and place"
 
 
 def _times(values: Any, factor: float) -> Any:

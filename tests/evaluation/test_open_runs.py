@@ -65,10 +65,20 @@ def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power)
     assert (same.site.level_unit, same.site.target_scale) == (model, data.site.target_scale)
 
 
-def test_a_station_that_the_model_does_not_know_is_refused():
-    said = r"stations roof of arrays are none of the model's, north, east, by .*stations=\[north, east\]"
-    with pytest.raises(ValueError, match=said):
-        align_to_site(town(), town((0, 1)).site)
+def test_a_second_survey_was_refused_where_it_heard_new_stations(caplog):
+    """New access points are the rule: what is known is judged, the others' rows are counted."""
+    site = town((0, 1)).site
+    said = "stations roof of arrays are none of the model's, north, east, by name and place"
+    known = align_to_site(town(), site)
+    assert {*known.station.tolist()} == {0, 1} and known.site.stations.name == site.stations.name
+    np.testing.assert_allclose(known.target, align_to_site(town((0, 1)), site).target, rtol=1e-5)
+    assert f"{said}: {len(WALK)} of {3 * len(WALK)} rows are left out" in caplog.text
+    with pytest.raises(
+        ValueError, match=said + r"; dataset\.stations"
+    ):  # a training would learn from less than it was given
+        align_to_site(town(), site, whole=True)
+    with pytest.raises(ValueError, match=r"stations roof .* no name in common"):
+        align_to_site(town((2,)), site)
     alone = from_arrays({"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0]})
     with pytest.raises(ValueError, match="arrays has one static end, the model 3 stations"):
         align_to_site(alone, replace(town().site, name="arrays"))
