@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.amplitudes import amplitudes_to_levels
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
@@ -110,7 +111,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     Raises:
         DataError: all problems, with array and row.
     """
-    check = Checker(raw, str(source))
+    check = Checker(amplitudes_to_levels(raw), str(source))
     check.check_names()
     measured = check.measurement()
     stated = {name: "stated" for name in raw.arrays if name == "sensitivity_db"}  # lists add one of their own

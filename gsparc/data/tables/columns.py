@@ -175,7 +175,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
 
 MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
 # With a number behind the word: `AP1` is a station's levels, `ap` a column of their names.
-NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS})[\W_]*[a-z]?\d+[\W_]*$")
+NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
 
 
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
@@ -190,9 +190,9 @@ def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
 
 def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[str]:
     """Warnings of columns that are not used though their heads speak of something that matters."""
-    stations = chosen.get("station", ())
+    stations = [column.head for column in chosen.get("station", ())]
     notes: list[str] = []
-    names = sheet.joined(c.head for c in stations) if stations else np.zeros(len(sheet), str)
+    apart: dict[str, str] = {}  # topics of columns that tell stations apart, each beside those before it
     ends, have = set(heads.END_WORDS), {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
     for head in sheet.heads:
         lone = "station" not in chosen and not any(columns[0].label for columns in chosen.values())
@@ -206,14 +206,23 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
         # Heights are said per end or for the end without a name; either is enough.
         if wanted in chosen or (wanted == "z" and {"rx_z", "tx_z"} & set(chosen)):
             continue
-        words = sheet.words(head)
+        words, beside = sheet.words(head), [*stations, *apart]
+        names = sheet.joined(beside) if beside else np.zeros(len(sheet), str)
         pairs = {pair for pair in zip(names.tolist(), words.tolist(), strict=True) if pair[1]}
         groups = len({name for name, _ in pairs}) if wanted != "z" else 1
         # A column matters where one station has several values of it, with rows enough for each.
         if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
-            joined = "+".join([*(column.head or "" for column in stations), head])
-            how = heads.SHEET["remedies"][topic].format(head=head, joined=joined)
+            joined, remedy = "+".join([*map(str, beside), head]), heads.SHEET["remedies"].get(topic)
+            if remedy is None:
+                apart[head] = topic
+                continue
+            how = remedy.format(head=head, joined=joined)
             notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
+    if apart:
+        s, do = ("s", "is") if len(apart) == 1 else ("", "are")
+        how = f"dataset.columns.station={'+'.join([*map(str, stations), *apart])} tells them apart"
+        told = _names(Column(head=head) for head in apart)
+        notes.append(Caution(f"{told} speak{s} of {next(iter(apart.values()))} and {do} not used: {how}"))
     return notes + _more_levels(sheet, chosen.get("rssi_db", ()), used)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +130,10 @@ class Builder:
                     return self.refuse(f"{fault}; dataset.columns.rssi_db={head}*-1 takes losses for levels")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
-            return self.refuse(f"{fault}; say dataset.columns.rssi_db=COLUMN")
+            numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
+            family, count = numbered.most_common(1)[0]
+            alike = f"'{family}' (levels) or .csi_amp='{family}' (amplitudes)" if count > 1 else "COLUMN"
+            return self.refuse(f"{fault}; say dataset.columns.rssi_db={alike}")
         if role not in LEVELS:
             self._channels(CHANNELS if role in CHANNELS else POLAR)
             return role
@@ -158,13 +162,20 @@ class Builder:
         """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
         pairs = [self._tones(part) for part in names]
         # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
+        amplitudes = names == POLAR and not pairs[1]
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         for name, own, other in zip(names, pairs, pairs[::-1], strict=True):
-            for tone in sorted(set(other) - set(own)):
+            for tone in [] if amplitudes else sorted(set(other) - set(own)):
                 fault = f"{other[tone].head!r} has no {name} beside it"
                 self.refuse(f"{fault}; say dataset.columns.{name}=COLUMN")
-        parts = [[part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs]
+        parts = [[part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs if part]
         if self.sheet.problems:
+            return
+        if amplitudes:
+            self.arrays["csi"] = np.stack([v for v in parts[0] if v is not None], axis=1)
+            if (self.arrays["csi"] < 0).any():
+                head = pairs[0][self.tones[0]].head or ""
+                self.refuse("amplitudes below 0: levels? say dataset.columns.rssi_db='NAME_*'", head)
             return
         first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
         if names == POLAR:
