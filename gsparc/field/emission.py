@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, choice, number, setting, whole
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.ops.networks import networks
+from gsparc.ops.transforms import full_precision
 
 ACTIVATIONS = ("auto", "sigmoid", "softplus", "linear")
 EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities
@@ -78,11 +78,13 @@ class Emission(nn.Module):
         """Return network outputs before the activation: position (B, 3) [m] -> (B, N, C)."""
         encoded = self.encoding(position)
         if not self.settings.hidden:
-            count, width, channels = self.weight2.shape
-            # Without hidden units all Gaussians read the same features: one product.
-            flat = self.weight2.permute(1, 0, 2).reshape(width, count * channels)
-            return (encoded @ flat).view(len(encoded), count, channels) + self.bias2
-        return networks(encoded, self.weight1, self.bias1, self.weight2, self.bias2)
+            return _shared_product(encoded, self.weight2) + self.bias2
+        return self._networks(encoded.to(self.weight1.dtype))  # half precision of `torch.autocast`
+
+    @full_precision
+    def _networks(self, encoded: Tensor) -> Tensor:
+        inner = torch.relu(_shared_product(encoded, self.weight1) + self.bias1)
+        return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
 
     def forward(self, position: Tensor, distance: Tensor) -> Tensor:
         """Return emissions (B, N, C) at positions (B, 3) [m]; distance (B, N) is d_i / d_ref (eq. 1)."""
@@ -103,3 +105,10 @@ class Emission(nn.Module):
             return positive + torch.log(-torch.expm1(-positive))
         logits = torch.logit(emission.clamp(EMISSION_FLOOR, 1 - EMISSION_FLOOR))
         return logits + distance.log().unsqueeze(-1) if self.settings.log_distance else logits
+
+
+def _shared_product(encoded: Tensor, weight: Tensor) -> Tensor:
+    """Features (B, E), the same of all Gaussians, times the weights (N, E, K) of each: (B, N, K)."""
+    count, width, outputs = weight.shape
+    # One product, as all Gaussians read the same features.
+    return (encoded @ weight.permute(1, 0, 2).reshape(width, count * outputs)).view(-1, count, outputs)

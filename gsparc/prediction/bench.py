@@ -18,7 +18,6 @@ from gsparc.field.losses import spectrum_loss
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.optimizer import OptimizerSettings, optimizer_for
 from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
-from gsparc.ops.networks import networks, plain_networks
 from gsparc.ops.projection import Projection
 
 Call = Callable[[], object]
@@ -112,11 +111,6 @@ def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Ite
     yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), reference)
     yield make_case("forward and gradients", backward)
     yield make_case("weights of channels", weights)
-    emission = model.emission
-    layers = [p.detach() for p in (emission.weight1, emission.bias1, emission.weight2, emission.bias2)]
-    encoded = emission.encoding(torch.randn(BATCH, 3, generator=draw).to(device))
-    of = f"{count} x {BATCH}"
-    yield Case("emission", of, lambda: networks(encoded, *layers), lambda: plain_networks(encoded, *layers))
 
 
 def loss_case(device: str = "cpu") -> Case:

@@ -2,7 +2,6 @@
 #define GSPARC_PACKS
 #include "backward.h"
 #include "frozen.h"
-#include "networks.h"
 #include "project.h"
 #include "query.h"
 #include "similarity.h"

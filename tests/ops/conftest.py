@@ -17,7 +17,7 @@ OF_THE_CPU = {
     "test_compute_kernels",  # tests/cuda/test_cuda.py has those of a GPU, in float32
     *("test_absent_backends_say_why", "test_every_instruction_set", "test_spans_cut_no_pixel_off"),
     "test_kernels_of_another_compiler_were_the_slowest_ones",
-    "test_networks_and_similarity_have_forward_mode",  # in float64
+    "test_similarity_has_forward_mode",
     "test_thousands_are_ordered_alike_by_any_threads",
 }
 

@@ -12,7 +12,7 @@ from gsparc.ops import SphereGrid, _native, calls, composite, make_plan, operato
 from gsparc.ops.projection import PROJECTIONS
 
 ROOT = Path(__file__).parents[2]
-for module in ("native", "cuda", "networks", "similarity"):
+for module in ("native", "cuda", "similarity"):
     importlib.import_module(f"gsparc.ops.{module}")
 
 
