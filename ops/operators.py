@@ -49,16 +49,15 @@ class Buffers(NamedTuple):
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def register_kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
-    """Mark what computes operator `name` on types of device.
+def register_kernel(name: str, device: str) -> Callable[[_Function], _Function]:
+    """Mark what computes operator `name` on a type of device.
 
     It receives the operator's empty outputs, then its arguments, from `run_kernel`. It fills the outputs, or
     returns others in their place.
     """
 
     def mark(function: _Function) -> _Function:
-        for device in devices:
-            KERNELS[device][name] = function
+        KERNELS[device][name] = function
         return function
 
     return mark

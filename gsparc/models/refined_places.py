@@ -21,8 +21,9 @@ from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.mixture.weights import in_error_unit, to_real_entries
-from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER
+from gsparc.models.target_rows import TINY_POWER
 from gsparc.ops import Pose
+from gsparc.physics.decibels import RELATIVE_DB
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +147,7 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
     if site.kind == "rssi":
         # From linear powers to decibels, to first order.
-        variance = variance * (DECIBELS_PER_NAT / left.mean.flatten().double().clamp_min(TINY_POWER)).square()
+        variance = variance * (RELATIVE_DB / left.mean.flatten().double().clamp_min(TINY_POWER)).square()
     true, mean = (to_real_entries(in_error_unit(values, site)) for values in (batch.target, left.mean))
     residual = true - mean
     parts = 2 if batch.target.is_complex() else 1

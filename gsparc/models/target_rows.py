@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
 from gsparc.data.schema import Kind, Measurements
+from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.processes.powers import PowerRows
 
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
-DECIBELS_PER_NAT = 10 / math.log(10)
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -74,7 +72,7 @@ def to_entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
     if kind == "csi":
         return 2 * variance
     if kind == "rssi":
-        return variance * (mean.flatten(1).mean(1) / DECIBELS_PER_NAT) ** 2
+        return variance * (mean.flatten(1).mean(1) / RELATIVE_DB) ** 2
     return variance
 
 

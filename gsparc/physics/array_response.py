@@ -56,14 +56,14 @@ def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tenso
 
 
 def bartlett_spectrum(vectors: Tensor, matrix: Tensor) -> Tensor:
-    """Return `|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is taken as 0.
+    """Return `|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is 0.
 
     >>> array, grid = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), SphereGrid.hemisphere(1, 4)
     >>> matrix = steering_matrix(array, grid, 0.1)
     >>> bartlett_spectrum(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y interferes at x
     tensor([[0., 2., 0., 2.]], dtype=torch.float64)
     """
-    return _SafeAbsolute.apply(vectors @ matrix.conj())
+    return (vectors @ matrix.conj()).abs()  # torch takes the slope at 0 as 0
 
 
 def normalise_spectrum(image: Tensor, how: str) -> Tensor:
@@ -86,20 +86,6 @@ def normalise_spectrum(image: Tensor, how: str) -> Tensor:
         raise ValueError(f"normalisation {how!r} is none of max, minmax, power, none")
     # The least divisor leaves a silent spectrum at 0; it would be NaN.
     return (image - low) / (high - low).clamp_min(1e-12)
-
-
-class _SafeAbsolute(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, value: Tensor) -> Tensor:
-        size = value.abs()
-        ctx.save_for_backward(value, size)
-        return size
-
-    @staticmethod
-    def backward(ctx, upstream: Tensor) -> Tensor:
-        value, size = ctx.saved_tensors
-        unit = torch.where(size > 0, value / size.clamp_min(torch.finfo(size.dtype).tiny), 0)
-        return upstream * unit
 
 
 @dataclass(frozen=True)

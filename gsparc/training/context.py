@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting, whole
 from gsparc.data.splits import FileSettings, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import LINE, NO_COST, Cost
@@ -49,7 +50,7 @@ class FitReport:
 
 
 @dataclass(frozen=True)
-class FitContext:
+class FitContext(Checked):
     """What a run brings along to a fit.
 
     Attributes:
@@ -82,18 +83,18 @@ class FitContext:
 
     run_dir: Path = Path()
     seed: int = 0
-    effort: float = 1.0
-    budget_s: float | None = None
+    effort: float = setting(1.0, POSITIVE)
+    budget_s: float | None = setting(None, or_null(POSITIVE))
     asked_s: float | None = None
-    budget_clock: Clock = "wall"
-    stations: StationModels = "auto"
+    budget_clock: Clock = setting("wall", choice(*get_args(Clock)))
+    stations: StationModels = setting("auto", choice(*get_args(StationModels)))
     split: SplitSettings | FileSettings | None = None
     leave_out: tuple[np.ndarray, ...] = ()
     race: Race | None = None
     beside: Mapping[str, Any] = field(default_factory=dict)
     resume: Path | None = None
     init_from: Path | None = None
-    batch_size: int = 16
+    batch_size: int = setting(16, whole(1))
     datamodule: DataModule | None = None
     trainer: partial[Any] | None = None
     callbacks: Callable[[], Sequence[Any]] = tuple
@@ -102,21 +103,9 @@ class FitContext:
     config_yaml: str = ""
 
     def __post_init__(self) -> None:
-        if not 0 < self.effort < math.inf:
-            raise ValueError(f"effort={self.effort!r}: a positive number is needed; 1 is usual")
-        if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
-            raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
+        super().__post_init__()
         if self.asked_s is None:
             object.__setattr__(self, "asked_s", self.budget_s)
-        if self.budget_clock not in get_args(Clock):
-            raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
-        if self.stations not in get_args(StationModels):
-            raise ValueError(f"stations={self.stations!r}: one of auto, each, together is needed")
-        # `isinstance` would take true for 1.
-        if type(self.batch_size) is not int or self.batch_size < 1:
-            raise ValueError(
-                f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
-            )
 
     def for_part(self, folder: str, **changes: Any) -> FitContext:
         """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""

@@ -85,5 +85,5 @@ def test_a_run_that_seconds_ended_goes_on_without_them_to_its_end(tmp_path, monk
 
 @pytest.mark.parametrize("wrong", [0, -3, float("inf")])
 def test_a_budget_that_is_none_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"budget_s.*positive number of seconds"):
+    with pytest.raises(ValueError, match=r"budget_s=.*: a number above 0, or null"):
         FitContext(budget_s=wrong)

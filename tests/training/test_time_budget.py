@@ -94,7 +94,7 @@ def test_an_effort_multiplies_every_count_and_rows_by_its_cube_root():
     usual, more = Effort(), Effort().scale_by(8.0)
     assert Effort().scale_by(1.0) == usual and more.evaluations == 8 * usual.evaluations
     assert more.chosen_on == 2 * usual.chosen_on and Effort().scale_by(1e-6).chosen_on == 150
-    with pytest.raises(ValueError, match="effort=0: a positive number is needed"):
+    with pytest.raises(ValueError, match="effort=0: a number above 0 is needed"):
         FitContext(effort=0)
 
 

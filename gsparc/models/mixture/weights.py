@@ -17,7 +17,8 @@ from scipy.stats import norm, t
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.models.target_rows import DECIBELS_PER_NAT, TINY_POWER, decibels
+from gsparc.models.target_rows import TINY_POWER, decibels
+from gsparc.physics.decibels import RELATIVE_DB
 
 LEAST_HELD = 4  # rows, for weights to mean anything
 LEAST_GAIN_DB = 0.1  # for which a query may take several times as long
@@ -75,7 +76,7 @@ def share_of_second(parts: Sequence[HeldOutPair]) -> float:
     if len(first) < FEW_ROWS and abs(gain) < 2 * unsure:
         return 0.5
     means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
-    if means[0] <= means[-1] and DECIBELS_PER_NAT * (means[0] - min(means)) < LEAST_GAIN_DB:
+    if means[0] <= means[-1] and RELATIVE_DB * (means[0] - min(means)) < LEAST_GAIN_DB:
         return 0.0
     best = float(SHARES[int(np.argmin(means))])
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best

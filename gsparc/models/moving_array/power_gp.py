@@ -10,7 +10,6 @@ from torch import Tensor
 
 from gsparc.data.limits import internal
 from gsparc.processes.kernel import Kernel
-from gsparc.processes.left_out import left_out_residuals
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
@@ -55,7 +54,7 @@ class PowerTrend(Stored):
 def solve_and_leave_out(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
     """Return weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out residuals (n, K)."""
     posterior = Exact.from_values(Prior(kernel), torch.from_numpy(places), values)
-    return posterior.weights, left_out_residuals(posterior.factor.precision, posterior.weights)[0]
+    return posterior.weights, posterior.left_out_residuals().residual
 
 
 def fit_trend(

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 import torch
 
+from gsparc.data.limits import Checked, choice, setting, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
@@ -39,7 +40,7 @@ Start = Literal["generic", "scene"]
 
 
 @dataclass(eq=False, kw_only=True)
-class CalibratedRayTracer(Method):
+class CalibratedRayTracer(Checked, Method):
     """Powers, or channels of one antenna, from traced paths.
 
     Args:
@@ -55,19 +56,16 @@ class CalibratedRayTracer(Method):
     no_gradient = "rays are traced to a place anew"
     kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
     scene: str | None = None
-    start: Start = "generic"
-    steps: int = 40
+    start: Start = setting("generic", choice(*get_args(Start)))
+    steps: int = setting(40, whole(0))
     depth: int = 5
     diffraction: bool = True
-    samples: int = 100_000
-    batch: int = 400
+    samples: int = setting(100_000, whole(1))
+    batch: int = setting(400, whole(1))
     learned: Calibration | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        if self.start not in get_args(Start):
-            raise ValueError(f"model.start={self.start!r}: expected one of {', '.join(get_args(Start))}")
-        if self.steps < 0 or self.samples < 1 or self.batch < 1:
-            raise ValueError("model: steps is at least 0, samples and batch at least 1")
+        super().__post_init__()
         self._scene_json, self._silent_db, self._factor = "", 0.0, 1.0 + 0.0j
         self._tracer: RayTracer | None = None
         # A depth that no tracer takes is refused here, before anything is loaded.
