@@ -17,7 +17,6 @@ from gsparc.field.distributed import process_max, process_sum
 from gsparc.field.model import GaussianModel
 from gsparc.field.readout import solve_readout
 from gsparc.field.schedule import INTERVAL, STEPS, acts_at_step, to_steps
-from gsparc.ops.reference import rotation_matrices
 from gsparc.training.tracking import log_event
 
 log = logging.getLogger(__name__)
@@ -206,5 +205,9 @@ def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int, 
 
 def _sample_inside(scales: Tensor, quats: Tensor, generator: torch.Generator) -> Tensor:
     """Offsets (M, 3) [m] drawn from Gaussians with the given scales (M, 3) and rotations (M, 4)."""
+    w, *v = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    axis = torch.stack(v, -1)
     local = torch.randn(scales.shape, generator=generator).to(scales) * scales
-    return (rotation_matrices(quats) @ local.unsqueeze(-1)).squeeze(-1)
+    # Rotating by a unit quaternion: x + 2 w (v x x) + 2 v x (v x x).
+    turned = torch.linalg.cross(axis, local)
+    return local + 2 * w.unsqueeze(-1) * turned + 2 * torch.linalg.cross(axis, turned)
