@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from gsparc.data.links.stations import find_station
 from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.models import checkpoint
 from gsparc.models.method import HasGaussians, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.physics.row_factors import describe_freedom
@@ -374,6 +376,11 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
         unknown = None if said.unknown is None or not own else said.unknown.to(dtype)
         return Prediction(mean, said.variance, unknown), single
+
+
+def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
+    """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
+    checkpoint.update_extra(path, extra)
 
 
 def _to_unit(stored: Prediction, unit: PowerUnit) -> Prediction:

@@ -29,8 +29,7 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Column, Table
-from gsparc.models.checkpoint import update_extra
-from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.predictor import Predictor, update_extra
 
 log = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from gsparc.data.executor import run_all
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models.checkpoint import update_extra
 from gsparc.models.method import Method, predict_in_batches
+from gsparc.prediction.predictor import update_extra
 from gsparc.prediction.refit import Learned
 
 KEY = "map"
