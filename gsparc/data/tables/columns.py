@@ -270,8 +270,11 @@ def _more_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str 
     """Warn of columns that are not used, with values like those of several `columns` of levels."""
     if len(columns) < 2:
         return []
-    rest = [h for h in sheet.heads if h not in used]
-    alike = [Column(head=h) for h in rest if _may_be_levels(sheet, h)]
+    rest = [h for h in sheet.heads if h not in used and not LISTS["no_level"] & set(words_of(h))]
+    numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
+    levels = numbers[[column.head for column in columns]].stack()
+    low, high = levels.min(), min(levels.max(), 0)
+    alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
     said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and " if alike else ""
     advice = f"are not used: of stations, too? call them as {columns[0].head!r} is called"
     return [Caution(said + advice)] if alike else []

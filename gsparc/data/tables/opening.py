@@ -31,7 +31,7 @@ def read_frame(path: Path, kind: str) -> Sheet:
         DataError: pyarrow is missing, or the file is damaged or empty.
     """
     source = str(path)
-    if kind != "JSON, GPX or KML" and find_spec("pyarrow") is None:
+    if kind != RECORDS and find_spec("pyarrow") is None:
         raise DataError(f"{source}: {kind} needs pyarrow; say: pip install 'gsparc[tables]'")
     with readable(source, f"damaged or not a {kind} file", Exception):  # pyarrow and pandas raise anything
         frame = FRAMES[kind](path)
@@ -47,10 +47,11 @@ def read_frame(path: Path, kind: str) -> Sheet:
     return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))), problems=Problems(source))
 
 
+RECORDS = "JSON, GPX or KML"
 FRAMES: dict[str, Callable[[Path], pd.DataFrame]] = {
-    "Parquet": pd.read_parquet, "Feather": pd.read_feather, "JSON, GPX or KML": read_records
+    "Parquet": pd.read_parquet, "Feather": pd.read_feather, RECORDS: read_records
 }  # fmt: skip
-STARTS = {b"PAR1": "Parquet", b"ARRO": "Feather", **dict.fromkeys((b"{", b"[{", b"<"), "JSON, GPX or KML")}
+STARTS = {b"PAR1": "Parquet", b"ARRO": "Feather", **dict.fromkeys((b"{", b"[{", b"<"), RECORDS)}
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
 GZIP = b"\x1f\x8b"
 DECIMAL_POINT = r"\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*"
@@ -117,12 +118,15 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
 
 def _decoded(path: Path) -> tuple[str, str]:
     """The text of a file and the name of its encoding."""
-    if path.stat().st_size > MOST_BYTES:
+    with path.open("rb") as file:
+        packed = file.read(len(GZIP)) == GZIP
+    with (
+        readable(path, "damaged or not compressed by gzip", (EOFError, zlib.error, gzip.BadGzipFile)),
+        gzip.open(path) if packed else path.open("rb") as file,
+    ):
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
         raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
-    content = path.read_bytes()
-    if content.startswith(GZIP):
-        with readable(path, "damaged or not compressed by gzip", (OSError, EOFError, zlib.error)):
-            content = gzip.decompress(content)
     for start, what in SHEET["others"].items():
         if content.lstrip().startswith(start.encode("latin-1")):
             raise DataError(f"{path}: not a table of text but {what}")
@@ -337,8 +341,10 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
     if not is_table(path):
         raise DataError(f"{path}: expected a table (csv, parquet, json, ...), no arrays")
     with path.open("rb") as file:
-        first = file.read(PEEKED).removeprefix(codecs.BOM_UTF8).lstrip()
+        first = b"".join(file.read(PEEKED).removeprefix(codecs.BOM_UTF8).split())
     kind = next((kind for start, kind in STARTS.items() if first.startswith(start)), None)
     kind = "Parquet" if path.suffix.lower() == ".parquet" else kind
+    if kind == RECORDS and path.stat().st_size > MOST_BYTES:
+        raise DataError(f"{path}: records of more than {MOST_BYTES:,} bytes; write them as Parquet")
     sheet, notes = read_text(path) if kind is None else (read_frame(path, kind), [])
     return replace(sheet, problems=Problems(path) if problems is None else problems), notes

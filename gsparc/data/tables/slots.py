@@ -73,7 +73,8 @@ def unfold_tones(sheet: Sheet) -> tuple[Sheet, list[str]]:
         return sheet, []
     place = pd.factorize(sheet.joined(placed))[0]
     long = sheet.frame.assign(**{BY: place, str(tone): values.astype(int)})
-    if long.duplicated([BY, tone]).any():
+    # Radios that hop have a tone for each row, and few rows at a place.
+    if long.duplicated([BY, tone]).any() or 2 * len(set(place)) > len(place):
         return sheet, []
     wide = long.pivot(index=BY, columns=tone, values=list(parts))
     wide.columns = [f"{parts[head]}_{number}{_said(head)}" for head, number in wide.columns]
