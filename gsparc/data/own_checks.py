@@ -95,7 +95,7 @@ class Checker:
             return present[0]
         if named in present:
             return str(named)
-        rest = [f"{name} {array.shape}" for name, array in self.given.items()] or ["no arrays"]
+        rest = [f"{name} {array.shape}" for name, array in self.given.items()] or ["no arrays outside groups"]
         names = " and ".join(present) or f"none of them among {list_first(rest, 8)}; rename what it is"
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
         return self.problems.add(self.source, f"{wanted}; found {names}")
