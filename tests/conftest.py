@@ -124,3 +124,16 @@ def browser():
     running = webdriver.Chrome(options=options, service=service)
     yield running
     running.quit()
+
+
+@pytest.fixture
+def spectrum_arrays() -> dict:
+    """A small valid file of one's own: static receiver, images of 9 x 36."""
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    return {
+        "rx_position": np.array([4.0, 1.0, 2.0]),
+        "tx_position": rng.uniform(0, 3, (10, 3)),
+        "spectrum": rng.uniform(0, 1, (10, 9, 36)),
+    }

@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import run_directory, show_result
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation.open_runs import calibrate_and_store, collect_evidence
 from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
-from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Interval, Table
 from gsparc.prediction.risk import SHARES, Guarantee, calibration_facts, explain_too_few, run_trials
-from gsparc.prediction.timing import machine_facts
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +36,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     except ValueError:
         # With fewer patches than parts no division by whole cells exists.
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
-    facts = known | calibration_facts(evidence, divisions, promise) | machine_facts() | provenance()
-    facts["seed"] = config.seed
+    facts = known | calibration_facts(evidence, divisions, promise) | {"seed": config.seed}
     # Written before a threshold is stored: where storing fails, these figures are there.
     write_summary(run_dir / "summary.json", facts)
     title = f"{known['dataset/name']}, {known['model/name']}"
@@ -53,9 +51,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             stored_lines.append(f"{path}: {bound}")
-        write_summary(run_dir / "summary.json", facts)
-    show_result(run_dir, *calibration_tables(facts), lines=stored_lines)
-    return facts
+    return finish_run(run_dir, facts, *calibration_tables(facts), lines=stored_lines)
 
 
 def calibration_tables(facts: dict[str, Any]) -> list[Table]:

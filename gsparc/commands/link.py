@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -16,19 +17,24 @@ from gsparc.apps.link.run import LinkStudy
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
-from gsparc.evaluation.table import Table, to_text
+from gsparc.evaluation.table import Column, Table
 
 log = logging.getLogger(__name__)
 
-RATES = {
-    "oracle_mbps": ("oracle Mbit/s", ".1f"), "chosen_mbps": ("chosen", ".1f"), "shortfall": ("short", ".1%"),
-    "shortfall_accepted": ("short, accepted", ".1%"), "tbler": ("TBLER", ".1%"), "outage": ("outage", ".1%"),
-}  # fmt: skip
-BEAMS = {
-    "gain_db": "gain dB", "predicted_gain_db": "predicted", "loss_db": "loss dB", "loss_db_mean": "mean loss",
-    "loss_db_p95": "95 %", "loss_db_max": "worst", "loss_db_accepted": "mean, accepted",
-}  # fmt: skip
+RATES = (
+    Column("median SNR dB", "g", of="level"), Column("oracle Mbit/s", ".1f", of="oracle_mbps"),
+    Column("chosen", ".1f", of="chosen_mbps"), Column("short", ".1%", of="shortfall"),
+    Column("short, accepted", ".1%", of="shortfall_accepted"), Column("TBLER", ".1%", of="tbler"),
+    Column("outage", ".1%", of="outage"),
+)  # fmt: skip
+BEAMS = (
+    Column("antennas", "d", of="antennas"), Column("gain dB", ".2f", of="gain_db"),
+    Column("predicted", ".2f", of="predicted_gain_db"), Column("loss dB", ".2f", of="loss_db"),
+    Column("mean loss", ".2f", of="loss_db_mean"), Column("95 %", ".2f", of="loss_db_p95"),
+    Column("worst", ".2f", of="loss_db_max"), Column("mean, accepted", ".2f", of="loss_db_accepted"),
+)  # fmt: skip
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -68,31 +74,22 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     """Return tables of rates, block errors and beams; what was not computed has no table."""
     kind = facts["confidence/kind"]
     accepted = f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {kind}"
-    rates = [
-        [
-            f"{level:g}",
-            *(to_text(facts.get(f"mcs/{level:g}dB/{key}"), form) for key, (_, form) in RATES.items()),
-        ]
-        for level in levels
-    ]
-    heads = ["median SNR dB", *(head for head, _ in RATES.values())]
-    sections = [Table.of_texts(f"{title}: throughput, {accepted}", [], heads, rates)]
+    rates = [{"level": level, **facts_under(facts, f"mcs/{level:g}dB")} for level in levels]
+    sections = [Table.from_rows(f"{title}: throughput, {accepted}", RATES, rates)]
     if modulations:
-        keys = ("ebno_at_bler_0.1", "behind_perfect_db")
-        errors = [
-            [label, *(to_text(facts[f"pusch/{m}/{name}/{key}"], ".2f") for m in modulations for key in keys)]
+        heads = {"ebno_at_bler_0.1": "{}", "behind_perfect_db": "behind"}
+        places = [(m, key) for m in modulations for key in heads]
+        columns = [Column(heads[key].format(m), ".2f") for m, key in places]
+        receivers = [
+            [label, *(facts[f"pusch/{m}/{name}/{key}"] for m, key in places)]
             for name, (label, _, _) in STYLES.items()
             if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
         ]
         heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
-        numbers = [column for modulation in modulations for column in (modulation, "behind")]
-        sections.append(Table.of_texts(heading, ["receiver"], numbers, errors))
+        sections.append(Table(heading, [Column("receiver", ""), *columns], receivers))
     # As numbers: as text 16 comes before 4.
-    antennas = sorted(
-        int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.endswith("/gain_db")
-    )
+    antennas = sorted(int(key.split("/")[1]) for key in facts if re.fullmatch(r"beams/\d+/gain_db", key))
     if antennas:
-        beams = [[str(n), *(to_text(facts[f"beams/{n}/{key}"], ".2f") for key in BEAMS)] for n in antennas]
-        heads = ["antennas", *BEAMS.values()]
-        sections.append(Table.of_texts("maximum-ratio beams, all test positions", [], heads, beams))
+        beams = [{"antennas": n, **facts_under(facts, f"beams/{n}")} for n in antennas]
+        sections.append(Table.from_rows("maximum-ratio beams, all test positions", BEAMS, beams))
     return sections

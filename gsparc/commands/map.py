@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
@@ -78,7 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     tiff = check_geotiff(config.geotiff)
     promise = read_or_gather(str(config.ckpt), settings)
     field = predict_map(predictor, promise=promise, **query)
-    coverage = None if promise is None else promise.coverage(how.share)
+    coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)
     lines = map_notes(field, coverage, ends)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"

@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.raw import Raw
-from gsparc.data.schema import MEASUREMENTS
 
-# What people call `csi` where they kept its absolute values.
-NAMES = ("csi_amplitude", "csi_amp", "csi_abs", "csi_magnitude", "csi_mag", "amplitude", "magnitude")
 PHASED = ("csi", "frequency_hz", "mask", "noise_variance", "array_position")  # what powers do not have
 
 
@@ -21,9 +18,6 @@ def amplitudes_to_levels(raw: Raw) -> Raw:
     returned as it is.
     """
     arrays = dict(raw.arrays)
-    called = [name for name in NAMES if name in arrays] * arrays.keys().isdisjoint(MEASUREMENTS)
-    if len(called) == 1:
-        arrays["csi"] = arrays.pop(called[0])
     csi = arrays.get("csi", np.zeros(0, complex))
     if csi.dtype.kind not in "fiu" or not 0 < csi.ndim < 4 or (csi < 0).any() or not np.unique(csi)[1:].size:
         return raw

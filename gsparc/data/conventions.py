@@ -16,8 +16,10 @@ from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.errors import DataError
 from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.data.units import UNITS
 from gsparc.ops import SphereGrid
 
+FOOT = UNITS["ft"].factor
 Change = Callable[[Measurements], Measurements]
 
 
@@ -68,6 +70,20 @@ def _moved(change: Callable[[np.ndarray], np.ndarray]) -> Change:
 
 def _array(factor: Callable[[Measurements], float]) -> Change:
     return lambda d: replace(d, site=replace(d.site, array=np.asarray(d.site.array) * factor(d)))
+
+
+def _places(change: Callable[[np.ndarray], np.ndarray], *ends: str) -> Change:
+    """Positions of ends changed, about the origin of the file."""
+
+    def moved(data: Measurements) -> Measurements:
+        origin, stations = data.site.origin, data.site.stations
+        places = {end: change(getattr(data, end) + origin) - origin for end in ends}
+        if stations is not None and any(end.startswith(str(data.site.static_end)) for end in ends):
+            there = replace(stations, position=change(stations.position + origin) - origin)
+            places["site"] = replace(data.site, stations=there)
+        return replace(data, **places)
+
+    return moved
 
 
 def _grid(first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0) -> Change:
@@ -137,6 +153,12 @@ CONVENTIONS = {
     "array_wavelengths": Convention("array_position in wavelengths", "antennas",
                                     _array(lambda data: LIGHT / float(data.site.tones().mean()))),
     "delays_removed": Convention("the delay of each row taken out", "tones", _with_delays),
+    "feet": Convention("positions in feet", "channels",
+                       _places(lambda p: p * FOOT, "tx", "rx_position")),
+    "exchange_xy": Convention("x and y of the receiver exchanged", "channels",
+                              _places(lambda p: p[:, [1, 0, 2]], "rx_position")),
+    "downwards": Convention("heights of the receiver counted downwards", "channels",
+                            _places(lambda p: p * [1, 1, -1], "rx_position")),
     "zeros_unmeasured": Convention("0 for tones that were not measured", "tones", mask_zero_tones, False),
     "transposed": Convention("rows as azimuths, columns as elevations", "hemisphere", _transposed),
     "zenith": Convention("elevation from the zenith", "above", _grid(_from_zenith, 1)),

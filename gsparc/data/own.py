@@ -21,6 +21,7 @@ from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers,
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
+from gsparc.data.other_names import name_arrays
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Kind, Links, Measurements, Site
@@ -111,7 +112,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     Raises:
         DataError: all problems, with array and row.
     """
-    check = Checker(amplitudes_to_levels(raw), str(source))
+    check = Checker(amplitudes_to_levels(name_arrays(raw)), str(source))
     check.check_names()
     measured = check.measurement()
     stated = {name: "stated" for name in raw.arrays if name == "sensitivity_db"}  # lists add one of their own

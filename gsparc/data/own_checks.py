@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.assemble import check_positions
-from gsparc.data.errors import Problems, suggest_name
+from gsparc.data.errors import Problems, list_first, suggest_name
 from gsparc.data.raw import Raw
 from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
 from gsparc.ops import SphereGrid
@@ -35,7 +35,7 @@ class Checker:
         plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.attributes.items()}
         self.raw, self.source = replace(raw, attributes=plain), source
         self.problems = Problems(source)
-        self.notes = [*raw.notes]
+        self.notes, self.given = [*raw.notes], raw.arrays
         self.row_names: list[str] = []
         self.unknown: str | None = None  # a position that nobody gave
         self.sizes: dict[str, int] = {}  # of axes by their letter
@@ -64,7 +64,7 @@ class Checker:
         Raises:
             DataError: arrays of another type or number of axes than the schema's: nobody else looks at these.
         """
-        sound, arrays = True, self.raw.arrays
+        sound, arrays = True, self.given
         # What is ignored must not be taken for an array of the same name that is made of others.
         self.raw = replace(self.raw, arrays={name: arrays[name] for name in arrays if name in FIELDS})
         for name in arrays:
@@ -95,7 +95,8 @@ class Checker:
             return present[0]
         if named in present:
             return str(named)
-        names = " and ".join(present) or "none of them"
+        rest = [f"{name} {array.shape}" for name, array in self.given.items()] or ["no arrays outside groups"]
+        names = " and ".join(present) or f"none of them among {list_first(rest, 8)}; rename what it is"
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
         return self.problems.add(self.source, f"{wanted}; found {names}")
 

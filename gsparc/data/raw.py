@@ -36,6 +36,7 @@ from gsparc.data.files import whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
+ARRAY_SUFFIXES = (".npz", ".mat", *HDF5_SUFFIXES, *NETCDF_SUFFIXES)
 UNREADABLE = (SyntaxError, TokenError)  # of a header that is no Python literal
 COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
@@ -200,7 +201,7 @@ def _read_npz(path: Path) -> Raw:
     except DAMAGED as error:
         fault = f"damaged or not an npz file ({explain_error(error)})"
         if "allow_pickle" in str(error):
-            fault = "holds Python objects; expected plain arrays of numbers"
+            fault = "holds Python objects; expected plain arrays: numpy.savez(FILE, rx_position=..., csi=...)"
         raise DataError(f"{path}, {name}: {fault}") from None
     # An npz has no attributes; ours keeps them as JSON text in an entry of that name.
     text = arrays.pop("attributes", None)
@@ -279,7 +280,7 @@ def _read_mat(path: Path) -> Raw:
         arrays = {name: array for name, array in content.items() if not name.startswith("__")}
     words = {name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"}
     for name in [name for name, array in arrays.items() if array.dtype.kind in "OV"]:
-        raise DataError(f"{path}, {name}: cells or structures; expected plain arrays of numbers")
+        raise DataError(f"{path}, {name}: cells or structures; expected plain arrays: rx_position, csi, ...")
     return Raw({name: array.squeeze() for name, array in arrays.items() if name not in words}, words)
 
 

@@ -372,6 +372,7 @@ class Field:
         required: `yes`, `one of`, or when.
         meaning: in words.
         holds: what its entries are, one of `HOLDS`.
+        also: what others call it, without regard to case, underlines and dots.
         becomes: of an array of a release, its name in the schema.
     """
 
@@ -381,6 +382,7 @@ class Field:
     required: str
     meaning: str
     holds: str
+    also: str = ""
     becomes: str = ""
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import draw_stations, draw_walls, legend_below, set_bounds
-from gsparc.evaluation.table import Table
+from gsparc.evaluation.table import Column, Table
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
@@ -78,5 +78,5 @@ def table_of_scenes() -> Table:
         size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.bounding_box(), axis=0))
         used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
         rows.append([name, size, f"{len(tracer.triangles()):,}", used])
-    heads = ["scene", "size [m]", "triangles", "materials"]
-    return Table.of_texts("scene=NAME: scenes that come with Sionna", heads, [], rows)
+    columns = [Column(head, "") for head in ("scene", "size [m]", "triangles", "materials")]
+    return Table("scene=NAME: scenes that come with Sionna", columns, rows)

@@ -108,13 +108,6 @@ class Table:
         """Return a row per result; `more` are `note` and `bold`."""
         return cls(title, columns, [[column.value(row) for column in columns] for row in results], **more)
 
-    @classmethod
-    def of_texts(
-        cls, title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]
-    ) -> Table:
-        """Return a table of cells that are written already: columns of `words`, then of `numbers`."""
-        return cls(title, [*(Column(name, "") for name in words), *map(Column, numbers)], [*rows])
-
     def without(self, *names: str) -> Table:
         """Return the same but for some columns."""
         kept = [i for i, column in enumerate(self.columns) if column.name not in names]

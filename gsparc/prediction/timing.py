@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Method, predict_with_threads
 
@@ -26,7 +27,7 @@ COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second every
 
 
 @dataclass(frozen=True)
-class ClockSettings:
+class ClockSettings(Checked):
     """How long to measure.
 
     Attributes:
@@ -38,7 +39,7 @@ class ClockSettings:
         untimed: calls at the start of each visit, which bring the contender's data back into the caches.
     """
 
-    rounds: int = 60
+    rounds: int = setting(60, whole(1))
     least: int = 5
     warmup: int = 3
     budget_s: float = 5.0

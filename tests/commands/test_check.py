@@ -10,13 +10,8 @@ from gsparc.data.own import write_own
 
 
 @pytest.fixture
-def arrays():
-    rng = np.random.default_rng(0)
-    return {
-        "rx_position": np.array([4.0, 1.0, 2.0]),
-        "tx_position": rng.uniform(0, 3, (10, 3)),
-        "spectrum": rng.uniform(0, 1, (10, 9, 36)),
-    }
+def arrays(spectrum_arrays):
+    return spectrum_arrays
 
 
 def _said(path):

@@ -81,3 +81,18 @@ def test_what_cannot_be_done_is_one_line(line, message, made, tmp_path, monkeypa
     overrides = [f"hydra.run.dir={tmp_path / 'run'}", *overrides]
     pattern = message if message.startswith("^") or ".*" in message else re.escape(message)
     assert_refused(knock(COMMANDS[name].run, name, overrides), pattern, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "tradeoff ckpt={spectra} rounds=0",
+        "study rounds=0",
+        "study queries=0",
+        "calibrate ckpt={town} draws=0",
+    ],
+)
+def test_no_rounds_ended_in_an_index_error_and_no_draws_in_a_maximum_of_nothing(line, made, tmp_path):
+    name, *overrides = line.format(**made).split()
+    answer = knock(COMMANDS[name].run, name, [*overrides, f"hydra.run.dir={tmp_path / 'run'}"])
+    assert_refused(answer, f"{overrides[-1]}: a whole number of at least 1", tmp_path / "run")

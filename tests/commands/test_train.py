@@ -168,30 +168,23 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
     assert not way or (tmp_path / "run" / "sweep.png").exists()  # of no figure at all: no logarithm
 
 
+def said_of_a_draw(folder: Path, **rows: np.ndarray) -> str:
+    """The log of a training on split.seed=2 of a file with those `rows`."""
+    places, file = np.random.default_rng(0).uniform(0, 20, (60, 3)), folder / "own.npz"
+    np.savez(file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0], **rows)
+    given = ["dataset=own", f"dataset.file={file}", "model=mean", "baselines=[]", "split.seed=2"]
+    given += [f"hydra.run.dir={folder / 'run'}", "logger=none", "threads=1"]
+    assert knock(main, "train.py", given).status == 0
+    return " ".join((folder / "run/train.log").read_text().split())
+
+
 def test_the_title_of_a_table_did_not_say_the_draw_of_the_split(tmp_path):
     """`split random, test, seed 0` stood above three draws."""
-    places = np.random.default_rng(0).uniform(0, 20, (60, 3))
-    file = tmp_path / "own.npz"
-    np.savez(file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0])
-    given = ["dataset=own", f"dataset.file={file}", "model=mean", "baselines=[]", "split.seed=2"]
-    given += [f"hydra.run.dir={tmp_path / 'run'}", "logger=none", "threads=1"]
-    answer = knock(main, "train.py", given)
-    assert "random (split.seed=2), test, seed 0" in " ".join((tmp_path / "run/train.log").read_text().split())
-    assert answer.status == 0
+    assert "random (split.seed=2), test, seed 0" in said_of_a_draw(tmp_path)
 
 
 def test_the_title_named_a_seed_where_the_release_named_the_test_rows(tmp_path):
     """`split random (split.seed=2)`, and the seed had moved validation rows alone."""
-    places = np.random.default_rng(0).uniform(0, 20, (60, 3))
-    rows = {"split_train": np.arange(40), "split_test": np.arange(40, 60)}
-    file = tmp_path / "own.npz"
-    np.savez(file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0], **rows)
-    given = ["dataset=own", f"dataset.file={file}", "model=mean", "baselines=[]", "split.seed=2"]
-    given += [f"hydra.run.dir={tmp_path / 'run'}", "logger=none", "threads=1"]
-    assert knock(main, "train.py", given).status == 0
-    said = " ".join((tmp_path / "run/train.log").read_text().split())
+    said = said_of_a_draw(tmp_path, split_train=np.arange(40), split_test=np.arange(40, 60))
     assert "split random (the release's test rows), test, seed 0" in said
     assert "random (the release's test rows): 36 training" in said and "(split.seed" not in said
-
-
-# -- the command itself ---------------------------------------------------------------------------------

@@ -52,14 +52,3 @@ def csi_arrays() -> dict[str, np.ndarray]:
         "frequency_hz": np.array([2.40e9, 2.41e9, 2.42e9]),
         "array_position": np.array([[0.0, 0, 0], [0.06, 0, 0]]), "rx_orientation": np.array([1.0, 0, 0, 0]),
     }  # fmt: skip
-
-
-@pytest.fixture
-def spectrum_arrays() -> dict[str, np.ndarray]:
-    """A small valid file of one's own: static receiver, images of 9 x 36."""
-    rng = np.random.default_rng(0)
-    return {
-        "rx_position": np.array([4.0, 1.0, 2.0]),
-        "tx_position": rng.uniform(0, 3, (10, 3)),
-        "spectrum": rng.uniform(0, 1, (10, 9, 36)),
-    }

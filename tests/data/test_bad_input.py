@@ -76,7 +76,7 @@ CSI = {
     "no transmitter": (_without("tx_position"), r"tx_position: missing"),
     "no frequency": (_without("frequency_hz"), "frequency_hz: missing; csi needs the 3 frequencies"),
     "misspelt": (_without("tx_position", "tx_positon"), "unknown name; did you mean 'tx_position'"),
-    "real csi": (_set("csi", -np.ones((12, 2, 3))), "csi: expected complex numbers, found dtype float64"),
+    "real csi": (_set("csi", -np.ones((12, 5, 3))), "csi: expected complex numbers, found dtype float64"),
     "csi nan": (_entry("csi", (5, 1, 1), np.nan), "csi, row 5: not finite"),
     "csi silent": (_set("csi", np.zeros((12, 2, 3), complex)), "every measured value is zero"),
     "one sample": (_together(_set("csi", np.ones((1, 2, 3), complex)),

@@ -18,9 +18,11 @@ SCHEMA = (DOCS / "reference" / "schema.md").read_text(encoding="utf-8")
 def test_the_site_shows_the_schema():
     pytest.importorskip("mkdocs", reason="the site's tables need the extra docs")
     hook = runpy.run_path(str(DOCS / "site" / "pages.py"))
-    row = r"^\| `(\w+)`" + r" \| (.+?)" * 5 + r" \|$"
+    row = r"^\| `(\w+)`" + r" \| (.+?)" * 5 + r" \| (.*?) ?\|$"
     rows = re.findall(row, hook["on_page_markdown"](SCHEMA), re.M)
-    assert rows == [(f.name, f.shape, f.unit, f.required, f.meaning, f.holds) for f in FIELDS.values()]
+    assert rows == [
+        (f.name, f.shape, f.unit, f.required, f.meaning, f.holds, f.also) for f in FIELDS.values()
+    ]
 
 
 def test_the_example_makes_a_good_file(tmp_path, monkeypatch):

@@ -281,7 +281,7 @@ SPOILT = {
     "latitude and longitude swapped": (
         "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",
     ),
-    "channels of stations without places": ("x,y,re,im,cell\n1,2,1,0,a\n", {}, "stations without places; add columns"),
+    "channels of stations without places": ("x,y,re,im,cell\n1,2,1,0,a\n2,2,1,0,b\n", {}, "stations without places; add columns"),
     "a station that moved": (
         "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,a,5,6\n", {}, "'a' is at (5, 5) in line 2 and at (5, 6)",
     ),
@@ -302,7 +302,7 @@ SPOILT = {
     "percent": ("x,y,signal (%)\n1,2,80\n", {}, "'signal (%)': is in %: a quality, not a level"),
     "millimetres beside nothing": ("x_mm,y,rssi\n1,2,-80\n", {}, "'x_mm' is in mm, 'y' says no unit; rename one, e.g. to 'y [m]'"),
     "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
-    "JSON": ('{"x": 1}', {}, "not a table of text but JSON"),
+    "JSON": ('[{"x": 1}, {"x"', {}, "damaged or not a JSON, GPX or KML file"),
     "zeros": (b"x,y\0,rssi\n1,2,-80\n", {}, "not text (byte 3 is zero"),
     "UTF-16 cut short": (PLAIN.encode("utf-16")[:-1], {}, "damaged UTF-16"),
 }  # fmt: skip
@@ -347,7 +347,7 @@ def test_a_spoilt_list_of_stations(write, refused, listed, words):
 
 def test_names_of_files(write, refused, tmp_path):
     refused("no such file", parse_table, tmp_path / "nothing.csv")
-    refused("expected a name ending in .csv", parse_table, write(PLAIN, "drive.xlsx"))
+    refused("expected a table (csv, parquet, json, ...), no arrays", parse_table, write(PLAIN, "drive.mat"))
 
 
 def test_marks_between_thousands_were_decimal_commas(write, refused):

@@ -19,7 +19,7 @@ from product import PARTS
 from rich.console import Console
 from worlds import World, covering, drawn, every
 
-from gsparc.evaluation.table import Table
+from gsparc.evaluation.table import Column, Table
 
 MANY = 100
 
@@ -80,7 +80,7 @@ def main() -> int:
         with given.results.open("a") as file:
             file.write(json.dumps(done[-1]) + "\n")
         console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
-    console.print(Table.of_texts("kinds of data", HEADS, (), map(cells, done)))
+    console.print(Table("kinds of data", [Column(head, "") for head in HEADS], [*map(cells, done)]))
     if given.csv is not None:
         with given.csv.open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows([HEADS, *map(cells, done)])

@@ -50,28 +50,6 @@ def directed(
     return replace(data, directions=seen), fold, sources - data.site.origin
 
 
-FURNITURE = np.array(  # tables, cabinets, a partition: [m], lower and upper corners
-    [
-        [[1.0, 0.5, 0.70], [2.6, 1.3, 0.76]],
-        [[3.6, 3.2, 0.70], [5.2, 4.1, 0.76]],
-        [[0.1, 3.0, 0.00], [0.6, 4.2, 1.90]],
-        [[6.2, 0.4, 0.00], [6.8, 1.5, 1.60]],
-        [[3.3, 1.2, 0.00], [3.4, 2.6, 1.70]],
-        [[5.3, 2.2, 0.00], [5.7, 2.6, 1.00]],
-    ]
-)
-
-
-def furnished(count: int, *, snr_db: float = 30.0, seed: int = 0) -> tuple[Trace, Measurements, Fold]:
-    """A 7 x 5 x 2.8 m room whose six pieces of furniture absorb; walls of different materials."""
-    walls = np.array([-0.8, -0.6, -0.9, -0.7, -0.5, -0.75])
-    room = Room(np.zeros(3), np.array([7.0, 5.0, 2.8]), walls, FURNITURE)
-    rx = scatter(room, count, seed + 1, margin=0.1)
-    told = trace_room(room, np.array([0.4, 2.2, 2.0]), rx, 2.4e9, snr_db=snr_db, seed=seed)
-    data = from_arrays(as_arrays(told))
-    return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
-
-
 def nmse(predicted: np.ndarray, true: np.ndarray) -> float:
     """sum |e|^2 / sum |h|^2."""
     return float((np.abs(predicted - true) ** 2).sum() / (np.abs(true) ** 2).sum())

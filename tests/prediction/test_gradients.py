@@ -13,6 +13,7 @@ import torch
 from campaigns import RENDERED, compose, spectra
 from closed import fitted_to
 from contexts import short
+from interference import plane
 from rooms import directed, shoebox
 from torch.autograd import forward_ad
 
@@ -40,7 +41,6 @@ from gsparc.training.context import FitContext, FitReport
 WORLD = np.array([430.0, -510.0, 12.0])  # float32 moves in steps of 30 micrometres there
 UTM = np.array([4.3e5, -5.1e6, 120.0])  # and of half a metre there
 STEP = 4e-5  # [m] of differences of fourth order
-PLANE_WAVELENGTH = 0.3
 
 
 def both_ends(kind: str) -> Measurements:
@@ -52,19 +52,6 @@ def both_ends(kind: str) -> Measurements:
     if kind == "csi":
         return from_arrays({**ends, "csi": np.exp(-2j * np.pi * far) / far})
     return from_arrays({**ends, "rssi_db": -20 * np.log10(far) + 0.3 * rng.standard_normal(120)})
-
-
-def plane() -> Measurements:
-    """Powers of waves that interfere, sampled within half a wavelength."""
-    rng = np.random.default_rng(0)
-    at = np.c_[rng.uniform(0, 0.6, (300, 2)), np.zeros(300)]
-    sources = np.c_[rng.uniform(-3, 3, (12, 2)), rng.uniform(1, 2, 12)]
-    far = np.linalg.norm(at[:, None] - sources, axis=-1)
-    field = np.exp(-2j * np.pi * far / PLANE_WAVELENGTH) / far @ np.exp(2j * np.pi * rng.uniform(size=12))
-    decibels = 10 * np.log10(np.abs(field) ** 2 + 1e-3) + 0.5 * rng.standard_normal(300)
-    return from_arrays(
-        {"rx_position": at, "rssi_db": decibels, "frequency_hz": 299_792_458.0 / PLANE_WAVELENGTH}
-    )
 
 
 def antennas() -> Measurements:
@@ -143,7 +130,7 @@ CASES = {
     "gp, powers, nearest rows": Case(method_class("gp"), kinds.received, thin=True),
     "gp, powers of both ends": Case(method_class("gp"), lambda _: both_ends("rssi")),
     "gsparc, powers": Case(planned(), kinds.received),
-    "gsparc, powers that interfere": Case(planned(), lambda _: plane()),
+    "gsparc, powers that interfere": Case(planned(), lambda _: plane(300)),
     "gsparc, powers of stations": Case(planned(), kinds.several, "0"),
 }
 REFUSED = {

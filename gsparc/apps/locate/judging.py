@@ -28,7 +28,7 @@ from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
-from gsparc.evaluation.table import Table
+from gsparc.evaluation.table import Column, Table
 from gsparc.prediction.predictor import Predictor, update_extra
 
 log = logging.getLogger(__name__)
@@ -83,9 +83,10 @@ def report(
             error = np.linalg.norm(place - heard.place, axis=1)
         median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
         facts |= {f"{stem}/median_m": median, f"{stem}/p90_m": p90}
-        rows.append([name, f"{median:.3g}", f"{p90:.3g}"])
+        rows.append([name, median, p90])
     title = f"{Path(config.data).stem if config.data else facts['dataset/name']}, {len(heard)} snapshots"
-    shown = [Table.of_texts(title, ["method"], ["median [m]", "p90 [m]"], rows)]
+    heads = Column("method", ""), Column("median [m]", ".3g"), Column("p90 [m]", ".3g")
+    shown = [Table(title, heads, rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
     if inside is not None:
         areas = f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places"

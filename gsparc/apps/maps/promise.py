@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.apps.maps import intervals
-from gsparc.apps.maps.intervals import Calibration, Coverage, Evidence, calibrate
+from gsparc.apps.maps.intervals import Calibration, Evidence, calibrate
 from gsparc.apps.maps.levels import measured_levels, predicted_levels
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_all
@@ -67,10 +67,6 @@ class Promise:
     def calibration(self, share: float = 0.9) -> Calibration:
         """See `calibrate`."""
         return calibrate(self.evidence, share)
-
-    def coverage(self, share: float = 0.9) -> Coverage:
-        """See `gsparc.apps.maps.intervals.cross_validate`."""
-        return intervals.cross_validate(self.evidence, share)
 
     def stations_of_place(self) -> int:
         """Return how many stations have a level at a place that was learned from, in the mean."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsparc.apps.maps.field_map import FieldMap
-from gsparc.apps.maps.intervals import Coverage
+from gsparc.apps.maps.intervals import Coverage, cross_validate
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
 from gsparc.data.errors import DataError
 from gsparc.evaluation.open_runs import check_dataset, open_files
@@ -39,7 +39,7 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
     learned = reopen_training(path, settings["dataset"])
     log.info("testing the intervals of maps: fits without blocks of places")
     promise = gather_promise(learned, how)
-    promise.coverage(how.share)  # too little evidence is said before anything is stored
+    cross_validate(promise.evidence, how.share)  # too little evidence is said before anything is stored
     promise.store(path)
     return promise
 

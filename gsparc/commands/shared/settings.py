@@ -33,6 +33,7 @@ class RunSettings(Checked):
         budget_s: seconds that may end training, or of timing; None: as the rest is configured.
         budget_clock: `wall` or `processor`.
         stations: `auto`, `each` or `together`.
+        rounds, queries, draws: trainings of a study, timings of its rows, trials of a promise.
     """
 
     seed: int = setting(0, whole(0, 2**32 - 1))
@@ -43,6 +44,9 @@ class RunSettings(Checked):
     budget_s: float | None = setting(None, or_null(POSITIVE))
     budget_clock: str = setting("wall", choice("wall", "processor"))
     stations: str = setting("auto", choice("auto", "each", "together"))
+    rounds: int = setting(1, whole(1))
+    queries: int = setting(1, whole(1))
+    draws: int = setting(1, whole(1))
 
     @classmethod
     def from_config(cls, config: DictConfig) -> RunSettings:

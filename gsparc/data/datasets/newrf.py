@@ -71,4 +71,4 @@ class NeWRF(Campaign):
     """One transmitter, many receivers, complex channels; settings of `Campaign`."""
 
     choice, reader = "newrf", staticmethod(read_newrf)
-    marks, suffixes = frozenset(NAMES), (".pkl", ".pickle")
+    marks, suffixes = frozenset({*NAMES, "csi", "frequency_hz"}), (".pkl", ".pickle")

@@ -1,4 +1,4 @@
-"""Tables of measurements (CSV, TSV, Parquet): one row for each place, or for each place and station.
+"""Tables of measurements (text, Parquet, records): one row for each place, or for each place and station.
 
 `read.parse_table` reads one; it is not imported here, as pandas takes half a second.
 """
@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
-TABLE_SUFFIXES = (*TEXT_SUFFIXES, ".parquet")
+from gsparc.data.raw import ARRAY_SUFFIXES
 
 
 def is_table(path: str | Path) -> bool:
-    """Tell whether a file's name says that it is one."""
-    return Path(path).suffix.lower() in TABLE_SUFFIXES
+    """Tell whether a file may be one: its name is not that of arrays."""
+    return Path(path).suffix.lower() not in ARRAY_SUFFIXES

@@ -116,6 +116,7 @@ def choose_columns(
         candidates = [column for column in found if not column.less] or found
         if role == "station":
             candidates = _identity(sheet, candidates, always=only is not None)
+            candidates = _finest(sheet, candidates)
         tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
         # With a column of stations a row is of one: several columns of levels would contradict it.
         one_each = tones or "station" not in {**chosen, **guesses}
@@ -151,6 +152,13 @@ def choose_columns(
     return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
 
 
+def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
+    """The first column that tells all stations apart that several do; all where none does."""
+    every = len(set(sheet.joined(column.head for column in columns).tolist()))
+    fine = [c for c in columns if len(set(sheet.joined([c.head]).tolist())) == every]
+    return columns if columns[0].label == JOINED or len(columns) < 2 else fine[:1] or columns
+
+
 JOINED = "joined"  # label of columns whose values together name a station
 
 
@@ -181,11 +189,26 @@ NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
     """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels; the notes."""
     used = {column.head for columns in chosen.values() for column in columns}
-    alike = [head for head in sheet.heads if head not in used and (MAC.search(head) or NAMED.match(head))]
+    rest = [head for head in sheet.heads if head not in used]
+    named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
+    alike = named or [head for head in rest if _may_be_levels(sheet, head)]
     if not alike or "station" in chosen:
         return []
     chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
-    return [_note(chosen["rssi_db"])]
+    note = _note(chosen["rssi_db"])
+    return [note if named else Caution(f"{note}: by their values, as no head says so")]
+
+
+def _may_be_levels(sheet: Sheet, head: str) -> bool:
+    """Whether a column holds numbers of `BY_VALUE` alone, but for one mark that repeats."""
+    if LISTS["no_level"] & set(words_of(head)):
+        return False
+    values = pd.to_numeric(sheet.frame[head].iloc[:MOST_LOOKED_AT], errors="coerce").dropna()
+    inside = values.between(*BY_VALUE)
+    return 2 * int(inside.sum()) > len(values) > 0 and values[~inside].nunique() < 2
+
+
+BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
 
 
 def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[str]:
@@ -199,7 +222,7 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
         topic = heads.topic_of(head) or ("a station" if lone and ends & set(words_of(head)) else None)
         if topic is None or head in used:
             if topic == "a floor" and any(c.head == head and c.unit is None for c in chosen.get("z", ())):
-                say = f"dataset.columns.z={head}*3.2 takes 3.2 m each"
+                say = f"{say_column('z', f'{head}*3.2')} takes 3.2 m each"
                 notes.append(Caution(f"column {head!r}: floors as heights in metres? {say}"))
             continue
         wanted = have.get(topic)
@@ -216,14 +239,31 @@ def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[
             if remedy is None:
                 apart[head] = topic
                 continue
-            how = remedy.format(head=head, joined=joined)
-            notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: dataset.columns.{how}"))
+            how = "; ".join(say_column(r, t.format(head=head, joined=joined)) + w for r, t, w in remedy)
+            notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: {how}"))
     if apart:
         s, do = ("s", "is") if len(apart) == 1 else ("", "are")
-        how = f"dataset.columns.station={'+'.join([*map(str, stations), *apart])} tells them apart"
+        how = f"{say_column('station', '+'.join([*map(str, stations), *apart]))} tells them apart"
         told = _names(Column(head=head) for head in apart)
         notes.append(Caution(f"{told} speak{s} of {next(iter(apart.values()))} and {do} not used: {how}"))
+    notes += [] if notes else _repeated(sheet, chosen, [h for h in sheet.heads if h not in used])
     return notes + _more_levels(sheet, chosen.get("rssi_db", ()), used)
+
+
+def _repeated(sheet: Sheet, chosen: Chosen, rest: list[str]) -> list[str]:
+    """Warn of a column of `rest` that tells rows of one place and station apart, where most have others."""
+    places = [role for role in chosen if KINDS[role] in ("length", "angle")]
+    said = [*chosen.get("station", ()), *(chosen[role][0] for role in places)]
+    if len(chosen.get("rssi_db", ())) != 1 or not places:
+        return []
+    key = sheet.frame[[column.head for column in said if column.head]].astype(str).agg(" ".join, axis=1)
+    repeats = len(sheet) // max(key.nunique(), 1)
+    for head in rest if repeats > 1 else ():
+        words = pd.Series(sheet.words(head), key.index)
+        if 1 < words.nunique() <= len(sheet) // REPEATED and (key + words).nunique() == len(sheet):
+            how = say_column("station", "+".join([*(c.head or "" for c in chosen.get("station", ())), head]))
+            return [Caution(f"column {head!r} tells rows of a place apart; {how} if it says what was heard")]
+    return []
 
 
 def _more_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> list[str]:
@@ -309,7 +349,7 @@ def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
         by_way = [columns for columns in by_way if columns]
         if len(by_way) < 2:
             continue
-        first = [columns[0] for columns in by_way]
+        first = [replace(own[0], head=_pattern(own)) if ways is MEASURED else own[0] for own in by_way]
         fault = f"{' and '.join(map(_names, by_way))} both say where"
         if ways is MEASURED:
             fault = f"{_names(first)} are different measurements"
@@ -318,11 +358,17 @@ def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
             guesses.pop(role, None)
 
 
+def _pattern(columns: list[Column]) -> str | None:
+    """A column's head, or what those of one quantity begin with, and a star."""
+    names = [column.head or "" for column in columns if column.role == columns[0].role]
+    return names[0] if len(names) == 1 else re.sub(r"\d+(?=\D*$)", "*", names[0])
+
+
 def _is_plain(column: Column, stations: Iterable[str]) -> bool:
     """Whether the head of a guessed column says a level and nothing beyond that it may be of a station."""
     absolute = column.unit is not None and column.unit.name != "dB"
     named = column.label in stations or re.fullmatch(r"\W*", column.label)
-    plain = set(words_of(column.label)) <= LISTS["plain"]
+    plain = set(words_of(column.label)) <= LISTS["plain"] | {column.word}
     return bool(absolute or named or plain or STATION.search(column.label))
 
 
@@ -341,9 +387,18 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
             sheet.refuse(f"{fault}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
 
 
+def say_column(role: str, text: str) -> str:
+    """Return the setting that says what a column is, as a shell takes it.
+
+    >>> print(say_column("rssi_db", "RSRP*-1"), say_column("station", "Cell id"))
+    dataset.columns.rssi_db=RSRP*-1 'dataset.columns.station="Cell id"'
+    """
+    plain = re.fullmatch(r"[\w.*+-]+", text)
+    return f"dataset.columns.{role}={text}" if plain else f"'dataset.columns.{role}=\"{text}\"'"
+
+
 def _choice(column: Column) -> str:
-    """The setting that says what a column is."""
-    return f"dataset.columns.{column.role}={column.head}"
+    return say_column(column.role, column.head or "")
 
 
 def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
@@ -385,17 +440,18 @@ def _turned(column: Column, unit: Unit) -> str:
     value = float(unit.convert(np.array(100.0)))
     said = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
     if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
-        return Caution(f"{said}; twice? dataset.columns.{column.role}={column.head} turns {bare} alone")
+        return Caution(f"{said}; twice? {_choice(column)} turns {bare} alone")
     return said
 
 
 def schema_unit(column: Column) -> str:
     """Return the unit of the column's values once they are read."""
-    unit, bare = SCHEMA.get(KINDS[column.role], "deg"), "" if column.unit is None else column.unit.name
-    if not bare and "rsrp" in heads.words_of(column.head or ""):
+    unit, own = SCHEMA.get(KINDS[column.role], "deg"), column.unit
+    if (own is None or not own.name) and "rsrp" in heads.words_of(column.head or ""):
         return unit  # dBm by definition (3GPP TS 36.214)
     # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
-    return "dB" if unit == "dBm" and bare in ("", "dB") else unit
+    relative = own is None or (own.name != "dBm" and (own.times or not own.changes))
+    return "dB" if unit == "dBm" and relative else unit
 
 
 def rename_for_stations(column: Column) -> Column:

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
+from unicodedata import combining, normalize
 
 import yaml
 
@@ -79,7 +80,7 @@ def parse_head(text: str) -> Head:
         last = UNITS[words[-1]]
         cut = re.sub(rf"[\W_]*{re.escape(words[-1])}\W*$", "", plain, flags=re.IGNORECASE)
         head = _role(words[:-1], last, cut)
-        if head.role and unit_suits(head.role, last):
+        if head.role and (unit_suits(head.role, last) or last.kind == "quality"):
             return head
     head = _role(words, unit, plain)
     return replace(head, unit=unit, strange=strange)
@@ -99,7 +100,7 @@ def station_in_head(text: str) -> str:
 
 def unit_suits(role: str, unit: Unit) -> bool:
     """Tell whether a column of `role` can be in `unit`."""
-    return KINDS[role] == unit.kind or (KINDS[role], unit.kind) == ("phase", "angle")
+    return KINDS[role] == unit.kind or (role, unit.kind) in (("csi_phase", "angle"), ("csi_amp", "level"))
 
 
 def unit_of(text: str) -> tuple[str, Unit | None, str]:
@@ -119,13 +120,17 @@ def unit_of(text: str) -> tuple[str, Unit | None, str]:
 
 def words_of(text: str) -> list[str]:
     """Split a head into small words: `RxPower_mean` is rx, power, mean."""
+    text = "".join(letter for letter in normalize("NFD", text) if not combining(letter))
     text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
+    text = re.sub(r"(?i)physical[ _]*(?:layer[ _]*)?cell[ _]*id(?:entity)?", "pci", text)
     apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
     apart = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", apart, flags=re.IGNORECASE)
     return [word for word in re.split(r"[^0-9a-zµμ°]+", apart.lower()) if word]
 
 
 def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
+    if words[-1] in ("1", "2", "3") and LISTS["vector"] & set(words):  # position_3 of an array's column
+        words = [*words[:-1], "xyz"[int(words[-1]) - 1]]
     rest = [word for word in words if word not in LISTS["place"]]
     joined = "_".join(rest)
     if joined in KINDS and joined != "rssi":  # which is watts in the schema, but dBm in most logs
@@ -133,7 +138,10 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
     if joined in OTHER_NAMES:
         return Head(OTHER_NAMES[joined], unit=unit, word=joined)
     measured = _level(words, unit, plain) or _channel(words, unit, plain)
-    return _axis(rest, unit) or measured or _text(words, unit)
+    head = _axis(rest, unit) or measured or _text(words, unit)
+    if head.role or unit is None or unit.name not in ("dBm", "dBW") or LISTS["no_level"] & set(words):
+        return head
+    return Head("rssi_db", plain.strip("_ "), unit, less=True)  # in any language
 
 
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:
@@ -169,6 +177,9 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
 def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     numbers = [word for word in words if word.isdigit()]
     parts = [word for word in words if word in _PART]
+    tone = re.search(r"(?i)\d+(?:\.\d+)?\s*[kmg]?hz\W*$", plain)  # S21_re_3.5GHz
+    if len(parts) == 1 and tone is not None:
+        return Head(_PART[parts[0]], tone[0], unit, parts[0])
     others = [word for word in words if word not in {*_PART, *numbers, *LISTS["channel"]}]
     named = bool(LISTS["channel"] & set(words))
     plainly = ("re", "im", "real", "imag", *("amp", "amplitude", "mag", "magnitude", "phase") * bool(numbers))

@@ -4,33 +4,37 @@ from __future__ import annotations
 
 import codecs
 import csv
+import gzip
 import re
+import zlib
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pandas as pd
 
 from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
 from gsparc.data.files import check_line_length
-from gsparc.data.tables import TABLE_SUFFIXES
+from gsparc.data.raw import ARRAY_SUFFIXES
+from gsparc.data.tables import is_table
 from gsparc.data.tables.heads import SHEET, parse_head
+from gsparc.data.tables.records import read_records
 from gsparc.data.tables.sheet import Sheet
 
 
-def read_parquet(source: str) -> Sheet:
-    """Read the columns of a Parquet file.
+def read_frame(path: Path, kind: str) -> Sheet:
+    """Read the columns of a file of one of `FRAMES`.
 
     Raises:
         DataError: pyarrow is missing, or the file is damaged or empty.
     """
-    try:
-        from pyarrow import ArrowException
-    except ImportError:
-        raise DataError(f"{source}: Parquet needs pyarrow; say: pip install 'gsparc[tables]'") from None
-    errors = (ArrowException, OSError, ValueError, ImportError)
-    with readable(source, "damaged or not a Parquet file", errors):
-        frame = pd.read_parquet(source, engine="pyarrow")
+    source = str(path)
+    if kind != RECORDS and find_spec("pyarrow") is None:
+        raise DataError(f"{source}: {kind} needs pyarrow; say: pip install 'gsparc[tables]'")
+    with readable(source, f"damaged or not a {kind} file", Exception):  # pyarrow and pandas raise anything
+        frame = FRAMES[kind](path)
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
     frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
     if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
@@ -43,12 +47,19 @@ def read_parquet(source: str) -> Sheet:
     return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))), problems=Problems(source))
 
 
+RECORDS = "JSON, GPX or KML"
+FRAMES: dict[str, Callable[[Path], pd.DataFrame]] = {
+    "Parquet": pd.read_parquet, "Feather": pd.read_feather, RECORDS: read_records
+}  # fmt: skip
+STARTS = {b"PAR1": "Parquet", b"ARRO": "Feather", **dict.fromkeys((b"{", b"[{", b"<"), RECORDS)}
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
+GZIP = b"\x1f\x8b"
 DECIMAL_POINT = r"\s*[-+]?\d*\.\d+(?:[eE][-+]?\d+)?\s*"
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousands, or three decimals
 LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
 COMMENTS = ("#", "%", "//")
+PEEKED = 64  # bytes that tell what a file is
 MOST_BYTES = 2**30  # of a table of text
 MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
 MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
@@ -107,9 +118,15 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
 
 def _decoded(path: Path) -> tuple[str, str]:
     """The text of a file and the name of its encoding."""
-    if path.stat().st_size > MOST_BYTES:
+    with path.open("rb") as file:
+        packed = file.read(len(GZIP)) == GZIP
+    with (
+        readable(path, "damaged or not compressed by gzip", (EOFError, zlib.error, gzip.BadGzipFile)),
+        gzip.open(path) if packed else path.open("rb") as file,
+    ):
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
         raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
-    content = path.read_bytes()
     for start, what in SHEET["others"].items():
         if content.lstrip().startswith(start.encode("latin-1")):
             raise DataError(f"{path}: not a table of text but {what}")
@@ -217,13 +234,17 @@ def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Line
     heads = _cells(comment, delimiter) if comment else []
     named = [sum(parse_head(cell).role is not None for cell in cells) for cells in (heads, first)]
     fits = len(heads) == len(first) and not all(map(_is_number, heads))
-    values = all(map(_is_number, first))
+    values = all(map(_is_number, first)) or (named[1] == 0 and sum(map(_is_decimal, first)) > 1)
     if not values and not (fits and named[0] > named[1]):
         return lines
     if fits:
         return {min(lines) - 1: comment, **lines}
     fault = f"line {min(lines)} holds numbers; expected the names of the columns above them"
     raise DataError(f"{source}: {fault}")
+
+
+def _is_decimal(cell: str) -> bool:
+    return "." in cell and _is_number(cell)
 
 
 def _is_number(cell: str) -> bool:
@@ -316,8 +337,14 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
-    if path.suffix.lower() not in TABLE_SUFFIXES:
-        raise DataError(f"{path}: expected a name ending in .csv, .tsv, .txt or .parquet")
-    sheet, notes = (read_parquet(str(path)), []) if path.suffix.lower() == ".parquet" else read_text(path)
+        raise DataError(f"{path}: no such file; expected a table, or arrays (*{', *'.join(ARRAY_SUFFIXES)})")
+    if not is_table(path):
+        raise DataError(f"{path}: expected a table (csv, parquet, json, ...), no arrays")
+    with path.open("rb") as file:
+        first = b"".join(file.read(PEEKED).removeprefix(codecs.BOM_UTF8).split())
+    kind = next((kind for start, kind in STARTS.items() if first.startswith(start)), None)
+    kind = "Parquet" if path.suffix.lower() == ".parquet" else kind
+    if kind == RECORDS and path.stat().st_size > MOST_BYTES:
+        raise DataError(f"{path}: records of more than {MOST_BYTES:,} bytes; write them as Parquet")
+    sheet, notes = read_text(path) if kind is None else (read_frame(path, kind), [])
     return replace(sheet, problems=Problems(path) if problems is None else problems), notes

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import Caution, DataError, list_first
+from gsparc.data.errors import Caution, DataError, list_first, name_row_ranges
 from gsparc.data.links.stations import PER_STATION, SECTOR
-from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations
+from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations, say_column
 from gsparc.data.tables.heads import AXES, LISTS, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
@@ -77,6 +77,22 @@ def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -
             _on_earth(sheet, chosen, roles, across)
         return Places(across, height, degrees)
     return None
+
+
+def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> tuple[Sheet, list[str]]:
+    """Leave out rows in which both coordinates of an end are empty, as loggers write them between fixes."""
+    lost = np.zeros(len(sheet), bool)
+    for end in ("", "rx_", "tx_"):
+        for pair in (("x", "y"), ("latitude", "longitude")):
+            heads = [chosen[f"{end}{axis}"][0].head for axis in pair if f"{end}{axis}" in chosen]
+            if len(heads) == 2 and None not in heads:
+                lost |= np.all([sheet.words(head or "") == "" for head in heads], axis=0)
+    if not lost.any() or lost.all():
+        return sheet, []
+    rows = [name for name, out in zip(sheet.rows, lost, strict=True) if out]
+    said = f"{name_row_ranges(rows)}: no place; these {len(rows)} of {len(sheet)} rows are left out"
+    kept = tuple(name for name, out in zip(sheet.rows, lost, strict=True) if not out)
+    return replace(sheet, frame=sheet.frame[~lost].reset_index(drop=True), rows=kept), [Caution(said)]
 
 
 def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> dict[str, object]:
@@ -148,7 +164,7 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
     # Where most rows are outside, the columns are no degrees; else these rows are faulty.
     if 2 * len(outside[0]) > len(across) and not swapped:
         end = roles[0].removesuffix("latitude")
-        metres = f"metres? say dataset.columns.{end}x={heads[1]} dataset.columns.{end}y={heads[0]}"
+        metres = f"metres? say {say_column(f'{end}x', heads[1])} {say_column(f'{end}y', heads[0])}"
         fault = _notation(*across[np.isfinite(across).all(axis=1)].T) or metres
         example = f"{across[outside[0][0], 0]:.10g} in {sheet.rows[outside[0][0]]}"
         return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")

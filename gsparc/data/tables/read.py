@@ -17,6 +17,7 @@ from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
+from gsparc.data.tables.cells import unfold_cells
 from gsparc.data.tables.columns import (
     CHANNELS,
     JOINED,
@@ -25,6 +26,7 @@ from gsparc.data.tables.columns import (
     Chosen,
     Column,
     choose_columns,
+    say_column,
     schema_unit,
 )
 from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
@@ -33,12 +35,14 @@ from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
     Places,
     StationList,
+    drop_rows_without_place,
     place_per_station,
     read_places,
     read_stations,
 )
-from gsparc.data.tables.sheet import Sheet
-from gsparc.data.tables.slots import unfold_slots
+from gsparc.data.tables.sheet import MEASURED, Sheet
+from gsparc.data.tables.slots import unfold_slots, unfold_tones
+from gsparc.data.units import UNITS, WATTS
 
 NOTHING: Mapping[str, object] = {}
 
@@ -60,8 +64,10 @@ def parse_table(
         DataError: all problems, with row and column.
     """
     sheet, notes = read_sheet(path)
-    sheet, unfolding = unfold_slots(sheet, {str(value) for value in columns.values()})
-    notes = [*notes, *unfolding]
+    sheet, of_cells = unfold_cells(sheet)
+    sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
+    sheet, of_tones = unfold_tones(sheet)
+    notes = [*notes, *of_cells, *of_slots, *of_tones]
     listed = None
     if stations_file is not None:
         second, _ = read_sheet(stations_file, sheet.problems)
@@ -76,6 +82,7 @@ def parse_table(
     chosen, guessed = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
+    sheet, without = drop_rows_without_place(sheet, chosen)
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()
@@ -84,9 +91,9 @@ def parse_table(
     if power is not None and "rssi_db" in chosen:
         about["level_unit"] = schema_unit(power)
     # A column that is scaled has the schema's unit.
-    if power is not None and power.unit is not None and not power.unit.times:
+    if power is not None and power.unit is not None and power.unit.name in WATTS and not power.unit.times:
         about["unit"] = power.unit.name
-    return Raw(arrays, about, notes=(*notes, *guessed, *builder.notes))
+    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes))
 
 
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
@@ -127,7 +134,8 @@ class Builder:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
             for head in self.sheet.heads:
                 if {"loss", "pathloss", "pl"} & set(words_of(head)):
-                    return self.refuse(f"{fault}; dataset.columns.rssi_db={head}*-1 takes losses for levels")
+                    how = say_column("rssi_db", f"{head}*-1")
+                    return self.refuse(f"{fault}; {how} takes losses for levels")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
@@ -152,9 +160,9 @@ class Builder:
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         # Received levels in dBm are below 0: a column without one is a power, a share, or lost its sign.
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
-            choices = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
+            choices = " or ".join(say_column(name, first.head or "") for name in LEVELS)
             fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
-            self.refuse(f"{fault}, or dataset.columns.rssi_db={first.head}*-1", first.head or "")
+            self.refuse(f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or "")
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
@@ -183,6 +191,8 @@ class Builder:
             degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
             if pairs[1][self.tones[0]].unit is None:
                 self.notes.append(f"phases are taken as {'degrees' if degrees else 'radians'}")
+            unit = pairs[0][self.tones[0]].unit
+            first = 10 ** (first / 20) if unit is not None and unit.kind == "level" else first
             turn = np.exp(1j * (np.radians(second) if degrees else second))
             first, second = first * turn.real, first * turn.imag
         csi = first + 1j * second
@@ -196,6 +206,9 @@ class Builder:
         tones: dict[int, Column] = {}
         for column in self.chosen.get(part, ()):
             label = column.label.strip(" _.:()[]")
+            said = MEASURED.fullmatch(label)
+            if said and said[2].lower() in UNITS and UNITS[said[2].lower()].kind == "frequency":
+                label = f"{UNITS[said[2].lower()].factor * float(said[1]):.0f}"
             where = self.sheet.describe_column(column.head or "")
             # A sign belongs to the number: tones -1 and 1 lie on both sides of the carrier.
             if not re.fullmatch(r"[-+]?\d+|", label):
@@ -311,6 +324,8 @@ class Builder:
         if ends:
             place_per_station(self.sheet, end_places[ends[0]], index, names)
             return None
+        if measured not in LEVELS and len(names) == 1:
+            return None  # the only transmitter: dataset.tx_position says where it is
         if measured in LEVELS:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
@@ -428,6 +443,8 @@ class Builder:
 
     def _frequency(self, channels: bool) -> None:
         """Add frequencies of tones, or the carrier."""
+        if channels and self.tones.min() >= LOWEST_HZ:
+            self.arrays["frequency_hz"] = self.tones.astype(float)
         ends = self.chosen["frequency_hz"][0].value if "frequency_hz" in self.chosen else ()
         if len(ends) == 2:
             if not channels or len(self.tones) == 1:

@@ -1,4 +1,4 @@
-"""Slots of scanners and phones, `Serving PCI, Serving RSRP, N1 PCI, N1 RSRP, ...`, as a row for each."""
+"""Slots of scanners, `Serving PCI, Serving RSRP, N1 PCI, N1 RSRP, ...`, as rows; rows of tones as columns."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import pandas as pd
 
 from gsparc.data.errors import list_first
-from gsparc.data.tables.heads import meaning_by_word, unit_of, words_of
+from gsparc.data.tables.heads import KINDS, LISTS, meaning_by_word, parse_head, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 
 HOLDS = meaning_by_word("slots")
@@ -21,7 +21,7 @@ def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     for head in heads:
         words = words_of(unit_of(head)[0])
         held = [HOLDS[word] for word in words if word in HOLDS]
-        name = " ".join(word for word in words if word not in HOLDS)
+        name = " ".join(word for word in words if word not in {*HOLDS, "cell", "dbm"})
         if len(held) == 1 and held[0] not in found.setdefault(name, {}):
             found[name][held[0]] = head
     slots = {name: parts for name, parts in found.items() if set(parts) >= NEEDED}
@@ -43,7 +43,11 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     shared = next((parts["EARFCN"] for parts in slots.values() if "EARFCN" in parts), None)
     level = next(iter(slots.values()))["RSRP"]
     names = {"PCI": "PCI", "RSRP": f"RSRP{level[len(unit_of(level)[0]) :]}", "EARFCN": "EARFCN"}
-    kept, parts = [head for head in sheet.heads if head not in used], []
+    # What else is of one slot says nothing of the others.
+    own = [{*name.split()} for name in slots if name]
+    rest = [head for head in sheet.heads if head not in used]
+    kept = [h for h in rest if h in said or not any(words <= {*words_of(h)} for words in own)]
+    parts = []
     for slot in slots.values():
         held = (sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != "")
         of_slot = {head: name for part, name in names.items() if (head := slot.get(part, shared)) is not None}
@@ -52,3 +56,38 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     rows = tuple(sheet.rows[i] for i in whole.index)
     result = replace(sheet, frame=whole.reset_index(drop=True), rows=rows)
     return result, [f"slots {list_first([*map(repr, slots)], 3)}: {len(rows)} rows of {len(sheet)} moments"]
+
+
+def unfold_tones(sheet: Sheet) -> tuple[Sheet, list[str]]:
+    """Return one row, with columns of all tones, for rows of one place that are of a tone each; a note."""
+    roles = {head: parse_head(head) for head in sheet.heads}
+    parts = {head: read.role for head, read in roles.items() if str(read.role).startswith("csi_")}
+    if len(parts) != 2 or any(roles[head].label for head in parts):
+        return sheet, []
+    tones = [head for head in sheet.heads if LISTS["tone"] & {*words_of(unit_of(head)[0])}]
+    tone = next((head for head in tones if sheet.frame[head].nunique() > 1), None)
+    rest = [head for head in sheet.heads if head not in {*parts, *tones}]
+    placed = [h for h in rest if KINDS.get(str(roles[h].role)) in ("length", "angle", "text")]
+    values = None if tone is None or not placed else sheet.numbers(tone, roles[tone].unit)
+    if values is None or not (values.round() == values).all():
+        return sheet, []
+    place = pd.factorize(sheet.joined(placed))[0]
+    long = sheet.frame.assign(**{BY: place, str(tone): values.astype(int)})
+    # Radios that hop have a tone for each row, and few rows at a place.
+    if long.duplicated([BY, tone]).any() or 2 * len(set(place)) > len(place):
+        return sheet, []
+    wide = long.pivot(index=BY, columns=tone, values=list(parts))
+    wide.columns = [f"{parts[head]}_{number}{_said(head)}" for head, number in wide.columns]
+    first = long.drop_duplicates(BY).index
+    rows = tuple(sheet.rows[i] for i in first)
+    frame = sheet.frame.loc[first, rest].reset_index(drop=True).join(wide)
+    said = f"rows of one place are tones by {tone!r}: {len(rows)} of {len(sheet)}"
+    return replace(sheet, frame=frame, rows=rows), [said]
+
+
+BY = "\0place"
+
+
+def _said(head: str) -> str:
+    unit = parse_head(head).unit
+    return "" if unit is None else f" [{unit.name}]"

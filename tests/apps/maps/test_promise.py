@@ -5,6 +5,7 @@ import pytest
 from scipy.linalg import cholesky
 from scipy.spatial.distance import cdist
 
+from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.promise import PromiseSettings, gather_promise, held_out_evidence, predict_rows
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
@@ -63,7 +64,7 @@ def test_a_map_of_sixty_rows_was_refused():
     method = GaussianProcess()
     method.fit(data, fold, context)
     promise = gather_promise(Learned(method, GaussianProcess, data, fold, context), PromiseSettings())
-    assert len(promise.evidence) >= 100 and promise.coverage(SHARE).share > 0.8
+    assert len(promise.evidence) >= 100 and cross_validate(promise.evidence, SHARE).share > 0.8
 
 
 def test_a_fold_without_test_rows_ended_in_a_reshape():

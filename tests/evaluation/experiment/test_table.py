@@ -36,6 +36,16 @@ def filled(method, value, seed=None, budget=None, split="random", kind="spectrum
     return CellResult(cell, Path("absent"), facts | {"dataset/kind": kind} | more, drawn, earlier)
 
 
+def drawn(method, *values, **more):
+    """A cell for each draw of the split."""
+    return [filled(method, value, draw, drawn=True, **more) for draw, value in enumerate(values)]
+
+
+def said_of(cells, ours="gsparc"):
+    """Remarks on the first table of cells."""
+    return " | ".join(remarks(split_by_problem(average_cells(cells))[0], ours))
+
+
 FOUND = [
     filled("gp", 30.0), *(filled("gsparc", 29.0 + s, s, 60.0) for s in (0.0, 1.0)),
     *(filled("gsrf", 20.0 + s, s, 60.0, **{"machine/load": 3.0}) for s in (0.0, 2.0)),
@@ -61,12 +71,9 @@ def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
 
 def test_draws_are_paired_with_the_best_and_have_standard_errors():
     """The spread over draws is of the rows: what two methods differ by on the same rows is known better."""
-    facts = {"drawn": True, "test/interval/coverage_90": 0.8, "test/outage/brier": 0.0125}
-    found = [
-        filled(method, error, seed, kind="rssi", split="drawn", **facts)
-        for seed, level in enumerate((5.0, 7.0, 9.0))
-        for method, error in (("gp", level), ("idw", level + 1.0 + 0.1 * seed))
-    ]
+    facts = {"test/interval/coverage_90": 0.8, "test/outage/brier": 0.0125}
+    how = {"kind": "rssi", "split": "drawn", **facts}
+    found = drawn("gp", 5.0, 7.0, 9.0, **how) + drawn("idw", 6.0, 8.1, 10.2, **how)
     (block,) = split_by_problem(average_cells(found))
     gp, idw = block.itertuples()
     assert (gp.method, gp.behind_db, idw.behind_db) == ("gp", 0.0, pytest.approx(1.1))
@@ -78,7 +85,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert "simple baseline wins" not in page, "there are no others"
     (said, *_) = remarks(block, "gsparc")
     assert "; 1.10 ± 0.06 dB before idw (standard error over the same 3 draws): they are told" in said
-    assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [0, 6.0]]
+    assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [1, 7.0]]
 
 
 def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
@@ -108,13 +115,13 @@ def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monk
 def test_losers_are_not_hidden():
     said = " | ".join(remarks(split_by_problem(average_cells(FOUND, TIMED))[0], "gsparc"))
     assert "first: gp" in said and "a simple baseline wins: take gp" in said
-    absent = " | ".join(remarks(split_by_problem(average_cells(FOUND, TIMED))[0], "never run"))
+    absent = said_of(FOUND, "never run")
     assert "never run was not run: no verdict" in absent and "baseline wins" not in absent
     assert "gsparc is 0.50 dB behind gp" in said
     assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
     assert "busy (load 0.1 to 3.0 per core)" in said
     far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
-    said = " | ".join(remarks(split_by_problem(average_cells(far))[0], "gsparc"))
+    said = said_of(far)
     assert "2.00 dB behind gp" in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
 
@@ -191,13 +198,8 @@ def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, m
 
 def test_methods_with_the_same_figures_in_every_draw_had_a_winner():
     """`first: gp, 0.00 ± 0.00 dB before gsparc`, and `a simple baseline wins: take gp`."""
-    cells = [
-        filled(method, 5.0 + draw, draw, kind="rssi", split="drawn", drawn=True)
-        for draw in range(3)
-        for method in ("gp", "gsparc")
-    ]
-    (block,) = split_by_problem(average_cells(cells))
-    said = " | ".join(remarks(block, "gsparc"))
+    how = {"kind": "rssi", "split": "drawn"}
+    said = said_of(drawn("gp", 5.0, 6.0, 7.0, **how) + drawn("gsparc", 5.0, 6.0, 7.0, **how))
     assert "; the same as gsparc (standard error over the same 3 draws)" in said
     assert "gp and gsparc have the same RMSE dB over 3 draws" in said
     assert "wins" not in said and "beats" not in said and "behind" not in said
@@ -205,12 +207,8 @@ def test_methods_with_the_same_figures_in_every_draw_had_a_winner():
 
 def test_a_simple_baseline_won_by_chance():
     """The verdict was by means of draws alone, however much their difference varied."""
-    gains = (2.0, -1.5, 0.4)
-    cells = [filled("gsparc", 30.0, draw, drawn=True) for draw in range(3)]
-    cells += [filled("gp", 30.0 + gain, draw, drawn=True) for draw, gain in enumerate(gains)]
-    cells += [filled("nearest", 30.0 + gain / 2, draw, drawn=True) for draw, gain in enumerate(gains)]
-    (block,) = split_by_problem(average_cells(cells))
-    said = " | ".join(remarks(block, "gsparc"))
+    cells = drawn("gsparc", 30.0, 30.0, 30.0) + drawn("gp", 32.0, 28.5, 30.4)
+    said = said_of(cells + drawn("nearest", 31.0, 29.25, 30.2))
     assert "gp and gsparc are not told apart in PSNR dB: gp is 0.30 ± 1.01 dB better over 3 draws" in said
     assert (
         "0.15 ± 0.51 dB before nearest (standard error over the same 3 draws): they are not told apart"
@@ -223,34 +221,31 @@ def test_budgets_called_equal_were_spent_by_half():
     """newrf spent 6.43 of 12 processor seconds, gsparc 14.2, under a title that gave 12 to each."""
     cpu = {"gsparc": 14.2, "newrf": 6.43, "blind": 12.5}
     found = [filled(name, 20.0, 0, 12.0, **{"time/train_cpu_s": own}) for name, own in cpu.items()]
-    said = remarks(split_by_problem(average_cells(found))[0], "gsparc")
+    said = said_of(found)
     more = "newrf used 54% of its budget: budgets=[{seconds: 22, seeds: [0]}] gives it as much, unless"
     assert f"spent of 12 processor seconds: gsparc 14.2, newrf 6.43; {more} it ended by itself" in said
-    said = " ".join(remarks(split_by_problem(average_cells(found[1:2]))[0], "gsparc"))
+    said = said_of(found[1:2])
     assert "newrf 6.43" in said and "as much" not in said
 
 
 def test_the_csv_file_had_other_signs_than_the_console():
     """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws, a spread was an error."""
-    drawn = [filled("gp", 5.0 + draw, draw, kind="rssi", split="drawn", drawn=True) for draw in range(3)]
+    draws = drawn("gp", 5.0, 6.0, 7.0, kind="rssi", split="drawn")
     seeds = [filled("gsparc", 5.0 + seed, seed, 60.0, kind="rssi") for seed in range(2)]
-    gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*drawn, *seeds]))).itertuples()
+    gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*draws, *seeds]))).itertuples()
     assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
     assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
     assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(gsparc.score_error_db)
 
 
 def test_what_methods_were_given_besides_places_was_not_said():
-    (block,) = split_by_problem(average_cells([*FOUND[:1], filled("newrf", 29.0, 0, 60.0)]))
-    assert any("gsparc were given directions of arrival" in line for line in remarks(block, "gsparc"))
-    (block,) = split_by_problem(average_cells(FOUND[:1]))
-    assert not any("were given" in line for line in remarks(block, "gsparc"))
+    assert "gsparc were given directions of arrival" in said_of([*FOUND[:1], filled("newrf", 29.0, 0, 60.0)])
+    assert "were given" not in said_of(FOUND[:1])
 
 
 def test_draws_with_the_same_test_rows_had_a_standard_error():
     """`split=random, draws: 3` of a release that names its test rows gave three copies of one split."""
-    same = {"split/test_sha256": "t", "drawn": True}
-    found = [filled("gp", 30.0 + draw, draw, **same) for draw in range(3)]
+    found = drawn("gp", 30.0, 31.0, 32.0, **{"split/test_sha256": "t"})
     (block,) = split_by_problem(average_cells(found))
     (row,) = block.itertuples()
     assert not row.draws and row.seeds == 3 and "draws" not in title_of(block)
@@ -260,11 +255,8 @@ def test_draws_with_the_same_test_rows_had_a_standard_error():
 
 def test_the_last_of_three_was_bold_in_a_comparison():
     """`ours` was, 14 dB behind; README has in bold what is best and told apart."""
-    cells = [
-        filled(method, 30.0 - behind - draw * (1 + behind / 50), draw, drawn=True)
-        for method, behind in (("gsparc", 0.0), ("gp", 1.0), ("complex_gp", 14.0))
-        for draw in range(3)
-    ]
+    behind = {"gsparc": 0.0, "gp": 1.0, "complex_gp": 14.0}.items()
+    cells = [c for name, by in behind for c in drawn(name, *(30 - by - n * (1 + by / 50) for n in range(3)))]
     (block,) = split_by_problem(average_cells(cells))
     page = markdown([block], "complex_gp")
     assert "| **gsparc** |" in page and "| complex_gp (ours) |" in page and page.count("**gsparc**") == 1
@@ -276,7 +268,6 @@ def test_the_lead_of_the_first_had_no_verdict():
     """`6.20 ± 1.27 dB before newrf (standard error over the same 3 draws)` left the reader to compute t."""
     leads = ((6.0, 5.9, 6.1), "they are told apart"), ((2.0, 0.1, 0.9), "they are not told apart")
     for gains, verdict in leads:
-        cells = [filled("gp", 30.0, draw, drawn=True) for draw in range(3)]
-        cells += [filled("gsparc", 30.0 + gain, draw, drawn=True) for draw, gain in enumerate(gains)]
+        cells = drawn("gp", 30.0, 30.0, 30.0) + drawn("gsparc", *(30.0 + gain for gain in gains))
         (block,) = split_by_problem(average_cells(cells))
         assert remarks(block, "gsparc")[0].endswith(f"over the same 3 draws): {verdict}")

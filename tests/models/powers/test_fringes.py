@@ -4,31 +4,17 @@ import numpy as np
 import pytest
 import torch
 from closed import fitted_to, read_back
+from interference import WAVELENGTH, plane
 from releases import REAL
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.fringes import Blend, nearest_distances, resolves_wavelength
 from gsparc.models.powers.waves import field_db, fit_wave_weights, make_basis
 from gsparc.ops import Pose
 
-LIGHT, WAVELENGTH = 299_792_458.0, 0.3
 PLANE = REAL / "real" / "techtile-power-reci-rf-1.npz"
-
-
-def plane(count: int, seed: int = 0) -> Measurements:
-    """Half a metre square under twelve sources that interfere, with 0.5 dB of noise."""
-    rng = np.random.default_rng(seed)
-    places = np.c_[rng.uniform(0, 0.6, (count, 2)), np.zeros(count)]
-    sources = np.c_[rng.uniform(-3, 3, (12, 2)), rng.uniform(1, 2, 12)]
-    far = np.linalg.norm(places[:, None] - sources, axis=-1)
-    field = np.exp(-2j * np.pi * far / WAVELENGTH) / far @ np.exp(2j * np.pi * rng.uniform(size=12))
-    decibels = 10 * np.log10(np.abs(field) ** 2 + 1e-3) + 0.5 * rng.standard_normal(count)
-    return from_arrays(
-        {"rx_position": places, "rssi_db": decibels, "frequency_hz": LIGHT / WAVELENGTH}, {"name": "plane"}
-    )
 
 
 def db(power: torch.Tensor) -> np.ndarray:

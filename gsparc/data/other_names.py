@@ -1,0 +1,55 @@
+"""Arrays as other tools call and shape them, under the schema's names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.errors import Caution
+from gsparc.data.raw import Raw, rename_arrays
+from gsparc.data.schema import FIELDS
+
+MOST_AXES = 3  # of channels of one static end
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+FIELD_OF = {_plain(other): field.name for field in FIELDS.values() for other in field.also.split()}
+
+
+def name_arrays(raw: Raw) -> Raw:
+    """Return `raw` with `fields.csv`'s other names of arrays replaced, and channels as complex (S, ...).
+
+    Real numbers with an axis of two become real and imaginary parts; axes of length 1 go where there are
+    more than `MOST_AXES`, or where one place is written (1, 3).
+    """
+    names: dict[str, str] = {}
+    for name, array in raw.arrays.items():
+        field = FIELD_OF.get(_plain(name), name)
+        taken = {*raw.arrays, *names.values()}
+        channel = array.dtype.kind == "c" or _parts(array) or re.search("amp|mag|abs", name)
+        if name not in FIELDS and field not in taken and (field != "csi" or channel):
+            names[name] = field
+    arrays, notes = rename_arrays(raw, names).arrays, [f"{name}: taken as {names[name]}" for name in names]
+    csi = arrays.get("csi", np.zeros(0))
+    if axis := _parts(csi):
+        first, second = np.moveaxis(csi, axis, 0).astype(np.float64)
+        csi = first + 1j * second
+        notes.append(Caution(f"csi: real numbers, taken as real and imaginary parts along axis {axis}"))
+    if csi.ndim > MOST_AXES and "station_position" not in arrays:
+        csi = csi.reshape(len(csi), *(count for count in csi.shape[1:] if count > 1))
+    arrays |= {"csi": csi} if "csi" in arrays else {}
+    for name in ("rx_position", "tx_position"):
+        if name in arrays and arrays[name].shape[:1] == (1,) and len(csi) != 1:
+            arrays[name] = arrays[name].reshape(arrays[name].shape[1:])
+    return replace(rename_arrays(raw, names), arrays=arrays, notes=(*raw.notes, *notes))
+
+
+def _parts(array: np.ndarray) -> int:
+    """Which axis of real numbers, some below 0, holds their real and imaginary parts; 0: none."""
+    real = array.dtype.kind in "if" and array.ndim > 1 and bool((array < 0).any())
+    return next((axis for axis in (array.ndim - 1, 1) if real and array.shape[axis] == 2), 0)
