@@ -17,13 +17,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
-from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.kernel import NOISE_SPAN, ExponentialShadowing, Kernel, distances
+from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.posterior import Exact
@@ -50,7 +49,8 @@ WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the 
 SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
-LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
+GAP_LOOKS = 25
+AMONG_ROWS = 8.0  # weight of errors among rows, of those at squares
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
@@ -106,7 +106,7 @@ class Candidate:
 def candidate_priors(
     rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
 ) -> list[Candidate]:
-    """Return the likeliest settings of each mean law, the best first, then those of kriging.
+    """Return the likeliest settings of each mean law, the best first, then one for gaps.
 
     Of few or very many rows the best law alone. Each law has further `terms`.
     """
@@ -118,15 +118,20 @@ def candidate_priors(
     found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
     if rows.silent.any():
         return found
-    return [*found, _fit_kriging(rows.draw_subset(max_rows, seed), trends[0].trend)]
+    part = rows.draw_subset(COMPARED_ON, seed)
+    gaps = max((_fit_to_squares(part, one) for one in found), key=lambda one: one.score)
+    return [*found, gaps]
 
 
-def _fit_kriging(rows: PowerRows, trend: Trend) -> Candidate:
-    """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    fit = fit_variogram(rows.places, rows.distances_terms_values(trend)[2].numpy())
-    sill = max(fit.sill, LEAST_SILL * fit.variance)
-    kernel = Kernel.from_length(fit.range, max(fit.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
-    return Candidate(-math.inf, trend, kernel, 0.0)
+def _fit_to_squares(rows: PowerRows, base: Candidate) -> Candidate:
+    """The same mean with two lengths that suit squares of floor left out as they do rows: for gaps."""
+    starts = [base.kernel] if len(base.kernel.signals) > 1 else _two_length_starts(rows, base.kernel)
+    known = rows.distances_terms_values(base.trend)
+    groups = [list(rows_of_groups(number_squares(rows.places, sides))) for sides in SPANS]
+    value, kernel = density.fit_kernel_by_left_out(
+        starts, *known, looks=GAP_LOOKS, tolerance=EVIDENCE_SETTLED, partitions=groups
+    )
+    return replace(base, score=-value, kernel=kernel)
 
 
 def mix_candidates(
@@ -142,7 +147,8 @@ def mix_candidates(
     part = rows.draw_subset(max_rows, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    gram = _relative_gram([_errors_among_rows(rows.measured_rows, one.prior, seed) for one in candidates])
+    near = [_errors_among_rows(rows.measured_rows, one.prior, seed) for one in candidates]
+    gram = AMONG_ROWS * _relative_gram(near)
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
