@@ -8,6 +8,7 @@ mixture of processes, by the errors at squares of floor left out, is safer than 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
@@ -22,7 +23,7 @@ from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing, Stationary, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.posterior import Exact
@@ -49,8 +50,7 @@ WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the 
 SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
-GAP_LOOKS = 25
-AMONG_ROWS = 8.0  # weight of errors among rows, of those at squares
+AMONG_ROWS = 4.0  # weight of errors among rows, of those at squares
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
@@ -108,7 +108,8 @@ def candidate_priors(
 ) -> list[Candidate]:
     """Return the likeliest settings of each mean law, the best first, then one for gaps.
 
-    Of few or very many rows the best law alone. Each law has further `terms`.
+    That is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or very
+    many rows the best law alone. Each law has further `terms`.
     """
     rest = subtract_means(rows, terms)
     laws = _candidate_laws(rest, site, "auto")
@@ -118,20 +119,10 @@ def candidate_priors(
     found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
     if rows.silent.any():
         return found
-    part = rows.draw_subset(COMPARED_ON, seed)
-    gaps = max((_fit_to_squares(part, one) for one in found), key=lambda one: one.score)
-    return [*found, gaps]
-
-
-def _fit_to_squares(rows: PowerRows, base: Candidate) -> Candidate:
-    """The same mean with two lengths that suit squares of floor left out as they do rows: for gaps."""
-    starts = [base.kernel] if len(base.kernel.signals) > 1 else _two_length_starts(rows, base.kernel)
-    known = rows.distances_terms_values(base.trend)
-    groups = [list(rows_of_groups(number_squares(rows.places, sides))) for sides in SPANS]
-    value, kernel = density.fit_kernel_by_left_out(
-        starts, *known, looks=GAP_LOOKS, tolerance=EVIDENCE_SETTLED, partitions=groups
-    )
-    return replace(base, score=-value, kernel=kernel)
+    few = rows.draw_subset(COMPARED_ON, seed)
+    squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
+    gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
+    return [*found, max(gaps, key=lambda one: one.score)]
 
 
 def mix_candidates(
@@ -232,14 +223,17 @@ def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
-def _fit_one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
+def _fit_one_length(
+    rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...],
+    shape: type[Stationary] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
+) -> Candidate:  # fmt: skip
     distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
         return Candidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
-    starts = [Kernel.from_length(scale * share, 0.1) for share in SHARES]
-    value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values)
+    starts = [Kernel.from_length(scale * share, 0.1, 1.0, shape) for share in SHARES]
+    value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values, partitions=squares)
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 
