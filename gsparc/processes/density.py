@@ -146,10 +146,10 @@ def covariance_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = Non
 
     Args:
         kernel: of stationary terms.
-        distance: (n, n) [m].
+        distance: (n, n) [m]; places (n, D) [m] where other than distances counts.
         columns: (n, P) of terms with unit normal weights; None: none.
     """
-    total = kernel.correlation(distance)
+    total = kernel.correlation(distance) if kernel.is_isotropic else kernel.correlations(distance, distance)
     if columns is not None:
         total = total + columns @ columns.T
     return total + kernel.noise * torch.eye(len(distance), dtype=distance.dtype)

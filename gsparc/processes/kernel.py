@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops.transforms import needs_reference
+from gsparc.processes.places import moving_end, other_end
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Term
 
@@ -132,6 +133,28 @@ class ExponentialShadowing(Stationary):
     def correlation(self, distance: Tensor) -> Tensor:
         """See `Stationary`."""
         return (distance * (-1 / self.length)).exp()
+
+
+@dataclass(frozen=True)
+class EndShadowing(Shadowing):
+    """The same about one of two ends that both move, whatever the other does: its surroundings, its gain.
+
+    >>> near = torch.tensor([[0.0, 0, 0, 9, 9, 9]])  # one transmitter, another receiver
+    >>> EndShadowing(2.0).covariance(near, torch.tensor([[0.0, 0, 0, 5, 5, 5]]))
+    tensor([[1.]])
+
+    Attributes:
+        other: whether it is the second end.
+    """
+
+    other: bool = False
+    by_distance = False
+    compiled = 0
+
+    def covariance(self, a: Tensor, b: Tensor) -> Tensor:
+        """See `Term`; of places (..., 6) of both ends [m]."""
+        end = other_end if self.other else moving_end
+        return super().covariance(end(a), end(b))
 
 
 class SmoothRough(Stationary):
@@ -266,11 +289,13 @@ class Kernel(Stored):
         "lengths 0.5 m (25%) and 2 m (75%), noise 0.1 of the signal's variance"
         """
         parts = [f"{length:.4g} m" for length in self.lengths]
-        if len(parts) == 2:
+        if len(parts) > 1:
             parts = [f"{part} ({share:.0%})" for part, share in zip(parts, self.shares, strict=True)]
+        ends = [" of each end" * isinstance(term, EndShadowing) for term in self.signals]
         kind = "exponential " * isinstance(self.terms[0], ExponentialShadowing)
-        word = "lengths" if len(parts) == 2 else "length"
-        return f"{kind}{word} {' and '.join(parts)}, noise {self.noise:.3g} of the signal's variance"
+        word = "lengths" if len(parts) > 1 else "length"
+        said = " and ".join(part + end for part, end in zip(parts, ends, strict=True))
+        return f"{kind}{word} {said}, noise {self.noise:.3g} of the signal's variance"
 
     @property
     def compiled_lengths(self) -> list[float] | None:
@@ -281,7 +306,7 @@ class Kernel(Stored):
     @property
     def is_isotropic(self) -> bool:
         """Whether distances are all that counts, also where both ends move."""
-        return self.terms[0].by_distance
+        return all(term.by_distance for term in self.signals)
 
     def correlation(self, distance: Tensor) -> Tensor:
         """Return correlations at distances (...) [m]."""
@@ -292,7 +317,10 @@ class Kernel(Stored):
 
     def correlations(self, a: Tensor, b: Tensor) -> Tensor:
         """Return correlations (..., n, m) of places (..., n, D) and (..., m, D) [m]."""
-        return self.correlation(distances(a, b)) if self.is_isotropic else self.terms[0].covariance(a, b)
+        if self.is_isotropic:
+            return self.correlation(distances(a, b))
+        first, *others = (term.covariance(a, b) for term in self.signals)
+        return sum(others, first)
 
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]."""
@@ -307,11 +335,12 @@ class Kernel(Stored):
         return torch.cat([*signals, shares[:-1] - shares[-1], noise])
 
     def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
-        """Return bounds of the parameters, for rows at distances (...) [m].
+        """Return bounds of the parameters, for rows at distances (...) [m], or at places (n, D).
 
         >>> [round(low, 2) for low, _ in Kernel.from_length(1.0, 1.0).bounds(torch.tensor([10.0]))]
         [-4.61, -13.82]
         """
+        distance = distance if self.is_isotropic else distances(distance, distance)
         # All rows may stand at one place, whose distances are 0.
         scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
         *lengths, noise = (term.bounds(scale) for term in self.terms)

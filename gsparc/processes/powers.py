@@ -69,11 +69,17 @@ class PowerRows:
         """Return means (m, 1) [dB] over the rows of each place."""
         return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
-    def distances_terms_values(self, trend: Trend) -> tuple[Tensor, Tensor, Tensor]:
-        """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB]."""
+    def distances_terms_values(
+        self, trend: Trend, kernel: Kernel | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB].
+
+        Of a `kernel` to which more than distances counts, places (n, D) [m] stand for these.
+        """
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
-        return distances(places, places), trend.columns(places), rest[:, None]
+        apart = distances(places, places) if kernel is None or kernel.is_isotropic else places
+        return apart, trend.columns(places), rest[:, None]
 
     def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
@@ -218,8 +224,12 @@ def condition_on_powers(
         seed: of rows that are drawn where there are too many.
         least: silent rows that are used where fewer were heard.
     """
-    if len(rows.places) <= MOST_ROWS or rows.silent.all():
-        return _condition_exactly(rows.draw_subset(MOST_ROWS, seed), prior, least)
+    # Rows of one end, however far the other is, tell of its own shadows: no few are the nearest.
+    if len(rows.places) <= MOST_ROWS or rows.silent.all() or not prior.kernel.is_isotropic:
+        process, notes = _condition_exactly(rows.draw_subset(MOST_ROWS, seed), prior, least)
+        drawn = len(rows.places) > MOST_ROWS and not rows.silent.all()
+        said = f"{MOST_ROWS} of {len(rows.places)} rows, drawn evenly, are learned from"
+        return process, (said,) * drawn + notes
     loud = rows.measured_rows
     values = loud.means_at_places()
     share = values.count / values.count.sum()

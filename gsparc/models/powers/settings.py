@@ -23,9 +23,17 @@ from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing, Stationary, distances
+from gsparc.processes.kernel import (
+    EndShadowing,
+    ExponentialShadowing,
+    Kernel,
+    Shadowing,
+    Stationary,
+    distances,
+)
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
+from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Posterior, Prior
@@ -176,6 +184,9 @@ def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows
     best = _choose_on_part(rows, trends, seed, min(max_rows, COMPARED_ON) if many else max_rows)
     if not many:
         return best
+    if not best.kernel.is_isotropic:  # none are nearest by which it could be chosen
+        part = rows.draw_subset(min(max_rows, 2 * COMPARED_ON), seed)
+        return _search_kernel(part, best, [best.kernel], limit=REFINED)
     kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
@@ -195,6 +206,9 @@ def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows:
     if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
         two = _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0)
         best = max(best, two, key=lambda one: one.score)
+        if has_both_ends(few.places):
+            ends = _search_kernel(few, best, _end_starts(few, best.kernel), 4.0)
+            best = max(best, ends, key=lambda one: one.score)
     if len(loud.places) > len(few.places) and not out_of_time():
         # A look at all rows costs several at few: what was found on these is near already.
         best = _search_kernel(loud, best, [best.kernel], limit=REFINED)
@@ -241,22 +255,36 @@ def _search_kernel(
     rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = density.LOOKS
 ) -> Candidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    known = rows.distances_terms_values(base.trend)
+    known = rows.distances_terms_values(base.trend, starts[0])
     value, kernel = density.fit_kernel_by_left_out(starts, *known, looks=limit)
     return replace(base, score=-value - base.cost - cost, kernel=kernel, cost=base.cost + cost)
 
 
 def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
     """Two lengths to start from, about the one that fits best and apart from it."""
-    scale = float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
+    scale = _median_distance(rows)
     fit, noise = kernel.length, kernel.noise
     near = [Kernel.from_lengths((fit * a, fit * b), (0.5, 0.5), noise) for a, b in SPLITS]
     return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), noise) for a, b in WIDE]
 
 
+def _median_distance(rows: PowerRows) -> float:
+    return float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
+
+
+def _end_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
+    """Shadows of the path and of each end, or gains of each place, where one was found for both together."""
+    starts = []
+    for length in (kernel.length, SHARES[0] * _median_distance(rows)):
+        ends = (EndShadowing(length), EndShadowing(length, other=True))
+        signals = [replace(one, share=1 / 3) for one in (Shadowing(kernel.lengths[-1]), *ends)]
+        starts.append(replace(kernel, terms=(*signals, kernel.terms[-1])))
+    return starts
+
+
 def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.distances_terms_values(base.trend)
+    distance, terms, values = rows.distances_terms_values(base.trend, base.kernel)
     gram = base.kernel.amplitude * density.covariance_of(base.kernel, distance, terms)
     silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
@@ -268,7 +296,7 @@ def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
 
 def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.distances_terms_values(base.trend)
+    distance, terms, values = rows.distances_terms_values(base.trend, base.kernel)
     side = torch.from_numpy(rows.side)
     most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
     bounds = base.kernel.bounds(distance)
