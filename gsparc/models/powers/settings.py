@@ -23,14 +23,7 @@ from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.kernel import (
-    EndShadowing,
-    ExponentialShadowing,
-    Kernel,
-    Shadowing,
-    Stationary,
-    distances,
-)
+from gsparc.processes.kernel import EndShadowing, ExponentialShadowing, Kernel, Shadowing, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
@@ -146,8 +139,9 @@ def mix_candidates(
     part = rows.draw_subset(max_rows, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    near = [_errors_among_rows(rows.measured_rows, one.prior, seed) for one in candidates]
-    gram = AMONG_ROWS * _relative_gram(near)
+    values = rows.measured_rows.means_at_places()
+    near = [condition_on_nearest(one.prior, values, seed).left_out().mean for one in candidates]
+    gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
@@ -170,12 +164,6 @@ def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
     group = rows_of_groups(number_squares(posterior.rows.numpy(), sides))
     residual, _ = left_out_residuals(posterior.factor.inverse, posterior.weights, group)
     return residual[posterior.extra == 0, 0].numpy()
-
-
-def _errors_among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
-    """Errors (n,) [dB] at each place, predicted from the nearest others."""
-    values = loud.means_at_places()
-    return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
 def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
@@ -239,7 +227,7 @@ def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw
 
 def _fit_one_length(
     rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...],
-    shape: type[Stationary] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
+    shape: type[Shadowing | ExponentialShadowing] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
 ) -> Candidate:  # fmt: skip
     distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
