@@ -120,7 +120,9 @@ def candidate_priors(
     found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
     if rows.silent.any():
         return found
-    few = rows.draw_subset(COMPARED_ON, seed)
+    # One row of a place: levels that repeat there to the digit would speak for no noise.
+    once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
+    few = rows.subset(once).draw_subset(COMPARED_ON, seed)
     squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
     gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
     return [*found, max(gaps, key=lambda one: one.score)]
