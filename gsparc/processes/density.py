@@ -7,7 +7,7 @@ slopes: autograd brings them from the covariance to lengths, shares and noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -21,6 +21,7 @@ from torch import Tensor
 from gsparc.processes.censored import PseudoValues, log_evidence
 from gsparc.processes.factor import BLAS, Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel
+from gsparc.processes.left_out import left_out_residuals
 from gsparc.processes.worker import stop_when_late
 
 LOOKS, SETTLED = 40, 5e-6  # of a walk: most evaluations, and the relative gain of a step that is the last
@@ -117,6 +118,26 @@ class ProfiledDensity(torch.autograd.Function):
         return slopes[0] * ctx.saved_tensors[0], None
 
 
+def density_without_groups(
+    gram: Tensor, values: Tensor, partitions: Sequence[Iterable[Tensor]]
+) -> tuple[Tensor, Tensor]:
+    """Return the negative density of rows without their groups and without themselves, half and half.
+
+    It is relative to the best amplitude [nats per row], which follows.
+
+    Args:
+        gram: (n, n) with noise, relative to the amplitude.
+        values: (n, 1) less the mean.
+        partitions: each of groups of rows that are left out together.
+    """
+    inverse = Factor.from_gram(gram, "raise").inverse
+    parts = (groups for one in partitions for groups in (None, one))
+    errors = [left_out_residuals(inverse, inverse @ values, groups) for groups in parts]
+    variance = torch.cat([one.variance for one in errors])
+    amplitude = (torch.cat([one.residual for one in errors])[:, 0].square() / variance).mean()
+    return 0.5 * (amplitude.log() + variance.log().mean()), amplitude.detach()
+
+
 def covariance_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = None) -> Tensor:
     """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
 
@@ -198,12 +219,17 @@ def fit_kernel(
 def fit_kernel_by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
     bounds: Sequence[tuple[float, float]] = (), looks: int = LOOKS, tolerance: float = SETTLED,
-    entries: int = 1, bounded: bool = True,
+    entries: int = 1, bounded: bool = True, partitions: Sequence[Iterable[Tensor]] = (),
 ) -> tuple[float, Kernel]:  # fmt: skip
-    """Find the least negative density of rows left out [nats per output], and its kernel."""
+    """Find the least negative density of rows left out [nats per output], and its kernel.
+
+    They are left out one by one, and by `partitions` where there are any.
+    """
 
     def objective(kernel: Kernel) -> tuple[Tensor, Tensor]:
         gram = covariance_of(kernel, distance, columns)
+        if partitions:
+            return density_without_groups(gram, values, partitions)
         value, amplitude = LeftOutDensity.apply(gram, values, entries, bounded)  # type: ignore[no-untyped-call]
         return value / len(values), amplitude
 

@@ -35,7 +35,6 @@ from gsparc.models.powers.settings import (
 )
 from gsparc.models.target_rows import linear_powers, power_rows, to_entry_variance
 from gsparc.processes.nearest import Nearest
-from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.posterior import Exact, approximation_label
 from gsparc.processes.powers import PowerProcess, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Prior
@@ -68,7 +67,6 @@ class PowerField(ClosedForm):
         self.waves, self.seed, self.walls, self.own_terms = waves, seed, walls, terms
         self.fringes: Fringes | None = None  # of coherent waves, beside the process
         self.powers: PowerProcess | None = None
-        self._tree: cKDTree | None = None  # of its places, made when it is asked
         self.known = np.zeros(0, np.int64)
         self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
         self.decibels = np.zeros(0)
@@ -157,8 +155,6 @@ class PowerField(ClosedForm):
         seen = power_rows(data, rows)
         each = [(share, condition_on_powers(seen, prior, self.seed)[0]) for share, prior in self.priors]
         self.powers = replace(each[0][1], others=tuple(each[1:]))
-        # The tree is of the rows before.
-        self._tree = None
         loud = seen.subset(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
         if isinstance(nearest := self.powers.posterior, Nearest):
@@ -225,11 +221,5 @@ class PowerField(ClosedForm):
         mean, spread, share = process.answer(places)
         if self.fringes is None:
             return mean, spread, share, mean
-        mean, factor = self.fringes.blend_solutions(mean, places, self._nearest_distance(places))
+        mean, factor = self.fringes.blend_solutions(mean, places, process.posterior.nearest_distance(places))
         return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)
-
-    def _nearest_distance(self, places: Tensor) -> Tensor:
-        """From the nearest known row (B,) [m]."""
-        if self._tree is None:
-            self._tree = cKDTree(self.require_fitted(self.powers).places)
-        return nearest_distance(self._tree, places)

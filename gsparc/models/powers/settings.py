@@ -8,6 +8,7 @@ mixture of processes, by the errors at squares of floor left out, is safer than 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
@@ -17,20 +18,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
-from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.kernel import (
-    NOISE_SPAN,
-    EndShadowing,
-    ExponentialShadowing,
-    Kernel,
-    Shadowing,
-    distances,
-)
+from gsparc.processes.kernel import EndShadowing, ExponentialShadowing, Kernel, Shadowing, distances
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
@@ -58,7 +51,7 @@ WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the 
 SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
-LEAST_SILL = 1e-2  # of the variance: a variogram may be all nugget
+AMONG_ROWS = 4.0  # weight of errors among rows, of those at squares
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
@@ -114,9 +107,10 @@ class Candidate:
 def candidate_priors(
     rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
 ) -> list[Candidate]:
-    """Return the likeliest settings of each mean law, the best first, then those of kriging.
+    """Return the likeliest settings of each mean law, the best first, then one for gaps.
 
-    Of few or very many rows the best law alone. Each law has further `terms`.
+    That is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or very
+    many rows the best law alone. Each law has further `terms`.
     """
     rest = subtract_means(rows, terms)
     laws = _candidate_laws(rest, site, "auto")
@@ -126,15 +120,12 @@ def candidate_priors(
     found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
     if rows.silent.any():
         return found
-    return [*found, _fit_kriging(rows.draw_subset(max_rows, seed), trends[0].trend)]
-
-
-def _fit_kriging(rows: PowerRows, trend: Trend) -> Candidate:
-    """Exponential shadowing by the empirical variogram, up to half the extent: kriging, for gaps."""
-    fit = fit_variogram(rows.places, rows.distances_terms_values(trend)[2].numpy())
-    sill = max(fit.sill, LEAST_SILL * fit.variance)
-    kernel = Kernel.from_length(fit.range, max(fit.nugget / sill, NOISE_SPAN[0]), sill, ExponentialShadowing)
-    return Candidate(-math.inf, trend, kernel, 0.0)
+    # One row of a place: levels that repeat there to the digit would speak for no noise.
+    once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
+    few = rows.subset(once).draw_subset(COMPARED_ON, seed)
+    squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
+    gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
+    return [*found, max(gaps, key=lambda one: one.score)]
 
 
 def mix_candidates(
@@ -150,7 +141,9 @@ def mix_candidates(
     part = rows.draw_subset(max_rows, seed)
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
-    gram = _relative_gram([_errors_among_rows(rows.measured_rows, one.prior, seed) for one in candidates])
+    values = rows.measured_rows.means_at_places()
+    near = [condition_on_nearest(one.prior, values, seed).left_out().mean for one in candidates]
+    gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
@@ -173,12 +166,6 @@ def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
     group = rows_of_groups(number_squares(posterior.rows.numpy(), sides))
     residual, _ = left_out_residuals(posterior.factor.inverse, posterior.weights, group)
     return residual[posterior.extra == 0, 0].numpy()
-
-
-def _errors_among_rows(loud: PowerRows, prior: Prior, seed: int) -> np.ndarray:
-    """Errors (n,) [dB] at each place, predicted from the nearest others."""
-    values = loud.means_at_places()
-    return (values.values - condition_on_nearest(prior, values, seed).left_out()[0])[:, 0].numpy()
 
 
 def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
@@ -240,14 +227,17 @@ def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
-def _fit_one_length(rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...]) -> Candidate:
+def _fit_one_length(
+    rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...],
+    shape: type[Shadowing | ExponentialShadowing] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
+) -> Candidate:  # fmt: skip
     distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
         return Candidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
-    starts = [Kernel.from_length(scale * share, 0.1) for share in SHARES]
-    value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values)
+    starts = [Kernel.from_length(scale * share, 0.1, 1.0, shape) for share in SHARES]
+    value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values, partitions=squares)
     return Candidate(-value - cost, trend, kernel, cost, notes)
 
 

@@ -66,7 +66,7 @@ WAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "huge integers": lambda a: np.full(a.shape, 2**63, dtype=np.uint64),
 }  # fmt: skip
 HARMLESS = {  # what these mean is clear, or they say nothing about the measurement
-    *(("csi", way) for way in ("1e38", "complex", "negative")),
+    *(("csi", way) for way in ("1e38", "complex", "negative", "one more axis")),
     *(("noise_variance", way) for way in ("1e38", "huge integers")),
     *(("path_direction", way) for way in ("1e38", "negative", "huge integers")),
     *(("rx_position", way) for way in ("negative",)),
