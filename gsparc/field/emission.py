@@ -111,4 +111,6 @@ def _shared_product(encoded: Tensor, weight: Tensor) -> Tensor:
     """Features (B, E), the same of all Gaussians, times the weights (N, E, K) of each: (B, N, K)."""
     count, width, outputs = weight.shape
     # One product, as all Gaussians read the same features.
-    return (encoded @ weight.permute(1, 0, 2).reshape(width, count * outputs)).view(-1, count, outputs)
+    return (encoded @ weight.permute(1, 0, 2).reshape(width, count * outputs)).view(
+        len(encoded), count, outputs
+    )
