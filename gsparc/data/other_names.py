@@ -40,7 +40,7 @@ def name_arrays(raw: Raw) -> Raw:
         first, second = np.moveaxis(csi, axis, 0).astype(np.float64)
         csi = first + 1j * second
         notes.append(Caution(f"csi: real numbers, taken as real and imaginary parts along axis {axis}"))
-    if csi.ndim > MOST_AXES and "station_position" not in arrays:
+    if csi.ndim > MOST_AXES and not any(name.startswith("station_") for name in arrays):
         csi = csi.reshape(len(csi), *(count for count in csi.shape[1:] if count > 1))
     arrays |= {"csi": csi} if "csi" in arrays else {}
     for name in ("rx_position", "tx_position"):

@@ -296,6 +296,17 @@ def test_arrays_under_the_names_of_other_tools_were_unknown(kind):
     assert_channels(interpret(Raw(SHAPES[kind]), "file").data)
 
 
+def test_one_tone_of_stations_in_degrees_lost_its_axis():
+    """Channels (S, T, A, 1) became (S, T, A) where stations stand in degrees."""
+    north, east = 59 + ROOM[:, 1] * 9e-6, 18 + ROOM[:, 0] * 1.7e-5
+    places = {"latitude": north, "longitude": east, "rx_height": ROOM[:, 2], "station_height": [3.0, 3.0]}
+    stations = {"station_latitude": [59.0, 59.0], "station_longitude": [18.0, 18.1]}
+    array = {"array_position": np.eye(3)[:2] * 0.05, "frequency_hz": [3e9]}
+    csi = np.broadcast_to(CHANNELS[:, :1, None, None], (len(CHANNELS), 2, 2, 1))
+    arrays = {key: np.asarray(one) for key, one in {**places, **stations, **array, "csi": csi}.items()}
+    assert interpret(Raw(arrays), "file").data.target.shape[1:] == (2, 1)
+
+
 def test_a_file_without_a_known_array_was_refused_without_its_names(refused):
     raw = Raw({"tau": np.ones((9, 3)), "rx_pos": np.ones((9, 3)), "tx_pos": np.ones(3)})
     refused(r"found none of them among tau \(9, 3\)", interpret, raw, "file")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +21,15 @@ if TYPE_CHECKING:
 
 SPECK = 1e-3  # of a site's width, that nobody draws: in degrees a site is 1e-5 as wide as in metres
 UNREADABLE = OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError
+SUFFIXES = (".geojson", ".json")
 LINE, POLYGON = 1, 3  # of shapely's types; larger numbers are collections
+
+
+def draws_shapes(path: str | Path) -> bool:
+    """Tell whether a file is GeoJSON of polygons or lines: one of points is a table."""
+    if Path(path).suffix.lower() not in SUFFIXES or not Path(path).is_file():
+        return False
+    return re.search(r'"(Multi)?(Polygon|LineString)"', Path(path).read_text(errors="replace")) is not None
 
 
 def read_shapes(

@@ -12,6 +12,7 @@ from scipy.stats import t
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, shadowing, share_between
+from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.intervals import Evidence, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
@@ -23,7 +24,6 @@ from gsparc.data.limits import Checked, check_arguments, finite_array, number, s
 from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
-from gsparc.data.tables import is_table
 from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
@@ -245,7 +245,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
 
 def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Any:
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
-    if sites is not None and is_table(sites):
+    if sites is not None and not draws_shapes(sites):
         site, end = predictor.site, predictor.site.static_end or "tx"
         asked = read_query_places(sites, (end,))
         where = asked.ends[end]

@@ -1,5 +1,6 @@
 """One more station goes where the others do not serve, by models that know stations they never heard."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from towns import MASTS, town_file, town_model
 
 import gsparc
 from gsparc.apps.maps.covered import covered_between
+from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.intervals import Evidence
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import (
@@ -157,6 +159,18 @@ def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
         place_station(predictor, **how, antenna=Antenna(azimuth=[0, 120]))
     with pytest.raises(DataError, match="degrees from north"):
         place_station(predictor, **how, antenna=Antenna(azimuth="north"))
+
+
+def test_polygons_of_candidates_were_read_as_a_table(together, tmp_path):
+    square = {"type": "Polygon", "coordinates": [[[0, 0], [60, 0], [60, 20], [0, 20], [0, 0]]]}
+    points = {"type": "MultiPoint", "coordinates": [[5, 5, 20], [75, 5, 12]]}
+    predictor, found = gsparc.load(together[2]), []
+    for number, content in enumerate((square, points)):
+        (tmp_path / f"{number}.geojson").write_text(json.dumps(content))
+        found.append(draws_shapes(tmp_path / f"{number}.geojson"))
+    assert found == [True, False]
+    inside = place_station(predictor, threshold_db=-75.0, sites=tmp_path / "0.geojson", count=4).places
+    assert len(inside) > 1 and (inside[:, :2] >= 0).all() and (inside[:, :2] <= [60, 20]).all()
 
 
 def test_two_stations_leave_none_out(together):
