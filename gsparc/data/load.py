@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 
 # A dataset is a file or a folder: who says the one may mean the other.
 PATHS = {"file": "root", "root": "file"}
+MADE = {"sionna": "make one with `gsparc simulate`, or "}  # data that nobody publishes
 
 
 def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule:
@@ -203,5 +204,6 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
             raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest_or_list(key, known)}")
     for key in known:
         if key in needed and accepted.get(key) in (None, "", "???"):
-            raise DataError(f"dataset.{key} is not set; say dataset.{key}={key.upper()} for dataset={name}")
+            say = f"{MADE.get(name, '')}say dataset.{key}={key.upper()} for dataset={name}"
+            raise DataError(f"dataset.{key} is not set; {say}")
     return accepted

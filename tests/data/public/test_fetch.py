@@ -220,6 +220,7 @@ def test_data_without_files_say_in_one_line_how_to_get_them(monkeypatch, tmp_pat
     for name, says in {
         "newrf": "get it with `gsparc data newrf` (0.4 MB in 1 file), or say dataset.file=FILE for dataset=newrf",
         "ble": "get it from https://github.com/philotuxo/Position-Annotated-BLE-RSSI-Dataset",
+        "sionna": "make one with `gsparc simulate`, or say dataset.file=FILE for dataset=sionna",
         "own": "dataset.file is not set; say dataset.file=FILE for dataset=own",
     }.items():
         with pytest.raises(DataError) as error:
