@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -150,6 +151,8 @@ def _number(stations: Stations, wanted: str | int, option: str, source: str) -> 
     found = find_station(wanted, stations)
     if found is None:
         hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.shown, 9)}"
+        if Path(str(wanted)).is_file():
+            hint = f"; a table of them is dataset.stations_file={wanted}"
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
     return found
 

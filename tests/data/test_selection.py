@@ -158,6 +158,7 @@ CANNOT = {
     "misspelt station": (wide, {"stations": ["senor42"]}, "no station senor42 in file; did you mean 'sensor42'?"),
     "station beyond the last": (wide, {"stations": [4]}, "dataset.stations=4: no station 4 in file"),
     "name without names": (channels, {"stations": ["A05"]}, "dataset.stations=A05: no station A05 in file; there are 0, 1, 2"),
+    "a table of them": (wide, {"stations": [__file__]}, f"; a table of them is dataset.stations_file={__file__}"),
     "no stations": (plain, {"stations": [0]}, "file has no stations; expected station_position"),
     "misspelt run": (channels, {"runs": ["EXP05"]}, "did you mean 'EXP005'?"),
     "no runs": (wide, {"runs": ["EXP005"]}, "file names no runs; expected an array run"),
