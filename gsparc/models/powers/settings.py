@@ -191,7 +191,7 @@ def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows:
     scores = [one.score for one in candidates]
     if both and not out_of_time():
         weighed = _select_doubtful(weighed, candidates[-1])
-        scores = [_fit_by_evidence(weighed, one, 0).score for one in candidates]
+        scores = [_fit_by_evidence(weighed, one, REFINED).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
         two = _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0)
