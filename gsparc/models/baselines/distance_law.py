@@ -34,6 +34,7 @@ EXPONENTS = (0.0, 8.0)  # bounds of n: 2 in free space, 6 through many walls
 USUAL, SPREAD = 3.0, 2.0  # mean and deviation of a prior on n, which only few rows notice
 CORNER = 3.0  # scales from which on the residuals' density is exponential
 FLOORS = 10  # candidates of d0
+UNSEEN = 10.0  # of the nearest row's distance: d0 where rows show none
 SPREADS_DB = (0.05, 60.0)  # bounds of the scale of the residuals
 LOOKED_AT = 2_000  # rows that an unknown place is sought with
 STARTS = 6  # of that search, drawn at random, beside two that the powers suggest
@@ -135,6 +136,8 @@ def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
         value, result = fit_level_and_exponent(to_decibels(np.maximum(far, floor)), rows, start)
         if value < best:
             best, at_best, law, start = value, result, replace(law, floor=float(floor)), result
+    if law.floor <= low:  # rows show none: nearer than all of them powers rise on
+        law = replace(law, floor=max(low / UNSEEN, TINY_M))
     count = int((~rows.silent).sum())
     few = math.sqrt(count / max(count - PARAMETERS, 1)) if count else 1.0  # parameters swallow residuals
     level, exponent, scale = (float(value) for value in at_best)

@@ -191,7 +191,7 @@ def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows:
     scores = [one.score for one in candidates]
     if both and not out_of_time():
         weighed = _select_doubtful(weighed, candidates[-1])
-        scores = [_fit_by_evidence(weighed, one, 0).score for one in candidates]
+        scores = [_fit_by_evidence(weighed, one, REFINED).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
         two = _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0)
@@ -286,21 +286,40 @@ def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
 
 def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    distance, terms, values = rows.distances_terms_values(base.trend, base.kernel)
-    side = torch.from_numpy(rows.side)
-    most = max(AMPLITUDES_DB2[1], 4 * float(values[side == 0].square().mean()))
-    bounds = base.kernel.bounds(distance)
-    bounds.append((math.log(AMPLITUDES_DB2[0]), math.log(most)))
+    value, kernel = fit_kernel_by_evidence([rows], base.trend, base.kernel, limit)
+    return replace(base, score=-value * len(rows.places) - base.cost, kernel=kernel)
 
-    last: list[PseudoValues] = []
+
+def fit_kernel_by_evidence(
+    parts: Sequence[PowerRows], trend: Trend, start: Kernel, limit: int
+) -> tuple[float, Kernel]:
+    """Find the kernel of largest evidence, silent rows among the rest; without looks `start` as it is.
+
+    Args:
+        parts: rows of independent processes of one prior, such as those of several stations.
+        trend: its mean.
+        start: where the search begins.
+        limit: looks at all parts.
+
+    Returns:
+        The least negative evidence [nats per row], and its kernel.
+    """
+    views = [(*part.distances_terms_values(trend, start), torch.from_numpy(part.side)) for part in parts]
+    heard = torch.cat([values[side == 0] for _, _, values, side in views])
+    most = max(AMPLITUDES_DB2[1], 4 * float(heard.square().mean()))
+    bounds = [*start.bounds(views[0][0]), (math.log(AMPLITUDES_DB2[0]), math.log(most))]
+    last, count = [list[PseudoValues]() for _ in views], sum(len(side) for *_, side in views)
 
     def negative_log_evidence(at: Tensor) -> Tensor:
-        gram = at[-1].exp() * density.covariance_of(base.kernel.with_values(at[:-1]), distance, terms)
-        return density.NegativeLogEvidence.apply(gram, values[:, 0], side, last) / len(values)  # type: ignore[no-untyped-call]
+        kernel, total = start.with_values(at[:-1]), at.new_zeros(())
+        for (distance, terms, values, side), found in zip(views, last, strict=True):
+            gram = at[-1].exp() * density.covariance_of(kernel, distance, terms)
+            total = total + density.NegativeLogEvidence.apply(gram, values[:, 0], side, found)  # type: ignore[no-untyped-call]
+        return total / count
 
-    start = np.append(base.kernel.parameters().numpy(), math.log(base.kernel.amplitude))
-    best, value = start, float(negative_log_evidence(torch.from_numpy(start)))
+    best = np.append(start.parameters().numpy(), math.log(start.amplitude))
     if limit:
-        best, value = density.minimise(negative_log_evidence, [start], bounds, limit, EVIDENCE_SETTLED)
-    kernel = replace(base.kernel.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
-    return replace(base, score=-value * len(values) - base.cost, kernel=kernel)
+        best, value = density.minimise(negative_log_evidence, [best], bounds, limit, EVIDENCE_SETTLED)
+    else:
+        value = float(negative_log_evidence(torch.from_numpy(best)))
+    return value, replace(start.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))

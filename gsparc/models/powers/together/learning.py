@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.mixture.weights import mean_and_error
+from gsparc.models.powers.settings import EVIDENCE_LOOKS, fit_kernel_by_evidence
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import Kernel, distances
@@ -26,7 +27,7 @@ from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import end_when
+from gsparc.processes.worker import end_when, out_of_time
 from gsparc.training.time_budget import TimeBudget
 
 START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
@@ -35,6 +36,7 @@ LEAST_DB2 = 1e-6  # of a station's process: levels that are equal to the last di
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
 LEARNED_EACH = 500  # rows of each station, for the law and for settings that all have alike
+WEIGHED_EACH = 160  # the same where some were silent: each look factors several covariances
 ENDS_FROM, ENDS_ON = 400, 700  # rows that a station needs for settings of its own, and has them from
 LEAST_STATIONS = 3  # to leave some out
 TRIED_ON = 3_600  # rows of all stations for the strength of shared terms
@@ -96,15 +98,30 @@ def learn_station_priors(
     their own.
     """
     trend, notes = _fit_site_law(rows, seed)
-    heard = rows.heard_rows
-    numbers = [number for number in heard.stations if (heard.station == number).sum() >= ENDS_FROM]
+    heard, listed = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
+    whole = rows.select_complete_places() if listed else heard
+    numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else end_when(budget.is_spent):
         kernel, priors = _fit_common_kernel(heard, trend, seed)
+        if listed and not out_of_time():
+            each = min(WEIGHED_EACH, max(MOST_ROWS // len(whole.stations), 1))
+            parts = [whole.select_station(n).draw_stretches(each, seed) for n in whole.stations]
+            # What lists hold spreads less than what they were drawn from.
+            narrow, (_, kernel) = kernel, fit_kernel_by_evidence(parts, trend, kernel, EVIDENCE_LOOKS)
+            wider = kernel.amplitude / narrow.amplitude
+            for number, one in priors.items():
+                own = replace(kernel, amplitude=wider * one.kernel.amplitude)
+                priors[number] = Prior(own, trend)
         if budget is not None and budget.is_spent():
             numbers = []
         for number in numbers:
-            some = heard.select_station(number).thin_rows(ENDS_ON, seed)
-            _, own = fit_kernel_by_left_out([kernel], *some.distances_terms_values(trend), tolerance=SETTLED)
+            if listed:
+                some = whole.select_station(number).draw_stretches(ENDS_FROM, seed)
+                _, own = fit_kernel_by_evidence([some], trend, priors[number].kernel, EVIDENCE_LOOKS)
+            else:
+                some = heard.select_station(number).thin_rows(ENDS_ON, seed)
+                known = some.distances_terms_values(trend)
+                _, own = fit_kernel_by_left_out([kernel], *known, tolerance=SETTLED)
             priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes

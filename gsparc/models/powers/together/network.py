@@ -59,8 +59,6 @@ TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
 GAINS = torch.arange(-12.0, 12.5, 2.0)  # [dB]
 ROUGH_LOOKS = 150  # evaluations, each of a sum over rows
 ROUGH_ON, LEARNED_ON = 20_000, 160  # rows of all sites; of each site, whose covariance is factored
-LEAST_WHOLE = 30  # places that leave no sector out, for settings by these alone
-STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
 def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
@@ -244,8 +242,8 @@ def _fit_by_evidence(
     rows: StationRows, rough: Sectors, gains: Tensor, scale: float, seed: int
 ) -> tuple[Sectors, Kernel]:
     """All settings of largest evidence of some rows of each site."""
-    rows, bands = _select_complete_places(rows), len(rough.levels)
-    parts = [_select_stretches(rows.select_station(number), LEARNED_ON, seed) for number in rows.stations]
+    rows, bands = rows.select_complete_places(), len(rough.levels)
+    parts = [rows.select_station(number).draw_stretches(LEARNED_ON, seed) for number in rows.stations]
     places = [torch.from_numpy(part.places) for part in parts]
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
@@ -296,25 +294,3 @@ def _to_unit_amplitude(kernel: Kernel) -> Kernel:
     amplitude = sum(map(float, signal.shares))
     shares = tuple(share / amplitude for share in signal.shares)
     return Kernel((replace(signal, shares=shares), WhiteNoise(kernel.noise / amplitude)), amplitude)
-
-
-def _select_complete_places(rows: StationRows) -> StationRows:
-    """Those of places that have as many rows as any, if these are enough; else all."""
-    place = np.unique(moving_end(rows.places), axis=0, return_inverse=True)[1].reshape(-1)
-    sectors = np.unique(np.stack([place, sector_of(rows.places).astype(np.int64)], 1), axis=0)[:, 0]
-    count = np.bincount(sectors)
-    whole = count == count.max()
-    return rows.subset(np.flatnonzero(whole[place])) if whole.sum() >= LEAST_WHOLE else rows
-
-
-def _select_stretches(rows: StationRows, limit: int, seed: int) -> StationRows:
-    """At most so many rows, all that there are of places that follow each other in short stretches.
-
-    To take some of the rows of a place would tell of stronger or weaker ones than there are.
-    """
-    place = np.unique(moving_end(rows.places), axis=0, return_inverse=True)[1].reshape(-1)
-    first = np.full(int(place.max()) + 1, len(rows.index))
-    np.minimum.at(first, place, rows.index)
-    stretch = np.argsort(np.argsort(first)) // STRETCH
-    rank = np.random.default_rng(seed).permutation(int(stretch.max()) + 1)[stretch[place]]
-    return rows.subset(np.sort(np.argsort(rank, kind="stable")[:limit]))

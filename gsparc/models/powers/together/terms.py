@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 import torch
@@ -27,6 +28,8 @@ from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 
 LAW_DB = 5.0  # deviation a decade from the middle, of a slope and of a bend
+LEAST_WHOLE = 30  # places that leave no station out, for settings by these alone
+STRETCH = 4  # places in the order of the drive that are drawn as one
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,7 @@ class StationRows(PowerRows):
 
         Rows where something was heard come first where there are too many, up to half of them.
         """
-        _, place = np.unique(moving_end(self.places), axis=0, return_inverse=True)
-        place = place.reshape(-1)
+        place = self._place_numbers
         # One rank for a place: stations that share places keep the same ones.
         rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
         chosen = []
@@ -69,6 +71,31 @@ class StationRows(PowerRows):
                 own = np.concatenate([loud[:share], quiet[: per_station - share]])
             chosen.append(own)
         return self.subset(np.sort(np.concatenate(chosen)))
+
+    def select_complete_places(self) -> Self:
+        """Return those of places that have as many rows as any, if these are enough; else all."""
+        ends = np.unique(self.places, axis=0)  # a sector's are of seven numbers
+        count = np.unique(moving_end(ends), axis=0, return_counts=True)[1]
+        whole = count == count.max()
+        enough = whole.sum() >= LEAST_WHOLE
+        return self.subset(np.flatnonzero(whole[self._place_numbers])) if enough else self
+
+    def draw_stretches(self, limit: int, seed: int) -> Self:
+        """Draw at most so many, all that there are of places that follow each other in short stretches.
+
+        To take some of the rows of a place would tell of stronger or weaker ones than there are.
+        """
+        place = self._place_numbers
+        first = np.full(int(place.max()) + 1, len(self.index))
+        np.minimum.at(first, place, self.index)
+        stretch = np.argsort(np.argsort(first)) // STRETCH
+        rank = np.random.default_rng(seed).permutation(int(stretch.max()) + 1)[stretch[place]]
+        return self.subset(np.sort(np.argsort(rank, kind="stable")[:limit]))
+
+    @property
+    def _place_numbers(self) -> np.ndarray:
+        """Numbers (n,) of the places that the moving end was at."""
+        return np.unique(moving_end(self.places), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
