@@ -204,6 +204,6 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
             raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest_or_list(key, known)}")
     for key in known:
         if key in needed and accepted.get(key) in (None, "", "???"):
-            say = f"{MADE.get(name, '')}say dataset.{key}={key.upper()} for dataset={name}"
+            say = f"{MADE.get(str(name), '')}say dataset.{key}={key.upper()} for dataset={name}"
             raise DataError(f"dataset.{key} is not set; {say}")
     return accepted

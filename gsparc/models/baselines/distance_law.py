@@ -137,7 +137,7 @@ def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
         if value < best:
             best, at_best, law, start = value, result, replace(law, floor=float(floor)), result
     if law.floor <= low:  # rows show none: nearer than all of them powers rise on
-        law = replace(law, floor=max(low / UNSEEN, TINY_M))
+        law = replace(law, floor=max(float(low) / UNSEEN, TINY_M))
     count = int((~rows.silent).sum())
     few = math.sqrt(count / max(count - PARAMETERS, 1)) if count else 1.0  # parameters swallow residuals
     level, exponent, scale = (float(value) for value in at_best)
