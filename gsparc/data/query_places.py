@@ -10,11 +10,10 @@ import numpy as np
 
 from gsparc.data.errors import DataError
 from gsparc.data.schema import ENDS, End
-from gsparc.data.tables.columns import Chosen, choose_columns
+from gsparc.data.tables.columns import choose_columns
 from gsparc.data.tables.heads import AXES
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.places import Places, read_places
-from gsparc.data.tables.read import NOTHING
 from gsparc.data.tables.sheet import Sheet
 
 # Only what a query needs: a column that looks like a level is none of its concern.
@@ -50,7 +49,7 @@ class QueryPlaces:
 
 
 def read_query_places(
-    path: str | Path, moving: Sequence[End], columns: Mapping[str, object] = NOTHING
+    path: str | Path, moving: Sequence[End], columns: Mapping[str, object] = {}
 ) -> QueryPlaces:
     """Read places of the ends that move.
 
@@ -108,8 +107,11 @@ def _of_sheet(
     other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
     if other:
         guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
-    station = _words(sheet, chosen, "station")
-    plain = None if station is None else sheet.words(chosen["station"][0].head or "")
+    station = plain = None
+    if "station" in chosen:
+        head, station = chosen["station"][0].head or "", sheet.joined(c.head for c in chosen["station"])
+        plain = sheet.words(head)
+        sheet.refuse_rows(head, np.flatnonzero(station == ""), "no station; expected its name")
     sheet.problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
     # Columns that were read as one quantity; joined stations are several columns and stay as text.
@@ -122,11 +124,3 @@ def _missing(sheet: Sheet, end: End, both: bool) -> str:
     axes = "columns.latitude=COLUMN and .longitude, or .x and .y"
     axes = f"columns.{end}_x=COLUMN and .{end}_y" if both else axes
     return f"{sheet.source}: no coordinates of the {ENDS[end]} among {sheet.first_heads()}; say {axes}"
-
-
-def _words(sheet: Sheet, chosen: Chosen, role: str) -> np.ndarray | None:
-    if role not in chosen:
-        return None
-    head, words = chosen[role][0].head or "", sheet.joined(c.head for c in chosen[role])
-    sheet.refuse_rows(head, np.flatnonzero(words == ""), f"no {role}; expected its name")
-    return words

@@ -111,7 +111,8 @@ def _in_metres(check: Checker) -> Georeference | None:
         return None
     # About the rows rather than the stations: a distant station must not distort the site.
     origin = Georeference.from_coordinates(*places[""])
-    end = _moving(check)
+    # Of the end with a height, or the one without a position; else of the receiver.
+    end = "tx" if check.present("tx_height", "rx_position") else "rx"
     for prefix, name in (("", end), ("station_", "station")):
         if prefix in places:
             known = np.isfinite(places[prefix][0])
@@ -149,8 +150,3 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
     if fault:
         check.refuse(f"{prefix}latitude", "row {}: {}".format(*fault))
     return latitude, longitude
-
-
-def _moving(check: Checker) -> str:
-    """The end that degrees are of: the one with a height, or the one without a position; the receiver."""
-    return "tx" if check.present("tx_height", "rx_position") else "rx"

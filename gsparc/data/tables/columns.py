@@ -456,8 +456,5 @@ def schema_unit(column: Column) -> str:
 
 def rename_for_stations(column: Column) -> Column:
     """Return the same column of a list of stations, where ends need not be named."""
-    axis = next((a for a in heads.AXES if column.role.endswith(a) and column.role not in KINDS_OF_ROWS), None)
+    axis = next((a for a in heads.AXES for end in ENDS if column.role == f"{end}{a}"), None)
     return column if axis is None else replace(column, role=f"station_{axis}")
-
-
-KINDS_OF_ROWS = tuple(name for name, kind in KINDS.items() if kind not in ("length", "angle"))

@@ -133,10 +133,9 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
         words = [*words[:-1], "xyz"[int(words[-1]) - 1]]
     rest = [word for word in words if word not in LISTS["place"]]
     joined = "_".join(rest)
-    if joined in KINDS and joined != "rssi":  # which is watts in the schema, but dBm in most logs
-        return Head(joined, unit=unit, word=joined)
-    if joined in OTHER_NAMES:
-        return Head(OTHER_NAMES[joined], unit=unit, word=joined)
+    role = OTHER_NAMES.get(joined, joined)
+    if role in KINDS and role != "rssi":  # which is watts in the schema, but dBm in most logs
+        return Head(role, unit=unit, word=joined)
     measured = _level(words, unit, plain) or _channel(words, unit, plain)
     head = _axis(rest, unit) or measured or _text(words, unit)
     if head.role or unit is None or unit.name not in ("dBm", "dBW") or LISTS["no_level"] & set(words):

@@ -234,17 +234,15 @@ def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Line
     heads = _cells(comment, delimiter) if comment else []
     named = [sum(parse_head(cell).role is not None for cell in cells) for cells in (heads, first)]
     fits = len(heads) == len(first) and not all(map(_is_number, heads))
-    values = all(map(_is_number, first)) or (named[1] == 0 and sum(map(_is_decimal, first)) > 1)
+    values = all(map(_is_number, first)) or (
+        named[1] == 0 and sum("." in cell and _is_number(cell) for cell in first) > 1
+    )
     if not values and not (fits and named[0] > named[1]):
         return lines
     if fits:
         return {min(lines) - 1: comment, **lines}
     fault = f"line {min(lines)} holds numbers; expected the names of the columns above them"
     raise DataError(f"{source}: {fault}")
-
-
-def _is_decimal(cell: str) -> bool:
-    return "." in cell and _is_number(cell)
 
 
 def _is_number(cell: str) -> bool:

@@ -44,12 +44,10 @@ from gsparc.data.tables.sheet import MEASURED, Sheet
 from gsparc.data.tables.slots import unfold_slots, unfold_tones
 from gsparc.data.units import UNITS, WATTS
 
-NOTHING: Mapping[str, object] = {}
-
 
 def parse_table(
     path: str | Path,
-    columns: Mapping[str, object] = NOTHING,
+    columns: Mapping[str, object] = {},
     stations_file: str | Path | None = None,
 ) -> Raw:
     """Read the arrays of a table; notes say what was guessed.

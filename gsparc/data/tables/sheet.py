@@ -140,7 +140,10 @@ class Sheet:
 
         Text that `count` cells of a level hold may stand for "not heard": minus infinity.
         """
-        if count and _silent(text, count):
+        plain = text.strip().lower()
+        # Any text without digits that repeats among levels stands for it, others by their words alone.
+        repeats = count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
+        if count and (repeats or NOT_HEARD.fullmatch(plain)):
             self.marks[text.strip()] += count
             return -np.inf
         measured = MEASURED.fullmatch(text)
@@ -157,10 +160,3 @@ class Sheet:
         first, sign, *numbers, last = parts.groups()
         degrees = sum(float(number or 0) / 60**k for k, number in enumerate(numbers))
         return -degrees if sign == "-" or (first or last).lower() in ("s", "w") else degrees
-
-
-def _silent(text: str, count: int) -> bool:
-    """Whether a text that is no number stands for "not heard" where `count` levels should."""
-    plain = text.strip().lower()
-    repeats = count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
-    return repeats or NOT_HEARD.fullmatch(plain) is not None

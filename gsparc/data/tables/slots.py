@@ -77,7 +77,8 @@ def unfold_tones(sheet: Sheet) -> tuple[Sheet, list[str]]:
     if long.duplicated([BY, tone]).any() or 2 * len(set(place)) > len(place):
         return sheet, []
     wide = long.pivot(index=BY, columns=tone, values=list(parts))
-    wide.columns = [f"{parts[head]}_{number}{_said(head)}" for head, number in wide.columns]
+    units = {head: f" [{read.unit.name}]" if read.unit else "" for head, read in roles.items()}
+    wide.columns = [f"{parts[head]}_{number}{units[head]}" for head, number in wide.columns]
     first = long.drop_duplicates(BY).index
     rows = tuple(sheet.rows[i] for i in first)
     frame = sheet.frame.loc[first, rest].reset_index(drop=True).join(wide)
@@ -86,8 +87,3 @@ def unfold_tones(sheet: Sheet) -> tuple[Sheet, list[str]]:
 
 
 BY = "\0place"
-
-
-def _said(head: str) -> str:
-    unit = parse_head(head).unit
-    return "" if unit is None else f" [{unit.name}]"
