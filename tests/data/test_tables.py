@@ -193,6 +193,24 @@ def test_wide_layout(write, heads, columns):
     np.testing.assert_array_equal(arrays["station_position"], [[2, 3, 4], [1, 2, 3]])
 
 
+@pytest.mark.parametrize("style", ["{}", "rssi_{}", "RSRP {} [dBm]"])
+@pytest.mark.parametrize(
+    ("mark", "above"), [(";", "# by hand, on a Monday, north of here\n"), (",", "% a; b\n")]
+)
+def test_names_of_wide_tables_lost_signs_and_comments_decided_separators(write, refused, style, mark, above):
+    """Columns of misspelt stations were left out without a word, and quotes stayed in names."""
+    heads = [style.format(name) for name in ("#2", "-1")]
+    heads = [f'"{head}"' if head[0] == "#" else head for head in heads]
+    rows = (["x", "y", *heads], ["1", "2", "-80", "-90"], ["4", "5", "-81", "-91"])
+    table = above + "".join(mark.join(row) + "\n" for row in rows)
+    arrays = parse_table(write(table), {}, write('name,x,y\n-1,5,6\n"#2",7,8\n', "stations.csv")).arrays
+    assert arrays["station_name"].tolist() == ["#2", "-1"]
+    assert arrays["rssi_db"].tolist() == [[-80, -90], [-81, -91]]
+    assert arrays["station_position"].tolist() == [[7, 8], [5, 6]]
+    misspelt = write('name,x,y\n-1b,5,6\n"#2",7,8\n', "stations.csv")
+    refused("no column says which station|could each be rssi_db", parse_table, write(table), {}, misspelt)
+
+
 def test_channels(write):
     text = "tx_x,tx_y,tx_z,h_re_0,h_im_0,h_re_1,h_im_1\n1,2,3,1,2,3,4\n2,2,3,5,6,,\n"
     said = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "2.4e9:2.5e9"}
