@@ -1,4 +1,4 @@
-"""Tables of measurements: what is understood, what is said, and 41 spoilt ones with one line each."""
+"""Tables of measurements: what is understood, what is said, and spoilt ones with one line each."""
 # ruff: noqa: E501 (a case is a row of a table)
 
 import sys
@@ -270,6 +270,7 @@ SPOILT = {
     "empty": ("", {}, "empty; expected a line of heads"),
     "heads only": ("x,y,rssi\n", {}, "line 1 names columns, but there are no rows"),
     "no heads": ("1,2,-80\n2,3,-81\n", {}, "line 1 holds numbers; expected the names"),
+    "a log without heads": ("48.2,16.3,LTE,LTE,-80\n48.3,16.3,LTE,LTE,-81\n", {}, "line 1 holds numbers; expected the names"),
     "one column": ("rssi\n-80\n-81\n", {}, "line 1 ('rssi') is a single column"),
     "a line too long": ("x,y,rssi\n1,2,-80\n1,2,3,-81\n", {}, "line 3 (4 cells): expected 3 cells"),
     "decimal commas between commas": ("x,y\n1,5,2,5\n2,5,3,5\n", {}, "2 heads, but every line below has 4"),
@@ -318,6 +319,7 @@ SPOILT = {
     "perhaps a level": ("x,y,rssi_ema\n1,2,-80\n", {}, "'rssi_ema': a received level or power, or something else?"),
     "a field strength": ("x,y,level (dBuV/m)\n1,2,80\n", {}, "[dBuV/m] is no known unit; expected one of dB, dBm, dBW"),
     "percent": ("x,y,signal (%)\n1,2,80\n", {}, "'signal (%)': is in %: a quality, not a level"),
+    "per cent in a head": ("x,y,signal_percent\n1,2,80\n", {}, "a quality, not a level"),
     "millimetres beside nothing": ("x_mm,y,rssi\n1,2,-80\n", {}, "'x_mm' is in mm, 'y' says no unit; rename one, e.g. to 'y [m]'"),
     "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
     "JSON": ('[{"x": 1}, {"x"', {}, "damaged or not a JSON, GPX or KML file"),
