@@ -4,7 +4,7 @@ import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render, truth
 
-from gsparc.ops import SphereGrid, calls, cuda, freeze, make_plan, operators, rasterize
+from gsparc.ops import SphereGrid, calls, cuda, make_plan, operators, rasterize
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 
@@ -36,22 +36,6 @@ def test_order_of_the_threads_does_not_matter(where):
     turned(0)
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
-
-
-@BOTH
-@pytest.mark.parametrize("channels", [1, 3, 8, 9, 70])
-def test_frozen_view_is_the_image(where, dtype, channels):
-    scene = crowd(150).to(dtype)
-    model, grid = scene.model, GRIDS["patch"]
-    features = torch.randn(150, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(
-        dtype
-    )
-    plan = make_plan(*model, origin(), grid)
-    view = freeze(plan, *model, version=3)
-    want = rasterize(*model, features, origin(), grid).image[0]
-    assert torch.allclose(
-        view.render(features, version=3), want, atol=1e-12 if dtype == torch.float64 else 1e-5
-    )
 
 
 @BOTH

@@ -1,15 +1,14 @@
 """Tables and arrays as strangers make them: each kind is read right, or named."""
 
-from io import StringIO
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from rich.console import Console
+from doors import said
 from scipy.io import savemat
 
-from gsparc.commands.check import check, main
+from gsparc.commands.check import main
 from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.own import write_own
 
@@ -22,12 +21,6 @@ AWAY = np.linalg.norm(PLACES[:, None] - AT, axis=2)
 LEVELS = np.round(-40 - 25 * np.log10(np.maximum(AWAY, 1)) + RNG.normal(0, 2, AWAY.shape))
 NORTH, EAST = 48.2 + PLACES[:, 1] / 1.1e4, 16.37 + PLACES[:, 0] / 7.4e3
 DEAF = np.quantile(LEVELS, 0.6) > LEVELS
-
-
-def said(path: Path, **settings) -> str:
-    out = StringIO()
-    check(str(path), Console(file=out, width=2000), **settings)
-    return out.getvalue()
 
 
 def table(heads: str, *columns) -> str:

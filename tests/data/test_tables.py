@@ -1,4 +1,4 @@
-"""Tables of measurements: what is understood, what is said, and 41 spoilt ones with one line each."""
+"""Tables of measurements: what is understood, what is said, and spoilt ones with one line each."""
 # ruff: noqa: E501 (a case is a row of a table)
 
 import sys
@@ -193,6 +193,24 @@ def test_wide_layout(write, heads, columns):
     np.testing.assert_array_equal(arrays["station_position"], [[2, 3, 4], [1, 2, 3]])
 
 
+@pytest.mark.parametrize("style", ["{}", "rssi_{}", "RSRP {} [dBm]"])
+@pytest.mark.parametrize(
+    ("mark", "above"), [(";", "# by hand, on a Monday, north of here\n"), (",", "% a; b\n")]
+)
+def test_names_of_wide_tables_lost_signs_and_comments_decided_separators(write, refused, style, mark, above):
+    """Columns of misspelt stations were left out without a word, and quotes stayed in names."""
+    heads = [style.format(name) for name in ("#2", "-1")]
+    heads = [f'"{head}"' if head[0] == "#" else head for head in heads]
+    rows = (["x", "y", *heads], ["1", "2", "-80", "-90"], ["4", "5", "-81", "-91"])
+    table = above + "".join(mark.join(row) + "\n" for row in rows)
+    arrays = parse_table(write(table), {}, write('name,x,y\n-1,5,6\n"#2",7,8\n', "stations.csv")).arrays
+    assert arrays["station_name"].tolist() == ["#2", "-1"]
+    assert arrays["rssi_db"].tolist() == [[-80, -90], [-81, -91]]
+    assert arrays["station_position"].tolist() == [[7, 8], [5, 6]]
+    misspelt = write('name,x,y\n-1b,5,6\n"#2",7,8\n', "stations.csv")
+    refused("no column says which station|could each be rssi_db", parse_table, write(table), {}, misspelt)
+
+
 def test_channels(write):
     text = "tx_x,tx_y,tx_z,h_re_0,h_im_0,h_re_1,h_im_1\n1,2,3,1,2,3,4\n2,2,3,5,6,,\n"
     said = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "2.4e9:2.5e9"}
@@ -252,6 +270,7 @@ SPOILT = {
     "empty": ("", {}, "empty; expected a line of heads"),
     "heads only": ("x,y,rssi\n", {}, "line 1 names columns, but there are no rows"),
     "no heads": ("1,2,-80\n2,3,-81\n", {}, "line 1 holds numbers; expected the names"),
+    "a log without heads": ("48.2,16.3,LTE,LTE,-80\n48.3,16.3,LTE,LTE,-81\n", {}, "line 1 holds numbers; expected the names"),
     "one column": ("rssi\n-80\n-81\n", {}, "line 1 ('rssi') is a single column"),
     "a line too long": ("x,y,rssi\n1,2,-80\n1,2,3,-81\n", {}, "line 3 (4 cells): expected 3 cells"),
     "decimal commas between commas": ("x,y\n1,5,2,5\n2,5,3,5\n", {}, "2 heads, but every line below has 4"),
@@ -300,6 +319,7 @@ SPOILT = {
     "perhaps a level": ("x,y,rssi_ema\n1,2,-80\n", {}, "'rssi_ema': a received level or power, or something else?"),
     "a field strength": ("x,y,level (dBuV/m)\n1,2,80\n", {}, "[dBuV/m] is no known unit; expected one of dB, dBm, dBW"),
     "percent": ("x,y,signal (%)\n1,2,80\n", {}, "'signal (%)': is in %: a quality, not a level"),
+    "per cent in a head": ("x,y,signal_percent\n1,2,80\n", {}, "a quality, not a level"),
     "millimetres beside nothing": ("x_mm,y,rssi\n1,2,-80\n", {}, "'x_mm' is in mm, 'y' says no unit; rename one, e.g. to 'y [m]'"),
     "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
     "JSON": ('[{"x": 1}, {"x"', {}, "damaged or not a JSON, GPX or KML file"),

@@ -2,14 +2,12 @@
 
 import gzip
 import json
-from io import StringIO
 
 import numpy as np
 import pandas as pd
 import pytest
-from rich.console import Console
+from doors import said
 
-from gsparc.commands.check import check
 from gsparc.data.datasets.own import read_any
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
@@ -50,12 +48,6 @@ def assert_levels(reading, names=CELLS):
 def assert_channels(data, expected=CHANNELS):
     scaled = data.target[:, 0] * data.site.target_scale
     np.testing.assert_allclose(scaled, expected, rtol=2e-4, atol=2e-4 * np.abs(expected).max())
-
-
-def said(path, **settings):
-    out = StringIO()
-    check(str(path), Console(file=out, width=2000), **settings)
-    return out.getvalue()
 
 
 RECORDS = [
@@ -141,16 +133,6 @@ def test_files_that_no_reader_takes_show_the_way_out(tmp_path, start, way):
         parse_table(tmp_path / "mine.dat")
 
 
-def test_logs_without_heads_were_misread(tmp_path):
-    """CellMapper's and NetMonster's: `columns 9 and 10 are both named 'LTE'; rename one`."""
-    path = tmp_path / "cells.csv"
-    path.write_text(
-        "".join(f"{one['lat']:.6f},{one['lon']:.6f},LTE,LTE,{one['rsrp']:g}\n" for one in RECORDS)
-    )
-    with pytest.raises(DataError, match="line 1 holds numbers; expected the names"):
-        parse_table(path)
-
-
 OTHERS = {
     "phones": ("timestamp,latitude,longitude,nrPci,ssRsrp", "dBm"),
     "German": ("Zeit,Breite,Länge,Standort,Pegel (dBm)", "dBm"),
@@ -215,13 +197,6 @@ def test_advice_on_columns_was_no_word_of_a_shell():
     """`dataset.columns.rssi_db=RSRP (LTE pcell)` is refused by the shell and by the settings."""
     assert say_column("rssi_db", "RSRP (x)") == "'dataset.columns.rssi_db=\"RSRP (x)\"'"
     assert say_column("rssi_db", "loss*-1") == "dataset.columns.rssi_db=loss*-1"
-
-
-def test_per_cent_were_advised_as_levels(tmp_path):
-    path = tmp_path / "quality.csv"
-    path.write_text(text("x,y,signal_percent", *ROOM.T[:2], range(COUNT)))
-    with pytest.raises(DataError, match="a quality, not a level"):
-        parse_table(path)
 
 
 SETTINGS = {"tx_position": AT.tolist()}

@@ -142,30 +142,31 @@ def test_places_in_degrees_were_said_to_be_apart_from_a_model_s_of_an_unknown_or
     assert run.learned is None and "about an unknown origin" in run.foreign
 
 
+def opened_beside_all(folder, monkeypatch, **changes):
+    """A drive of 80 places, all asked of a model that learned from all of another one."""
+    drive = {"rx_position": WALK, "rssi_db": np.linspace(-90, -50, 80)}
+    gsparc.fit(rx=WALK, rssi=drive["rssi_db"], model="mean", save=folder / "model.ckpt")
+    np.savez(folder / "drive.npz", **(drive | changes))
+    learned, rows = from_arrays(drive), np.arange(80)
+    split = Split("all", (Fold(rows, rows[:0], rows[:0]),), "")
+    monkeypatch.setattr(
+        open_runs, "_trained", lambda stored, data: (align_to_site(learned, data.site), split)
+    )
+    own = {"name": "own", "file": str(folder / "drive.npz")}
+    return open_runs.open_files([folder / "model.ckpt"], own, None, others_whole=True)
+
+
 def test_test_rows_of_a_drive_counted_unlisted_cells_as_lines(tmp_path, monkeypatch):
     """`5400 test rows` of a file of 1,800 lines."""
     level = np.linspace(-90, -50, 80)
-    gsparc.fit(rx=WALK, rssi=level, model="mean", save=tmp_path / "model.ckpt")
     level[:30] = -np.inf
-    np.savez(tmp_path / "drive.npz", rx_position=WALK, rssi_db=level, sensitivity_db=np.array(-95.0))
-    own = {"name": "own", "file": str(tmp_path / "drive.npz")}
-    all_rows = Split("all", (Fold(np.arange(80), np.arange(0), np.arange(0)),), "")
-    monkeypatch.setattr(open_runs, "_trained", lambda stored, data: (data, all_rows))
-    said = open_runs.open_files([tmp_path / "model.ckpt"], own, None, others_whole=True).foreign
+    said = opened_beside_all(tmp_path, monkeypatch, rssi_db=level, sensitivity_db=np.array(-95.0)).foreign
     assert "80 of these 80 test rows (50 listed, 30 unlisted) are at places" in said
 
 
 def test_rows_that_none_was_trained_on_read_as_an_alarm(tmp_path, monkeypatch):
     """`0 of these 80 test rows are at places that were TRAINED on`, of `split whole`."""
-    gsparc.fit(rx=WALK, rssi=np.linspace(-90, -50, 80), model="mean", save=tmp_path / "model.ckpt")
-    np.savez(tmp_path / "drive.npz", rx_position=WALK + 500.0, rssi_db=np.linspace(-90, -50, 80))
-    own = {"name": "own", "file": str(tmp_path / "drive.npz")}
-    learned = from_arrays({"rx_position": WALK, "rssi_db": np.linspace(-90, -50, 80)})
-    all_rows = Split("all", (Fold(np.arange(80), np.arange(0), np.arange(0)),), "")
-    monkeypatch.setattr(
-        open_runs, "_trained", lambda stored, data: (align_to_site(learned, data.site), all_rows)
-    )
-    run = open_runs.open_files([tmp_path / "model.ckpt"], own, None, others_whole=True)
+    run = opened_beside_all(tmp_path, monkeypatch, rx_position=WALK + 500.0)
     assert run.foreign.endswith("none of these 80 test rows are at places that were trained on")
     assert run.split.title == "whole (all rows of the file are asked)"
 

@@ -165,19 +165,13 @@ def test_headings_were_broken_inside_words_and_columns_of_dashes_shown():
     assert "skill" not in shown[200] and "scalar" not in shown[60]
 
 
-def test_what_an_own_method_learned_stood_without_its_name():
-    facts = {"model/made": None, "model/label": "own", "model/learned": "ridge 0.001\nrows 9"}
-    assert describe_model(facts) == ["own: ridge 0.001", "  rows 9"]
-
-
-def test_the_name_of_a_method_stood_twice_before_what_it_learned():
-    facts = {
-        "model/made": None,
-        "model/label": "gp",
-        "model/name": "gp",
-        "model/learned": "AP0: gp: length 3 m",
-    }
-    assert describe_model(facts) == ["gp: AP0: length 3 m"]
+@pytest.mark.parametrize(("label", "learned", "said"), [
+    ("own", "ridge 0.001\nrows 9", ["own: ridge 0.001", "  rows 9"]),  # it stood without its name
+    ("gp", "AP0: gp: length 3 m", ["gp: AP0: length 3 m"]),
+])  # fmt: skip
+def test_the_name_of_a_method_stood_twice_before_what_it_learned(label, learned, said):
+    facts = {"model/made": None, "model/label": label, "model/name": label, "model/learned": learned}
+    assert describe_model(facts) == said
 
 
 def test_a_baseline_whose_errors_are_forty_times_its_std_had_no_remark():

@@ -57,3 +57,13 @@ def assert_found_bad(answer: Answer, says: str) -> None:
     assert re.search(says, "\n".join(answer.out)), answer.out
     assert all(len(line) < 700 and "Traceback" not in line for line in answer.out), answer.out
     assert re.search(r": refused, \d+ problems?$", answer.out[-1]), answer.out
+
+
+def said(path: Path, **settings: object) -> str:
+    """What `gsparc check` says of a file."""
+    from rich.console import Console
+
+    from gsparc.commands.check import check
+
+    check(str(path), Console(file=(out := io.StringIO()), width=2000), **settings)
+    return out.getvalue()

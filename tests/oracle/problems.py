@@ -154,12 +154,6 @@ def powers(rows: int, **more: Any) -> Arrays:
     return {"rx": at, "tx": POSTS[0], "rssi": level[:, 0], **more}
 
 
-def nowhere_known() -> Arrays:
-    """Powers above a transmitter whose place nobody knows."""
-    at, level = shadowing(90, 1)
-    return {"rx": at, "station_position": np.full((1, 3), np.nan), "rssi": level}
-
-
 def silent() -> Arrays:
     """Powers of one station that is not heard below -75 dBm."""
     arrays = powers(110)
