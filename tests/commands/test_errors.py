@@ -19,6 +19,16 @@ REFUSED = [
     ("study kind=efects", "kind=efects: no such choice; did you mean 'effects'?"),
     ("study baselines=[gpp]", "baselines=['gpp']: a list of methods is needed, 'gpp' is none"),
     ("study model.field.count=-1", "model.field.count=-1: a whole number of at least 0"),
+    # No rounds ended in an IndexError, no draws in a maximum of nothing.
+    ("study rounds=0", "rounds=0: a whole number of at least 1"),
+    ("study queries=0", "queries=0: a whole number of at least 1"),
+    ("tradeoff ckpt={spectra} rounds=0", "rounds=0: a whole number of at least 1"),
+    ("calibrate ckpt={town} draws=0", "draws=0: a whole number of at least 1"),
+    ("evaluate ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
+    ("evaluate ckpt=absent.ckpt eval_onn=val", "did you mean 'eval_on'"),
+    ("evaluate ckpt=absent.ckpt eval_on=vall", "did you mean 'val'"),
+    ("evaluate ckpt=absent.ckpt threads=-2", "threads=-2"),
+    ("evaluate ckpt=absent.ckpt baselines=[nearst]", "did you mean 'nearest'"),
     ("report", "no run is named; say gsparc report RUN..., folders of runs"),
     ("serve ckpt=none.ckpt host=0.0.0.0", "others reach it; set GSPARC_TOKEN, or say token=WORD"),
     ("serve ckpt=none.ckpt host=example.org", "others reach it"),
@@ -81,18 +91,3 @@ def test_what_cannot_be_done_is_one_line(line, message, made, tmp_path, monkeypa
     overrides = [f"hydra.run.dir={tmp_path / 'run'}", *overrides]
     pattern = message if message.startswith("^") or ".*" in message else re.escape(message)
     assert_refused(knock(COMMANDS[name].run, name, overrides), pattern, tmp_path / "run")
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "tradeoff ckpt={spectra} rounds=0",
-        "study rounds=0",
-        "study queries=0",
-        "calibrate ckpt={town} draws=0",
-    ],
-)
-def test_no_rounds_ended_in_an_index_error_and_no_draws_in_a_maximum_of_nothing(line, made, tmp_path):
-    name, *overrides = line.format(**made).split()
-    answer = knock(COMMANDS[name].run, name, [*overrides, f"hydra.run.dir={tmp_path / 'run'}"])
-    assert_refused(answer, f"{overrides[-1]}: a whole number of at least 1", tmp_path / "run")

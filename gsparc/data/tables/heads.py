@@ -176,7 +176,7 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
 def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     numbers = [word for word in words if word.isdigit()]
     parts = [word for word in words if word in _PART]
-    tone = re.search(r"(?i)\d+(?:\.\d+)?\s*[kmg]?hz\W*$", plain)  # S21_re_3.5GHz
+    tone = re.search(r"(?i)(?<!\d)\d+(?:\.\d+)?\s*[kmg]?hz\W*$", plain)  # S21_re_3.5GHz
     if len(parts) == 1 and tone is not None:
         return Head(_PART[parts[0]], tone[0], unit, parts[0])
     others = [word for word in words if word not in {*_PART, *numbers, *LISTS["channel"]}]

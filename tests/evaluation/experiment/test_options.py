@@ -90,6 +90,16 @@ PLAIN = {
     "gp": {"model.components": 3, "model.mean": "constant"},
 }  # fmt: skip
 PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
+OTHER = {  # values to perturb options by
+    "trainer.val_check_interval": 3, "callbacks.densify.min_gaussians": 8, "callbacks.reset.ceiling": 0.04,
+    "dataset.batch_size": 5, "budget_s": 5, "stations": "auto", "split.redraw": "false", "split.thin": 0.7,
+    "trainer.max_steps": 3, "model.field.count": 30, "model.field.near": 1.2, "model.field.margin": 2.5,
+    "model.emission.encoding.anchors": 10, "model.emission.init_scale": 0.3, "model.attenuation.gain": 2.5,
+    "model.raster.low_pass": 0.5, "model.loss.ssim_weight": 0.1, "model.optimizer.emission": 0.02,
+    "model.confidence.alpha": 0.4, "model.refit": "true", "model.components": 5, "model.mean": "distance",
+    "init.searches": 3, "init.rows": 400, "model.power": 3.0,
+}  # fmt: skip
+
 Case = tuple[str, str, dict, set]
 
 
@@ -145,6 +155,24 @@ def test_what_a_method_does_not_heed_is_named(case):
 @pytest.mark.parametrize("case", CASES, ids=name_of)
 def test_what_every_method_does_not_heed_of_every_kind(case):
     check(case)
+
+
+def perturbed(case: Case, option: str) -> tuple[torch.Tensor, torch.Tensor]:
+    """Answers with the value of a case, and with another."""
+    world, model, given, _ = case
+    both = given, given | {option: OTHER[option]}
+    first, second = (fitted(world, f"model={model}", *words(one))[1] for one in both)
+    return first, second
+
+
+NOTED = [(case, option) for case in CASES for option in sorted(case[3])]
+DRAWN = np.random.default_rng(57).permutation(len(NOTED))[:10]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case, option", [NOTED[i] for i in DRAWN], ids=name_of)
+def test_what_is_named_changes_no_bit_of_the_answers(case, option):
+    assert torch.equal(*perturbed(case, option))
 
 
 def warned(caplog) -> list[str]:

@@ -7,10 +7,7 @@ import pytest
 from campaigns import spectra
 from doors import assert_refused, knock
 
-from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main as train
-
-evaluate = COMMANDS["evaluate"].run
 
 SLIPS = {
     "modle=gsparc": "did you mean 'model'", "model=gsprac": "did you mean 'gsparc'",
@@ -83,15 +80,3 @@ def test_train(slip, file, tmp_path):
         *("baselines=[]", "trainer.max_steps=1", "model.field.count=5", "model.effects.phase=false"),
     ]
     assert_refused(knock(train, "train.py", [*good, slip]), CASES[slip], tmp_path)
-
-
-@pytest.mark.parametrize("slip,says", [
-    ("ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
-    ("eval_onn=val", "did you mean 'eval_on'"),
-    ("eval_on=vall", "did you mean 'val'"),
-    ("threads=-2", "threads=-2"),
-    ("baselines=[nearst]", "did you mean 'nearest'"),
-])  # fmt: skip
-def test_evaluate(slip, says, tmp_path):
-    given = [f"hydra.run.dir={tmp_path}", "ckpt=absent.ckpt", slip]
-    assert_refused(knock(evaluate, "evaluate", given), says, tmp_path)

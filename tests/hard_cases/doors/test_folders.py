@@ -1,6 +1,6 @@
-"""Folders in the RFID release's layout, spoilt: `gsparc check` and `train.py dataset=rfid`.
+"""Folders in the RFID release's layout, spoilt: `gsparc check`.
 
-Remedy: gsparc/data/datasets/rfid.py. Cases of tests/helpers/releases.py and more, at the commands' own doors.
+Remedy: gsparc/data/datasets/rfid.py. Cases of tests/helpers/releases.py and more, at the command's own door.
 """
 # ruff: noqa: E501 (a case is a row of a table)
 
@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from doors import assert_found_bad, assert_refused, knock
+from doors import assert_found_bad, knock
 from PIL import Image
 from releases import SPOILT, write_release
 
 from gsparc.commands.check import main as check
-from gsparc.commands.train import main as train
 
 
 @pytest.fixture(scope="module")
@@ -65,14 +64,6 @@ def test_check(release, case):
     spoil, says = CASES[case]
     spoil(release)
     assert_found_bad(knock(lambda: check([str(release)]), "check", []), says)
-
-
-@pytest.mark.parametrize("case", ["csv nan", "spectrum truncated", "spectrum 16 bit", "index out of range"])
-def test_train(release, case, tmp_path):
-    spoil, says = CASES[case]
-    spoil(release)
-    given = ["dataset=rfid", f"dataset.root='{release}'", f"hydra.run.dir={tmp_path / 'run'}", "logger=none"]
-    assert_refused(knock(train, "train.py", given), says, tmp_path / "run")
 
 
 def test_the_sound_one_is_read(release):
