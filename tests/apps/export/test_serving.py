@@ -411,4 +411,5 @@ def test_an_honest_client_is_answered_among_hostile_ones(kind, tmp_path, request
         times = f"{np.median(late):.3f}, {np.quantile(late, 0.99):.3f}, {max(late):.3f} s"
         mb = f"{after[0]:.0f} MB, then {min(after):.0f} to {max(after):.0f}"
         sys.stderr.write(f"{len(late)} answers, median, p99, last {times}; {mb}\n")
-    assert hostile.returncode == 0 and max(late) < 1 and max(after) - after[0] < 20
+    busy = max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))  # processes a core, which take turns
+    assert hostile.returncode == 0 and max(late) < busy and max(after) - after[0] < 20
