@@ -98,12 +98,12 @@ def learn_station_priors(
     their own.
     """
     trend, notes = _fit_site_law(rows, seed)
-    heard, listed = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
-    whole = rows.select_complete_places() if listed else heard
+    heard, some_silent = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
+    whole = rows.select_complete_places() if some_silent else heard
     numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
     with nullcontext() if budget is None else end_when(budget.is_spent):
         kernel, priors = _fit_common_kernel(heard, trend, seed)
-        if listed and not out_of_time():
+        if some_silent and not out_of_time():
             each = min(WEIGHED_EACH, max(MOST_ROWS // len(whole.stations), 1))
             parts = [whole.select_station(n).draw_stretches(each, seed) for n in whole.stations]
             # What lists hold spreads less than what they were drawn from.
@@ -115,7 +115,7 @@ def learn_station_priors(
         if budget is not None and budget.is_spent():
             numbers = []
         for number in numbers:
-            if listed:
+            if some_silent:
                 some = whole.select_station(number).draw_stretches(ENDS_FROM, seed)
                 _, own = fit_kernel_by_evidence([some], trend, priors[number].kernel, EVIDENCE_LOOKS)
             else:
