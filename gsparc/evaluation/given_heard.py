@@ -1,4 +1,4 @@
-"""Levels given that they are listed: what is asked of rows of lists, which hold what is strong."""
+"""Levels given that they are heard: what is asked of rows of surveys, which hold what is strong."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ def levels_given_heard(
 
     What a level must exceed is drawn: in lists of the N strongest, where the method learned from unlisted
     rows, the N-th strongest of the other stations as the method predicts them; elsewhere levels of the
-    station's nearest silent rows. Levels are normal, and those that are listed the part above (J. Heckman,
-    "Sample selection bias as a specification error", Econometrica 47 (1979)). Without lists they stay as they
-    are: floors of stations are often guesses (real Wi-Fi: given that they are heard 4.08 for 3.87 dB).
-    Where a station was never silent the probability is NaN.
+    station's nearest silent rows. Levels are normal, and those that are heard the part above (J. Heckman,
+    "Sample selection bias as a specification error", Econometrica 47 (1979)). Where a station was never
+    silent levels stay as they are, and the probability is NaN.
 
     Args:
         method: fitted.
@@ -58,13 +57,12 @@ def levels_given_heard(
             limit = np.maximum(others[at], level[rows].min())
         above = torch.from_numpy((mean_db[at, None] - limit) / spread_db[at, None]).clamp_min(FARTHEST)
         chance[at] = torch.special.ndtr(above).mean(1)
-        if others is not None:
-            # Each limit counts by how probable it makes the list. Above 0 is a mirror image.
-            weight = torch.softmax(torch.special.log_ndtr(above), 1)
-            shift, lost = truncated_moments(above)
-            middle = (weight * shift).sum(1)
-            mean[at] += spread[at] * middle.numpy()
-            spread[at] *= ((weight * (1 - lost + shift**2)).sum(1) - middle**2).sqrt().numpy()
+        # Each limit counts by how probable it makes the list. Above 0 is a mirror image.
+        weight = torch.softmax(torch.special.log_ndtr(above), 1)
+        shift, lost = truncated_moments(above)
+        middle = (weight * shift).sum(1)
+        mean[at] += spread[at] * middle.numpy()
+        spread[at] *= ((weight * (1 - lost + shift**2)).sum(1) - middle**2).sqrt().numpy()
     return {"heard_share": chance, "heard_db": mean, "heard_std_db": spread}
 
 

@@ -20,10 +20,10 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
 
     `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
-    `interval/width_db` its mean width; of lists that of levels given that they are listed, which exceed the
-    others by `listed_above_db`. Where powers may be too weak to be heard or listed, `outage/rate` is the
-    share of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0
-    when perfect, and `outage/brier_rate` what always saying the rate gives.
+    `interval/width_db` its mean width; beside silent rows that of levels given that they are heard, which
+    exceed the others by `listed_above_db`. Where powers may be too weak to be heard or listed, `outage/rate`
+    is the share of rows that were, `outage/brier` the mean square of (predicted probability - what
+    happened), 0 when perfect, and `outage/brier_rate` what always saying the rate gives.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     # Decibels of a power need a mean above 0.

@@ -47,7 +47,7 @@ FIGURES = {
     "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
-GIVEN_LISTED = "rmse_db of rows of lists: of levels given that they are listed"
+GIVEN_HEARD = "rmse_db: of levels given that they are heard or listed"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
@@ -76,7 +76,10 @@ def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
 
 
 def judged_by(facts: Mapping[str, Any], prefix: str = "test") -> dict[str, str]:
-    """Return figures that methods are judged by, by what leads in them are called; of lists heard rows, too.
+    """Return figures that methods are judged by, by what leads in them are called.
+
+    Beside silent rows those
+    of heard ones, too.
 
     >>> judged_by({"dataset/kind": "rssi", "test/rmse_db_with_silent": 4.0})
     {'ahead': 'rmse_db_with_silent', 'ahead_listed': 'rmse_db'}

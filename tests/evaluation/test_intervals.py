@@ -44,9 +44,10 @@ def test_a_true_law_is_calibrated(drawn):
     found = power_intervals(scored(data, mean_db, 6.0), data)
     assert found["outage/rate"] == pytest.approx(0.5, abs=0.03)
     assert found["outage/brier"] < 0.8 * found["outage/brier_rate"]
-    assert found["interval/width_db"] == pytest.approx(2 * 1.645 * 6, rel=0.01)
-    # Heard rows are the upper part of their laws: a little fewer than 90 % lie inside.
-    assert 0.84 < found["interval/coverage_90"] < 0.93
+    # Heard rows are the upper part of their laws, by whose moments they are judged.
+    assert 0.7 < found["interval/width_db"] / (2 * 1.645 * 6) < 0.8
+    assert 0.88 < found["interval/coverage_90"] < 0.93
+    assert found["reduced_chi2"] == pytest.approx(1, abs=0.05) and found["listed_above_db"] > 2.5
 
 
 def test_too_sure_and_too_unsure_are_told_apart(drawn):
@@ -54,10 +55,7 @@ def test_too_sure_and_too_unsure_are_told_apart(drawn):
     sure, right, unsure = (power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0))
     assert sure["interval/coverage_90"] < 0.4 < 0.99 < unsure["interval/coverage_90"]
     assert right["outage/brier"] < min(sure["outage/brier"], unsure["outage/brier"])
-    # Heard rows are the upper part of their laws: a little less than 1.
-    assert 0.7 < right["reduced_chi2"] < 1.1 and sure["reduced_chi2"] == pytest.approx(
-        36 * right["reduced_chi2"]
-    )
+    assert right["reduced_chi2"] < 1.1 < 10 < sure["reduced_chi2"]
 
 
 def test_whether_std_is_right_was_in_no_table():

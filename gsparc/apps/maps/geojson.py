@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +28,16 @@ def draws_shapes(path: str | Path) -> bool:
     """Tell whether a file is GeoJSON of polygons or lines: one of points is a table."""
     if Path(path).suffix.lower() not in SUFFIXES or not Path(path).is_file():
         return False
-    return re.search(r'"(Multi)?(Polygon|LineString)"', Path(path).read_text(errors="replace")) is not None
+    try:
+        return any(one and one["type"] not in ("Point", "MultiPoint") for one in _geometries(path))
+    except UNREADABLE:
+        return False
+
+
+def _geometries(path: str | Path) -> list[Any]:
+    """Those of a file, undecoded; None where a feature has none."""
+    content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    return [one.get("geometry", one) for one in content.get("features", [content])]
 
 
 def read_shapes(
@@ -56,10 +64,8 @@ def read_shapes(
     from shapely.geometry import shape
 
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-        features = [one.get("geometry", one) for one in content.get("features", [content])]
         with np.errstate(invalid="ignore"):  # NaN is refused below
-            parts = np.array([shape(one) for one in features if one], object)
+            parts = np.array([shape(one) for one in _geometries(path) if one], object)
     except FileNotFoundError:
         raise DataError(f"{where}: no such file") from None
     except (*UNREADABLE, shapely.errors.ShapelyError) as error:

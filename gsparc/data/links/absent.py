@@ -8,7 +8,7 @@ import numpy as np
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.plausibility import find_marks
-from gsparc.data.errors import Severe
+from gsparc.data.errors import Severe, list_first
 from gsparc.data.links.strongest import StrongestLists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
@@ -70,6 +70,9 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         (floor, may), lists = found, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"
         how = f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
+        out = np.isnan(lists.level).any(0) & ~np.isnan(floor) & ~may.any(0)
+        if out.any():
+            how += f", but of {list_first(np.array(stations.shown)[out])} unknown, strong ones are lost"
     else:
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         stated = np.full(count, np.nan if floor is None else floor)

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-FULL = 0.3  # of the moments, that hold as many as any
+FULL = 0.15  # of the moments, that hold as many as any: .03 at most where hearing alone ends lists
 LEAST_MOMENTS = 20
 ABOVE_DB = 6.0  # of a neighbour's weakest, where a station drops out of lists, at most
 WHOLE = 0.5  # of the rows, those of moments that leave none out
@@ -86,7 +86,7 @@ class StrongestLists:
     def are_strongest(self) -> bool:
         """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak."""
         sizes = np.isfinite(self.level).sum(1)
-        piled = self.full.mean() >= FULL and self.full.sum() > (sizes == self.length - 1).sum()
+        piled = self.full.mean() >= FULL and 2 * self.full.sum() > (sizes == self.length - 1).sum()
         if len(sizes) < LEAST_MOMENTS or not 2 <= self.length < self.level.shape[1] or not piled:
             return False
         above = self.beside - np.nanmin(self.level, 1)[:, None]

@@ -16,7 +16,7 @@ from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     DECIDING,
-    GIVEN_LISTED,
+    GIVEN_HEARD,
     WITH_SILENT,
     heading_of,
     lower_is_better,
@@ -218,7 +218,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another program (at commit): {old}")
-    lines += [GIVEN_LISTED] * bool(block.outage.notna().any())
+    lines += [GIVEN_HEARD] * bool(block.outage.notna().any())
     return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
 
 

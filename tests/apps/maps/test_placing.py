@@ -164,11 +164,16 @@ def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
 def test_polygons_of_candidates_were_read_as_a_table(together, tmp_path):
     square = {"type": "Polygon", "coordinates": [[[0, 0], [60, 0], [60, 20], [0, 20], [0, 0]]]}
     points = {"type": "MultiPoint", "coordinates": [[5, 5, 20], [75, 5, 12]]}
+    named = {
+        "type": "Feature",
+        "geometry": points,
+        "properties": {"shape": "Polygon"},
+    }  # once looked for as text
     predictor, found = gsparc.load(together[2]), []
-    for number, content in enumerate((square, points)):
+    for number, content in enumerate((square, points, named)):
         (tmp_path / f"{number}.geojson").write_text(json.dumps(content))
         found.append(draws_shapes(tmp_path / f"{number}.geojson"))
-    assert found == [True, False]
+    assert found == [True, False, False]
     inside = place_station(predictor, threshold_db=-75.0, sites=tmp_path / "0.geojson", count=4).places
     assert len(inside) > 1 and (inside[:, :2] >= 0).all() and (inside[:, :2] <= [60, 20]).all()
 
