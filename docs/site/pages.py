@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 from typing import Any
 
+from cells import table
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
@@ -31,14 +31,6 @@ def on_page_markdown(markdown: str, **unused: Any) -> str:
     markdown = TABLE.sub(lambda found: table(ROOT / found[1]), markdown)
     markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
     return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
-
-
-def table(path: Path) -> str:
-    """Return a CSV file as a table in Markdown, names in its first column as code."""
-    with path.open(encoding="utf-8", newline="") as file:
-        head, *rows = csv.reader(file)
-    shown = [(re.sub(r"^\w+$", r"`\g<0>`", name), *rest) for name, *rest in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *shown))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
