@@ -103,6 +103,24 @@ def test_no_cell_of_a_table_is_cut(helpers, path):
     assert Cells(markdown(table(ROOT / path), extensions=["tables"])).rows == written
 
 
+def test_every_setting_is_on_the_site(helpers):
+    """Some were in no page; what files leave to their class is there with its meaning."""
+    from settings import CONF, list_files, list_settings
+
+    found = {file.relative_to(CONF).as_posix(): list_settings(file) for file in CONF.rglob("*.yaml")}
+    assert not [(file, row) for file, rows in found.items() for row in rows if not row[2]]
+    names = {file: {name: default for name, default, _ in rows} for file, rows in found.items()}
+    assert names["paper/gsparc.yaml"]["model.attenuation.learn_gain"] == "false"
+    assert names["model/gsparc.yaml"]["model.attenuation.learn_gain"] == "true"
+    assert names["model/newrf.yaml"]["model.octaves"] == "8"
+    assert names["scene/conference_room.yaml"]["scene.height_m"] == "[1.1, 1.5]"
+    assert {"dataset.level_steps", "dataset.hall"} <= names["dataset/ble.yaml"].keys()
+    assert {"trainer.overfit_batches", "trainer.max_steps"} <= names["trainer/cpu.yaml"].keys()
+    assert names["map.yaml"]["promise.share"] == "0.9"
+    text = list_files()
+    assert all(f"| `{name}` |" in text for settings in names.values() for name in settings)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_tutorials_run():

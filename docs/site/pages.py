@@ -6,12 +6,14 @@ import re
 from pathlib import Path
 from typing import Any
 
+import settings
 from cells import table
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 EXECUTED = ROOT / "build" / "executed"
 TABLE = re.compile(r"^<!-- table: (\S+\.csv) -->$", re.MULTILINE)  # its path from the root
+SETTINGS = "<!-- settings -->"
 TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 
 
@@ -29,6 +31,8 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, **unused: Any) -> str:
     """Links to the README lead to the start page, those to taken pages to these; tables are shown."""
     markdown = TABLE.sub(lambda found: table(ROOT / found[1]), markdown)
+    if SETTINGS in markdown:
+        markdown = markdown.replace(SETTINGS, settings.list_files())
     markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
     return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
 
