@@ -6,12 +6,16 @@ import re
 import subprocess
 import sys
 import time
+import zlib
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 from urllib.parse import unquote
 
 import pytest
 from filelock import FileLock
+
+import gsparc
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1"}
@@ -119,6 +123,18 @@ def test_every_setting_is_on_the_site(helpers):
     assert names["map.yaml"]["promise.share"] == "0.9"
     text = list_files()
     assert all(f"| `{name}` |" in text for settings in names.values() for name in settings)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_names_are_those_that_users_import(site):
+    """`SphereGrid` also stood under `gsparc.ops.native`, and `gsparc.fit` nowhere."""
+    lines = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode().splitlines()
+    names = {line.split()[0] for line in lines if line.split()[1] in ("py:class", "py:function")}
+    assert {f"gsparc.{name}" for name in gsparc.__all__} <= names
+    for module, _, name in (name.rpartition(".") for name in names):
+        room = import_module(module)
+        assert name in getattr(room, "__all__", ()) or getattr(room, name).__module__ == module, module
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,17 @@ def on_page_markdown(markdown: str, **unused: Any) -> str:
         markdown = markdown.replace(SETTINGS, settings.list_files())
     markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
     return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
+
+
+def on_env(env: Any, config: Any, **unused: Any) -> Any:
+    """Names by which nobody should import, of modules that only use them, leave the inventory."""
+    inventory = config.plugins["mkdocstrings"].handlers.inventory
+    for path in [item.name for item in inventory.values() if item.role in ("class", "function")]:
+        module, _, name = path.rpartition(".")
+        room = import_module(module)
+        if getattr(room, name).__module__ != module and name not in getattr(room, "__all__", ()):
+            del inventory[path]
+    return env
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
