@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import settings
+from cells import table
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 EXECUTED = ROOT / "build" / "executed"
 TABLE = re.compile(r"^<!-- table: (\S+\.csv) -->$", re.MULTILINE)  # its path from the root
+SETTINGS = "<!-- settings -->"
 TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 
 
@@ -29,16 +32,21 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, **unused: Any) -> str:
     """Links to the README lead to the start page, those to taken pages to these; tables are shown."""
     markdown = TABLE.sub(lambda found: table(ROOT / found[1]), markdown)
+    if SETTINGS in markdown:
+        markdown = markdown.replace(SETTINGS, settings.list_files())
     markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
     return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
 
 
-def table(path: Path) -> str:
-    """Return a CSV file as a table in Markdown, names in its first column as code."""
-    with path.open(encoding="utf-8", newline="") as file:
-        head, *rows = csv.reader(file)
-    shown = [(re.sub(r"^\w+$", r"`\g<0>`", name), *rest) for name, *rest in rows]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *shown))
+def on_env(env: Any, config: Any, **unused: Any) -> Any:
+    """Names by which nobody should import, of modules that only use them, leave the inventory."""
+    inventory = config.plugins["mkdocstrings"].handlers.inventory
+    for path in [item.name for item in inventory.values() if item.role in ("class", "function")]:
+        module, _, name = path.rpartition(".")
+        room = import_module(module)
+        if getattr(room, name).__module__ != module and name not in getattr(room, "__all__", ()):
+            del inventory[path]
+    return env
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

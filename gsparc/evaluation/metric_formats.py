@@ -78,8 +78,7 @@ def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
 def judged_by(facts: Mapping[str, Any], prefix: str = "test") -> dict[str, str]:
     """Return figures that methods are judged by, by what leads in them are called.
 
-    Beside silent rows those
-    of heard ones, too.
+    Beside silent rows also those of heard ones.
 
     >>> judged_by({"dataset/kind": "rssi", "test/rmse_db_with_silent": 4.0})
     {'ahead': 'rmse_db_with_silent', 'ahead_listed': 'rmse_db'}

@@ -23,7 +23,7 @@ class EncodingSettings(Checked):
         kind: `raw` coordinates (the paper), `fourier` octaves along the axes, or `kernel`: whitened
             similarities to training positions, so that a linear read-out with independent weights is a
             Gaussian process of the emission.
-        octaves: number of octaves of `fourier`; the first has a period of twice the scene box.
+        octaves: number of octaves of `fourier`; the period of the first is the longest side of the box.
         anchors: largest number of training positions of `kernel`.
     """
 

@@ -43,7 +43,8 @@ class DeformedPeer(GaussianPeer):
 
     Args:
         count: Gaussians.
-        width, depth, octaves: of the deforming network.
+        width, depth: of the deforming network.
+        octaves: of its Fourier features of places.
         others: see `TrainedPeer`.
     """
 

@@ -105,7 +105,8 @@ class NeWRF(TrainedPeer):
     """Channels of one antenna and one tone, with directions of arrival.
 
     Args:
-        width, depth, octaves: of the network.
+        width, depth: of the network.
+        octaves: of its Fourier features of places.
         samples: points per ray, half of them fine.
         neighbours: training receivers that vote at a query.
         others: see `TrainedPeer`.
