@@ -28,7 +28,7 @@ OUTLIERS = 1e-3  # share of the training errors beyond either bound of what is a
 
 @dataclass(frozen=True)
 class RelativeErrorRegression(Stored):
-    """Ridge regression of the logarithm of |e|^2 / |h|^2 on S columns and their products.
+    """Ridge regression of the logarithm of |e|^2 over a power on S columns and their products.
 
     Attributes:
         centre, scale: (S,) of the columns in training.
@@ -50,14 +50,14 @@ class RelativeErrorRegression(Stored):
     smearing: float
 
     def expected_error(self, columns: Tensor) -> Tensor:
-        """Return the expected relative error |e|^2 / |h|^2 (m,) at columns (m, S)."""
+        """Return the expected relative error (m,) at columns (m, S)."""
         standard = (columns.clamp(self.low, self.high) - self.centre) / self.scale
         logarithm = self.intercept + _add_products(standard) @ self.weights
         return self.smearing * logarithm.clamp(self.least, self.largest).exp()
 
     @classmethod
     def from_rows(cls, columns: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
-        """Fit to columns (n, S) float32, and |e|^2 / |h|^2 (n,) of rows that a fit did not see; n > 1."""
+        """Fit to columns (n, S) float32, and errors (n,) of rows that a fit did not see; n > 1."""
         centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(LEAST_SCALE)
         terms = _add_products((columns - centre) / scale).double().numpy()
         target = relative_error.clamp_min(LEAST_ERROR).log().double().numpy()

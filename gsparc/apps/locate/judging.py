@@ -35,7 +35,8 @@ log = logging.getLogger(__name__)
 
 Report = tuple[dict[str, Any], list[Table], list[str]]  # facts, tables and sentences
 SHOWN = 6  # snapshots, evenly over all
-ABOUT = {"area_m2": "area", "modes": "modes", "doubt": "doubt", "inside": "inside"}  # columns of `Located`
+ABOUT = ("modes", "doubt", "inside")  # columns of `Located`
+SIZES = {"length_m": "m", "area_m2": "m2", "volume_m3": "m3"}  # of areas, by how many axes are searched
 TRUST_IS_OF = ("share", "prior", "plan", "plan_points")  # settings
 
 
@@ -61,15 +62,16 @@ def report(
         config: see conf/locate.yaml.
         method: name.
         heard, trained: what was located, and what was learned from.
-        columns: of `locate.csv`, n values each; `error_m` where true places are known, `area_m2` of areas.
+        columns: of `locate.csv`, n values each; `error_m` where true places are known, one of
+            `SIZES` of areas.
         facts: for the summary, with the milliseconds of a snapshot.
         promise: what the areas promise, in words.
         group: see `locate_by_neighbours`.
     """
     write_samples(run_dir / "locate.csv", columns)
-    area, inside = columns.get("area_m2"), columns.get("inside")
+    size, inside = next((name for name in SIZES if name in columns), ""), columns.get("inside")
     facts["locate/snapshots"] = len(heard)
-    facts["locate/area_m2"] = None if area is None else float(np.median(area))
+    facts |= {f"locate/{size}": float(np.median(columns[size]))} if size else {}
     doubts = _doubts(columns, facts)
     if "error_m" not in columns:
         return facts, [], doubts
@@ -89,7 +91,8 @@ def report(
     shown = [Table(title, heads, rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
     if inside is not None:
-        areas = f"areas of {facts['locate/area_m2']:.3g} m2 (median) hold {np.mean(inside):.0%} of places"
+        median = f"{facts[f'locate/{size}']:.3g} {SIZES[size]} (median)"
+        areas = f"areas of {median} hold {np.mean(inside):.0%} of places"
         doubts.insert(0, f"{areas}, {promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot")
     return facts, shown, doubts
 
@@ -131,6 +134,7 @@ def locate_by_model(
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
     heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
     box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
+    size = list(SIZES)[(box.edge.max(0) > 0).sum() - 1]
     # Not of names alone: a plan's image, and rows, change under the same name.
     extra, cells_hash = run.stored[0].extra, joblib.hash((box, wider, learned, data.site.sha256))[:8]
     how = {name: to_dict(config)[name] for name in TRUST_IS_OF} | asdict(unknown) | {"cells": cells_hash}
@@ -155,13 +159,14 @@ def locate_by_model(
         table = {} if heard.row is None else {"row": heard.row[first]}
         world = np.array([one.place for one in located]) + origin
         table |= columns_of_places(world, heard.place[first] + origin, run.predictor)
-        about = {head: [getattr(one, name) for one in located] for head, name in ABOUT.items()}
+        about = {name: [getattr(one, name) for one in located] for name in ABOUT}
+        about = {size: [one.area for one in located]} | about
         return table | {head: values for head, values in about.items() if values[0] is not None}
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
     own = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
-    said = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} m2 were searched"
+    said = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
     said += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None

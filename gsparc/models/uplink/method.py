@@ -78,7 +78,7 @@ class UplinkField(UplinkMethod):
     def _features_and_errors(
         self, data: Measurements, rows: np.ndarray, rng: np.random.Generator, pieces: int
     ) -> tuple[Tensor, Tensor]:
-        """Error features (n, S) and relative errors (n,) of training snapshots, whole and in pieces.
+        """Features (n, S) and errors (n,), of the mean's power, of training snapshots, whole and in pieces.
 
         Pieces are one antenna and a few tones: narrow grids of one antenna fade deeper than the whole
         downlink.
@@ -98,7 +98,7 @@ class UplinkField(UplinkMethod):
             for some, band in views:
                 aperture = Aperture(whole.places[some], whole.tones[band])
                 mean, true = everything[:, some, band], batch.target[:, some, band]
-                error.append(mean_power(mean - true) / mean_power(true))
+                error.append(mean_power(mean - true) / mean_power(mean))
                 features.append(result.features(mean, aperture))
         return torch.cat(features), torch.cat(error)
 
@@ -124,9 +124,10 @@ class UplinkField(UplinkMethod):
             result = self._search_snapshots(uplink, noise)
             mean = result.sources.channels(aperture)
             error = self.error_model.expected_error(result.features(mean, aperture))
+            # Before shrinking: what was not found is not in the mean, and shrinking does not take it away.
+            variance = error * mean_power(mean)
             if self.shrink:
                 mean = mean / (1 + error)[:, None, None]
-            variance = error * mean_power(mean)
         mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
         return Prediction(mean, variance, error / (1 + error))
 
