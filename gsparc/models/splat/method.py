@@ -53,6 +53,7 @@ log = logging.getLogger(__name__)
 
 THIRDS = 3  # of the rows: one is for validation where few were set apart
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
+ENOUGH = 2  # times the antennas of an array: so many Gaussians give it any vector, and more the same
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
@@ -493,6 +494,9 @@ class LearnedField(Method):
         kind = "array process" if self.settings.response.array else "process of images"
         made = f"networks of {hidden} hidden units in {count} Gaussians" if hidden else f"{count} Gaussians"
         made = f"{kind} through {made}" if self.choices.closed_form else made
+        if self.choices.init == "vectors" and not self.steps and self.site is not None:
+            enough = ENOUGH * len(self.site.array_geometry()[0])
+            made += f" ({enough} or more answer alike)" * (count >= enough)
         kept = "all" if self.steps == self.steps_taken else self.steps or "none"
         return made + (
             f", {self.steps_taken} gradient steps, {kept} kept" if self.steps_taken else ", no gradient steps"
