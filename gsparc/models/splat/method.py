@@ -264,7 +264,7 @@ class LearnedField(Method):
                 InitTask(
                     apply_choices(self.settings, self.choices), self.choices.closed_form, data,
                     stage.fold.train, self._static_receiver(), self._ends.get("tx_position"),
-                    context.seed, folder,
+                    context.seed, folder, budget,
                 )
             )  # fmt: skip
             self._prior = start.prior
