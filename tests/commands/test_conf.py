@@ -109,3 +109,10 @@ def test_the_paper_leaves_nothing_to_auto():
     values = [config.init.name, settings.emission.activation, settings.emission.encoding.kind]
     assert "auto" not in [*values, settings.emission.init_bias, *config.model.effects.values()]
     assert len(config.model.guesses) > 5
+
+
+def test_guesses_of_callbacks_that_are_left_out_were_said():
+    """`densification from step none to none every none`."""
+    given = "paper=gsparc_minute", "callbacks.densify=null", "callbacks.reset=null"
+    whole, without = (build(compose(*options).model).guesses for options in (given[:1], given))
+    assert len(whole) == 11 and len(without) == 7 and not any("None" in guess for guess in [*whole, *without])

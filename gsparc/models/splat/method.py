@@ -131,7 +131,8 @@ class LearnedField(Method):
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
-        self.refit, self.guesses = refit, tuple(guesses)
+        # Of a callback that is left out, oc.select gives None.
+        self.refit, self.guesses = refit, tuple(guess for guess in guesses if " None" not in guess)
         self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
         self.model: GaussianModel | None = None
         self.site: Site | None = None
