@@ -89,6 +89,13 @@ def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
     assert done.status == 0 and (kept["power"], kept["neighbours"]) == (3, 8)
 
 
+def test_overrides_behind_cfg_were_unrecognized_arguments():
+    said = knock(
+        COMMANDS["train"].run, "train", ["model=idw", "--cfg", "job", "dataset=own", "model.power=3"]
+    )
+    assert said.status == 0 and {"  power: 3", "  name: own"} < set(said.out)
+
+
 def test_trainer_defaults_in_code_are_those_of_the_configuration():
     trainer = OmegaConf.to_container(compose().trainer)
     del trainer["_target_"]
