@@ -142,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not paths:
         parser.error("name a file or a folder, too")
     if args.draw is not None and (len(paths) > 1 or not args.draw.lower().endswith(".png")):
-        parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
+        parser.error("--draw takes the name of a PNG file, and goes with one file; --no-draw draws none")
     console = Console()
 
     def picture(number: int) -> str | None:

@@ -215,6 +215,16 @@ class Checker:
             return None, None
         return np.atleast_1d(frequency), float(frequency.mean() if carrier is None else carrier)
 
+    def fits_exchanged(self, antennas: int, tones: int) -> bool:
+        """Tell whether frequencies and antennas fit channels with exchanged axes alone."""
+        given = {name: array.shape for name, array in self.raw.arrays.items()}
+
+        def fits(antennas: int, tones: int) -> bool:
+            places = given.get("array_position", (antennas, 3))
+            return given.get("frequency_hz", ()) in ((), (tones,)) and places == (antennas, 3)
+
+        return fits(tones, antennas) and not fits(antennas, tones)
+
     def read_rotation(self, rows: int) -> np.ndarray | None:
         """Return (S, 3, 3) local to world; the identity when the file says nothing."""
         present = self.present("rx_orientation", "rx_rotation")

@@ -119,6 +119,12 @@ def test_a_map_only_where_it_is_asked_for(tmp_path, arrays, capsys):
         assert "--draw takes the name of a PNG file" in capsys.readouterr().err
 
 
+def test_draw_none_was_refused_without_the_option_that_draws_none(capsys):
+    with pytest.raises(SystemExit):
+        main(["a.npz", "--draw", "none"])
+    assert "--no-draw draws none" in capsys.readouterr().err
+
+
 def test_a_file_is_drawn_unless_said_otherwise(tmp_path, arrays, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_own(tmp_path / "hall.npz", arrays)

@@ -89,6 +89,13 @@ def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
     assert done.status == 0 and (kept["power"], kept["neighbours"]) == (3, 8)
 
 
+def test_overrides_behind_cfg_were_unrecognized_arguments():
+    said = knock(
+        COMMANDS["train"].run, "train", ["model=idw", "--cfg", "job", "dataset=own", "model.power=3"]
+    )
+    assert said.status == 0 and {"  power: 3", "  name: own"} < set(said.out)
+
+
 def test_trainer_defaults_in_code_are_those_of_the_configuration():
     trainer = OmegaConf.to_container(compose().trainer)
     del trainer["_target_"]
@@ -109,3 +116,10 @@ def test_the_paper_leaves_nothing_to_auto():
     values = [config.init.name, settings.emission.activation, settings.emission.encoding.kind]
     assert "auto" not in [*values, settings.emission.init_bias, *config.model.effects.values()]
     assert len(config.model.guesses) > 5
+
+
+def test_guesses_of_callbacks_that_are_left_out_were_said():
+    """`densification from step none to none every none`."""
+    given = "paper=gsparc_minute", "callbacks.densify=null", "callbacks.reset=null"
+    whole, without = (build(compose(*options).model).guesses for options in (given[:1], given))
+    assert len(whole) == 11 and len(without) == 7 and not any("None" in guess for guess in [*whole, *without])

@@ -29,6 +29,12 @@ REFUSED = [
     ("evaluate ckpt=absent.ckpt eval_on=vall", "did you mean 'val'"),
     ("evaluate ckpt=absent.ckpt threads=-2", "threads=-2"),
     ("evaluate ckpt=absent.ckpt baselines=[nearst]", "did you mean 'nearest'"),
+    # Lightning's words on lengths of loaders, then a normal fit.
+    (
+        "train model=gp dataset=own dataset.file={file} trainer.overfit_batches=2",
+        "not supported; split.train_count",
+    ),
+    ("train -m model=gp,idw --cfg job", "--cfg shows one job: leave out -m"),
     ("report", "no run is named; say gsparc report RUN..., folders of runs"),
     ("serve ckpt=none.ckpt host=0.0.0.0", "others reach it; set GSPARC_TOKEN, or say token=WORD"),
     ("serve ckpt=none.ckpt host=example.org", "others reach it"),

@@ -145,6 +145,17 @@ def test_a_best_place_was_not_said_to_be_like_others(tmp_path, monkeypatch):
     assert any(told in line for line in done.out)
 
 
+def test_a_single_candidate_was_not_told_apart_from_no_others(tmp_path, monkeypatch):
+    path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
+
+    def with_an_interval(*of, **how):
+        return replace(place_station(*of, **how), between=np.array([[0.4, 0.6, 0.0, 0.2]]))
+
+    monkeypatch.setattr("gsparc.apps.maps.placing.place_station", with_an_interval)
+    done = run("place", f"ckpt={path}", "count=1", "promised=false", "left_out=0", folder=tmp_path / "to")
+    assert any(line.endswith("of the gain 0.0 to 20.0 points") for line in done.out), done
+
+
 def test_a_station_among_others_of_no_known_place_was_no_number_of_metres_away(tmp_path):
     """`place` ended in `TypeError: unsupported format string`."""
     values = dict(np.load(town_file(tmp_path / "town.npz")))

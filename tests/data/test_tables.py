@@ -156,6 +156,12 @@ def test_what_is_said_wins_over_guesses(write, refused):
     assert degrees["latitude"].tolist() == [40, 40] and degrees["rx_height"] == 1.5
 
 
+def test_a_column_that_another_file_lacks_was_refused_without_how_to_leave_it_out(write, refused):
+    """`evaluate` of a model that was trained with dataset.columns.sensitivity_db=sens."""
+    refused("no such column; .*; or say dataset.columns.sensitivity_db=null", parse_table, write(PLAIN),
+            {"sensitivity_db": "sens"})  # fmt: skip
+
+
 def test_long_layout_with_places_in_columns(write):
     text = "x,y,z,rssi,gateway,gateway_x,gateway_y,gateway_z\n"
     text += "1,1,1,-80,g7,9,9,3\n1,1,1,-85,12,0,0,3\n2,1,1,-81,g7,9,9,3\n"

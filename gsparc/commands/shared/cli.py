@@ -61,7 +61,10 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         sys.argv[1:] = add_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
-    given = get_args_parser().parse_known_args(sys.argv[1:])[0]
+    given, rest = get_args_parser().parse_known_args(sys.argv[1:])
+    # Hydra takes overrides in one piece alone, which options would cut.
+    words = given.overrides + [word for word in rest if not word.startswith("-")]
+    sys.argv[1:] = words + [word for word in sys.argv[1:] if word not in words]
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
     interrupts: list[int] = []
@@ -70,6 +73,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         with _noting(interrupts):
             for folder in (given.config_dir, given.config_path):
                 check_yaml(folder)
+            if given.cfg and given.multirun:
+                raise ValueError("--cfg shows one job: leave out -m, and give one value of each setting")
             if given.cfg in ("job", "all"):
                 _show_whole(main)
             else:

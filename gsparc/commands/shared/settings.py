@@ -62,6 +62,9 @@ class RunSettings(Checked):
         trainer = values.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
+        if few := trainer.get("overfit_batches"):  # starts in closed form and refits learn from all rows
+            said = f"trainer.overfit_batches={few}: not supported; split.train_count=32 learns from few rows"
+            raise SettingError(f"{said}, which eval_on=train then scores")
         accelerator = trainer.get("accelerator", "auto")
         kinds = ["auto", "gpu", *_accelerators()] if trainer else [accelerator]
         if accelerator not in kinds:  # Lightning says so, but not where a model takes no steps

@@ -316,6 +316,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
         return (Column(role, value=numbers),)
     hint = suggest_name(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
+    hint += f"; or say dataset.columns.{key}=null"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
 
 

@@ -26,7 +26,7 @@ RENDERED = (  # settings of the model that only rasterized Gaussians have
     "field", "emission", "attenuation", "raster", "response", "confidence", "loss", "optimizer", "refit",
     "keep_best", "steps",
 )  # fmt: skip
-ALONE = "a plain process has all the weight: model=splat is the field alone, and "
+ALONE = "a plain process has all the weight, Gaussians (%s) none: model=splat is the field alone, and "
 ALONE += "model.effects.residual=false leaves the process out"
 REDRAW = "the dataset names its test rows: say split.redraw=true"
 STEPS = "no gradient steps are asked for: say model.steps=auto"
@@ -94,21 +94,18 @@ def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | 
         if judged and not reads.heeds(path):
             why[_instead(path, method, reads, data)].append(text)
     words = "; ".join(f"{', '.join(one)} ({text})" for text, one in why.items())
-    if why or _alone(method):
-        log.warning("%s", f"options without effect here: {words}" if why else ALONE)
+    if why:
+        log.warning("%s", f"options without effect here: {words}")
+    if method.without_process() is not None and not method.count_components():
+        log.warning(ALONE, method.facts()["model/choices"])
     return ", ".join(text for one in why.values() for text in one) or None
-
-
-def _alone(method: Method) -> bool:
-    """Whether the process beside the field has all the weight."""
-    return method.without_process() is not None and not method.count_components()
 
 
 def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str:
     """Why an option has no effect, and what to set instead where that is known."""
     (group, _, name), noted = path.partition("."), reads.noted
     training = group in ("trainer", "callbacks", "dataset") or path == "model.steps"
-    rendered = group == "model" and name.partition(".")[0] in RENDERED
+    rendered = group == "model" and name.partition(".")[0] in RENDERED and not method.takes_weights
     started = method.facts()["model/init"] if group == "init" else None
     # The first that holds is told: from what decides all options to what concerns one.
     reasons = (
@@ -116,7 +113,6 @@ def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str
         (path == "stations", "there is one station"),
         (group == "split" and data.release_split is not None, REDRAW),
         (group == "split", "this split does not use it"),
-        (_alone(method), ALONE),
         (path == "model.steps" and "trainer.max_steps" in noted, "steps of the Trainer win"),
         (training and "trainer" in noted, "this training does not call for it"),
         (training and {"model.steps", "trainer.max_steps"} & noted, STEPS),

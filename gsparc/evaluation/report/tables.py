@@ -174,6 +174,8 @@ def table_of_leads(runs: Sequence[Run]) -> Table:
     columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("told apart", "")]
     figure = heading_of(runs[0].row["figure"])
     note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; told apart: 95 % (Student's t)."
+    if len({run.row["seed"] for run in runs}) == 1 and any("test rows" in str(row[3]) for row in rows):
+        note += " Of one seed: what seeds change is not in the error (seed=0,1,2)."
     return Table("Paired differences", columns, rows, note)
 
 

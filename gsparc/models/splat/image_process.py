@@ -74,11 +74,7 @@ class ImageProcess(LearnedField):
                 self.settings.field.count, self.effects, choices.init,
                 ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
             )  # fmt: skip
-        # Settings of the field count as heeded only where the field has a part in the answer.
-        with heeded.set_apart() as read:
-            report = super().fit(data, fold, context)
-        if not self._is_process_alone:
-            heeded.count_reads(*read)
+        report = super().fit(data, fold, context)  # what it reads decides the weight of Gaussians, too
         spent = dict(self.spent)
         if self._average is not None:
             method = self._average[0]

@@ -53,6 +53,7 @@ log = logging.getLogger(__name__)
 
 THIRDS = 3  # of the rows: one is for validation where few were set apart
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
+ENOUGH = 2  # times the antennas of an array: so many Gaussians give it any vector, and more the same
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
@@ -130,7 +131,8 @@ class LearnedField(Method):
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
-        self.refit, self.guesses = refit, tuple(guesses)
+        # Of a callback that is left out, oc.select gives None.
+        self.refit, self.guesses = refit, tuple(guess for guess in guesses if " None" not in guess)
         self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
         self.model: GaussianModel | None = None
         self.site: Site | None = None
@@ -263,7 +265,7 @@ class LearnedField(Method):
                 InitTask(
                     apply_choices(self.settings, self.choices), self.choices.closed_form, data,
                     stage.fold.train, self._static_receiver(), self._ends.get("tx_position"),
-                    context.seed, folder,
+                    context.seed, folder, budget,
                 )
             )  # fmt: skip
             self._prior = start.prior
@@ -493,6 +495,9 @@ class LearnedField(Method):
         kind = "array process" if self.settings.response.array else "process of images"
         made = f"networks of {hidden} hidden units in {count} Gaussians" if hidden else f"{count} Gaussians"
         made = f"{kind} through {made}" if self.choices.closed_form else made
+        if self.choices.init == "vectors" and not self.steps and self.site is not None:
+            enough = ENOUGH * len(self.site.array_geometry()[0])
+            made += f" ({enough} or more answer alike)" * (count >= enough)
         kept = "all" if self.steps == self.steps_taken else self.steps or "none"
         return made + (
             f", {self.steps_taken} gradient steps, {kept} kept" if self.steps_taken else ", no gradient steps"

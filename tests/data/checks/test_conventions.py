@@ -133,6 +133,21 @@ def test_a_convention_that_cannot_be_is_refused(tmp_path, setting):
         mended_by(tmp_path, channels(), setting)
 
 
+def test_tones_before_antennas_were_refused_without_what_to_say(tmp_path):
+    """`frequency_hz: expected shape () or (K,), here () or (2,), found (16,)`, with `exchange_axes`, too."""
+    clean = channels()
+    turned = clean | {
+        "csi": clean["csi"].swapaxes(1, 2),
+        "mask": np.ones_like(clean["csi"], bool).swapaxes(1, 2),
+    }
+    with pytest.raises(DataError, match=r"say dataset\.exchange_axes=true") as refused:
+        from_arrays(turned)
+    assert len(refused.value.problems) == 1
+    np.testing.assert_array_equal(
+        mended_by(tmp_path, turned, "exchange_axes").target, from_arrays(clean).target
+    )
+
+
 def test_offsets_beside_a_carrier_were_refused():
     clean = channels()
     offsets = clean | {"frequency_hz": clean["frequency_hz"] - 2.44e9, "carrier_hz": np.array(2.44e9)}

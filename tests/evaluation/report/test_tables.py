@@ -202,6 +202,13 @@ def test_an_ablation_by_multirun_had_no_paired_difference(run_dir, tmp_path):
     )
 
 
+def test_settings_were_told_apart_without_a_word_on_the_seed_that_they_share(run_dir, tmp_path):
+    said = "Of one seed: what seeds change is not in the error"
+    for seeds in (1, 2):
+        runs = sweep_of(run_dir, tmp_path / str(seeds), [(29.0, 28.7)] * seeds)
+        assert (said in tables.table_of_leads(runs).markdown()) == (seeds == 1)
+
+
 def test_a_method_without_chance_had_differences_without_error(run_dir, tmp_path):
     """Three seeds of a closed form are one fit: its difference is known as well as its test rows tell it."""
     runs = sweep_of(run_dir, tmp_path, [(29.0, 28.7)] * 3)

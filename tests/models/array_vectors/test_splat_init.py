@@ -118,6 +118,18 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
     assert torch.isfinite(model.fitted_model().emission.weight2).all()
 
 
+def test_a_number_of_gaussians_that_changes_nothing_was_swept_without_a_word(known_campaign, tmp_path):
+    """100 and 500 of them gave the same figures: more than an array needs span the same vectors."""
+    data, fold = known_campaign[0], Fold(np.arange(40), np.arange(0), np.arange(40, 60))
+    few, more, many = (
+        _trained(data, fold, tmp_path, f"model.field.count={n}", steps=0) for n in (20, 40, 160)
+    )
+    query = Query(*_ends(data, fold.test))
+    torch.testing.assert_close(more.predict(query).mean, many.predict(query).mean, rtol=0, atol=2e-3)
+    assert "through 40 Gaussians (32 or more answer alike), no gradient steps" in more.description
+    assert "alike" not in few.description
+
+
 def test_a_closed_form_that_cannot_be_is_refused(known_campaign, tmp_path):
     data, _ = known_campaign
     fold = Fold(np.arange(20), np.arange(20, 24), np.arange(24, 30))
