@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -91,7 +92,11 @@ def _described(kind: type) -> dict[str, str]:
                 r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", inspect.cleandoc(text or ""), re.M
             ):
                 for names, meaning in re.findall(r"^    ([\w, ]+): (.+(?:\n     .+)*)", section, re.M):
-                    found |= dict.fromkeys(re.split(", *", names), " ".join(meaning.split()))
+                    own = dict.fromkeys(re.split(", *", names), " ".join(meaning.split()))
+                    named = re.match(r"see `(\w+)`", meaning)
+                    other = vars(sys.modules[one.__module__]).get(named[1]) if named else None
+                    more = _described(other) if isinstance(other, type) else {}
+                    found |= own | {name: text for name, text in more.items() if name in own}
     return found
 
 

@@ -142,14 +142,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     given_mask = check.read_mask(raw.arrays[measured].shape, of_rows["censored"])
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     named = str(raw.attributes.get("conventions", "")).split()
-    if kind == "csi" and check.fits_exchanged(*values.shape[1:]):
-        if "exchange_axes" in named:
-            named.remove("exchange_axes")
-        else:
-            fits = f"rows of shape {values.shape[1:]} fit frequencies and antennas with their axes exchanged"
-            check.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
-        values, mask = (None if one is None else one.swapaxes(1, 2) for one in (values, mask))
-        assert values is not None
+    if kind == "csi" and check.fits_exchanged(named, *values.shape[1:]):
+        values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
     frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
     # Transposed images: their grid is that of the axes as they will be.
     turned = values.shape[:0:-1] if "transposed" in named else values.shape[1:]
