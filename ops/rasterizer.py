@@ -146,7 +146,9 @@ def rasterize(
     ids: Tensor | None = None,
     backend: str | None = None,
 ) -> Raster:
-    """Render features (N, C) or (B, N, C), real, in one call: `make_plan`, then `composite`; see there.
+    """Render features (N, C) or (B, N, C), real, for each pose: `make_plan`, then `composite`.
+
+    Takes the arguments and raises the errors of both. Gradients reach all tensors but the pose's.
 
     >>> pose, grid = Pose.identity(torch.zeros(3)), SphereGrid.hemisphere(9, 36)
     >>> means, quats = torch.tensor([[4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])

@@ -90,7 +90,7 @@ def read_yaml(path: Path, missing_message: str, expected: str) -> Mapping[str, A
 
     Args:
         path: of the file.
-        missing, expected: what the message says is wanted where there is no file, or no table in it.
+        missing_message, expected: what the message says is wanted where there is no file, or no table in it.
 
     Raises:
         DataError: missing, not readable, or no table.

@@ -98,7 +98,7 @@ def predict_file(
     write_answers(path, queries, predictions, site.kind, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
-        "predict/far_outside_and_margin": int(far.sum()),
+        "predict/far_outside": int(far.sum()),
         "predict/stations": len(np.unique(predictions.names.get("station", ()))),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,

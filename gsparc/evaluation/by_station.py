@@ -30,8 +30,8 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     """Return the share of places, with rows of two stations or more, whose measured strongest is predicted.
 
-    What was not heard counts as weaker than all that was. Stations predicted alike share a place, so that
-    the order of rows does not count. Empty without such places.
+    What was not heard counts as weaker than all that was. Of k stations tied as predicted strongest a right
+    one counts 1 / k. Empty without such places.
     """
     if data.station is None:
         return {}

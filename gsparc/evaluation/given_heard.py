@@ -16,7 +16,7 @@ from gsparc.processes.censored import truncated_moments
 
 NEAREST = 30  # silent rows of a station
 DRAWS = 100  # of the levels of all that may be listed
-FARTHEST = -8.0  # deviations that a level moves by: one that says it is farther below is wrong
+FARTHEST = -8.0  # deviations below its limit that a predicted level is clamped at
 
 
 def levels_given_heard(

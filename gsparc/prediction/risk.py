@@ -431,7 +431,7 @@ def run_trials(
 
     Args:
         evidence: positions the method did not learn from.
-        promise: what every threshold promises.
+        guarantee: what every threshold promises.
         how: `random` or `spatial` division.
         draws: calibration sets.
         kind: a confidence, or `auto`: the best on the positions set aside for choosing.

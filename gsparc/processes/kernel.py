@@ -235,7 +235,7 @@ class Kernel(Stored):
     True
 
     Attributes:
-        terms: signals whose shares sum to 1, several of distance alone or one; then `WhiteNoise`.
+        terms: several `Stationary`, or one of any kind, whose shares sum to 1; then `WhiteNoise`.
         amplitude: variance of a value without noise.
     """
 
@@ -323,7 +323,7 @@ class Kernel(Stored):
         return sum(others, first)
 
     def gram(self, places: Tensor) -> Tensor:
-        """Return correlations (n, n) with noise of places (n, D) [m]."""
+        """Return correlations (n, n) with noise of places (n, D) [m]; times `amplitude`: covariances."""
         result = self.correlations(places, places)
         result.diagonal().add_(self.noise)
         return result
@@ -335,7 +335,9 @@ class Kernel(Stored):
         return torch.cat([*signals, shares[:-1] - shares[-1], noise])
 
     def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
-        """Return bounds of the parameters, for rows at distances (...) [m], or at places (n, D).
+        """Return bounds of the parameters, in their order.
+
+        Takes distances (...) [m] of the rows where terms depend on these alone, else their places (n, D) [m].
 
         >>> [round(low, 2) for low, _ in Kernel.from_length(1.0, 1.0).bounds(torch.tensor([10.0]))]
         [-4.61, -13.82]

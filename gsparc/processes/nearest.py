@@ -220,9 +220,9 @@ def condition_on_nearest(
         prior: see there.
         values: at least one place.
         seed: of rows that weigh the mean law.
-        more: pseudo-values of other places, whose variances beyond the noise are `extra` (m,).
-        extra: see `more`.
-        most: neighbours of a place.
+        pseudo_values: of other places.
+        pseudo_variance: (m,) their variances beyond the noise, of the amplitude.
+        neighbours: of a place.
     """
     # The mean of n measurements has an n-th of their noise.
     noise, every = prior.kernel.noise / values.count, values

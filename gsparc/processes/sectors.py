@@ -2,7 +2,9 @@
 
 Places (n, 7) are of the moving end, of the station [m], and the station's number. The pattern is that of 3GPP
 TR 36.814, table A.2.1.1-2:
-`-min(min(12 (azimuth / width)^2, floor) + min(12 (elevation / height)^2, 20), floor)`.
+`-min(min(12 (azimuth / width)^2, floor) + min(12 (elevation / height)^2, 20), floor)`, of angles [deg] from
+the azimuth, clockwise from north, and from the tilt, positive downwards. Widths lie between 3 dB points;
+`floor` (A_m there) starts at 25 dB and is learned, 20 dB (SLA_v) is fixed.
 """
 
 from __future__ import annotations
@@ -94,7 +96,13 @@ class Sectors(Trend):
         return level - bend * decades.square() - self.pattern_loss(places, shared, own)
 
     def pattern_loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
-        """Return what patterns take off (..., n) [dB]; see `powers_at`."""
+        """Return what patterns take off (..., n) [dB]; see `powers_at`.
+
+        >>> north = Sectors(0.0, table=torch.tensor([[0.0, 0.0, 70.0, 10.0, 0.0]]))
+        >>> aside_and_behind = torch.tensor([[0.5736, 0.8192, 0, 0, 0, 0, 0], [0.0, -1, 0, 0, 0, 0, 0]])
+        >>> north.pattern_loss(aside_and_behind).float()  # 35 degrees aside
+        tensor([ 2.9999, 25.0000])
+        """
         azimuth, tilt, width, height, _ = self.table[sector_of(places).long()].T
         shared = self.shared if shared is None else shared
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]

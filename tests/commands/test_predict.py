@@ -156,7 +156,7 @@ def test_every_station_of_every_place(town, tmp_path):
     for number, name in enumerate(NAMES):
         expected = town.select_station(str(name)).rssi(rx=place)[:, 0]
         assert np.allclose(level[:, number], expected, atol=1e-4)
-    assert facts["predict/predictions"] == 21 and facts["predict/far_outside_and_margin"] == 0
+    assert facts["predict/predictions"] == 21 and facts["predict/far_outside"] == 0
 
 
 def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
@@ -318,7 +318,7 @@ def test_where_the_answers_go(town, tmp_path):
 
 def test_places_far_outside_are_counted(town, tmp_path, caplog):
     file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5], [21, 5, 1.5], [5, 500, 1.5], [5, 5, 90]])
-    assert predict_file(town, file)["predict/far_outside_and_margin"] == 2
+    assert predict_file(town, file)["predict/far_outside"] == 2
     assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
 
 

@@ -258,7 +258,7 @@ def _fit_blend(
 def _best_share(error: np.ndarray, difference: np.ndarray, excess: np.ndarray, rows_per_unit: float) -> float:
     """Share of the way from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
 
-    So many rows as are `rows_per_unit` count as one.
+    Count `rows_per_unit` rows as one.
     """
     noise = rows_per_unit * max(float((error**2).mean()), TINY)
     square = max(float(difference @ difference - excess.sum()), 0.0)
