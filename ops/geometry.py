@@ -100,7 +100,7 @@ WIDEST_GRID = 32767
 class SphereGrid:
     """Directions on the receiver's sphere; row i and column j are pixel *centres*.
 
-    Elevation is `atan2(z, hypot(x, y))` in [-pi/2, pi/2], azimuth `atan2(y, x)` from any first one on,
+    Elevation is `atan2(z, hypot(x, y))` in [-pi/2, pi/2], azimuth `atan2(y, x)` up to whole turns,
     both in the receiver's local frame (boresight z).
 
     >>> SphereGrid.hemisphere(2, 8).elevations().rad2deg()
