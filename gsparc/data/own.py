@@ -142,7 +142,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     given_mask = check.read_mask(raw.arrays[measured].shape, of_rows["censored"])
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     named = str(raw.attributes.get("conventions", "")).split()
-    if kind == "csi" and check.fits_exchanged(named, *values.shape[1:]):
+    if kind == "csi" and check.fits_exchanged(*values.shape[1:]):
+        named = check.accept_exchange(named, values.shape[1:])
         values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
     frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
     # Transposed images: their grid is that of the axes as they will be.

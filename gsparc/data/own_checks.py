@@ -215,25 +215,22 @@ class Checker:
             return None, None
         return np.atleast_1d(frequency), float(frequency.mean() if carrier is None else carrier)
 
-    def fits_exchanged(self, named: list[str], antennas: int, tones: int) -> bool:
-        """Tell whether frequencies and antennas fit channels with exchanged axes alone.
-
-        `exchange_axes` is taken from the conventions that are `named`; without it this is a problem.
-        """
+    def fits_exchanged(self, antennas: int, tones: int) -> bool:
+        """Tell whether frequencies and antennas fit channels with exchanged axes alone."""
         given = {name: array.shape for name, array in self.raw.arrays.items()}
 
         def fits(antennas: int, tones: int) -> bool:
             places = given.get("array_position", (antennas, 3))
             return given.get("frequency_hz", ()) in ((), (tones,)) and places == (antennas, 3)
 
-        if fits(antennas, tones) or not fits(tones, antennas):
-            return False
-        if "exchange_axes" in named:
-            named.remove("exchange_axes")
-        else:
-            shape = f"rows of shape {(antennas, tones)} fit frequencies and antennas"
-            self.refuse("csi", f"{shape} with their axes exchanged; say dataset.exchange_axes=true")
-        return True
+        return fits(tones, antennas) and not fits(antennas, tones)
+
+    def accept_exchange(self, named: list[str], shape: tuple[int, ...]) -> list[str]:
+        """Return conventions without `exchange_axes`, which is done; a problem where it is not named."""
+        if "exchange_axes" not in named:
+            fits = f"rows of shape {shape} fit frequencies and antennas with their axes exchanged"
+            self.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
+        return [one for one in named if one != "exchange_axes"]
 
     def read_rotation(self, rows: int) -> np.ndarray | None:
         """Return (S, 3, 3) local to world; the identity when the file says nothing."""

@@ -57,7 +57,7 @@ def levels_given_heard(
             limit = np.maximum(others[at], level[rows].min())
         above = torch.from_numpy((mean_db[at, None] - limit) / spread_db[at, None]).clamp_min(FARTHEST)
         chance[at] = torch.special.ndtr(above).mean(1)
-        # Each limit counts by how probable it makes the list. Above 0 is a mirror image.
+        # Each limit counts by how probable it makes that the row is heard.
         weight = torch.softmax(torch.special.log_ndtr(above), 1)
         shift, lost = truncated_moments(above)
         middle = (weight * shift).sum(1)

@@ -21,7 +21,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
     `interval/width_db` its mean width; beside silent rows that of levels given that they are heard, which
-    exceed the others by `listed_above_db`. Where powers may be too weak to be heard or listed, `outage/rate`
+    exceed the others by `heard_above_db`. Where powers may be too weak to be heard or listed, `outage/rate`
     is the share of rows that were, `outage/brier` the mean square of (predicted probability - what
     happened), 0 when perfect, and `outage/brier_rate` what always saying the rate gives.
     """
@@ -45,7 +45,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         figures |= {"interval/coverage_90": float((error <= half).mean())}
         figures |= {"interval/width_db": float(2 * half.mean())}
         figures |= {CALIBRATION: float(np.mean((error / spread) ** 2))}
-        figures |= {"listed_above_db": float((middle - mean_db[heard]).mean())} if given else {}
+        figures |= {"heard_above_db": float((middle - mean_db[heard]).mean())} if given else {}
     chance = scores.samples.get("heard_share", scores.variance * np.nan)[known]
     limited = np.isfinite(chance)
     if not limited.any():  # all of them are of stations that heard everything

@@ -165,7 +165,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     chi2[str(facts.get("model/label"))] = facts.get(f"{prefix}/{CALIBRATION}")
     wrong = wrong_deviations(chi2, main_figure(facts, prefix))
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
-    if above := facts.get(f"{prefix}/listed_above_db"):
+    if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(f"{GIVEN_HEARD}; levels of maps and predict are {above:.1f} dB lower in the mean")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [LINE.format(of_what=folds, cost=facts["time/cost"])] if facts.get("time/cost") else []

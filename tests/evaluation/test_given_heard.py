@@ -62,7 +62,7 @@ def test_heard_rows_beside_silent_ones_were_judged_by_levels_heard_or_not():
         method, 1.0, data, Split("drive", folds, hash_indices(folds)), baselines=["kriging"], timed=False
     )
     facts = found.facts
-    assert 0.2 < facts["test/outage/rate"] < 0.8 and facts["test/listed_above_db"] > 2
+    assert 0.2 < facts["test/outage/rate"] < 0.8 and facts["test/heard_above_db"] > 2
     assert facts["test/rmse_db"] < facts["baseline/kriging/rmse_db"]
     assert 0.8 < facts["test/reduced_chi2"] < 1.25 and 0.86 < facts["test/interval/coverage_90"] < 0.94
     assert any("given that they are heard" in line for line in remarks(facts))

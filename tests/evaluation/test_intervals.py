@@ -47,7 +47,7 @@ def test_a_true_law_is_calibrated(drawn):
     # Heard rows are the upper part of their laws, by whose moments they are judged.
     assert 0.7 < found["interval/width_db"] / (2 * 1.645 * 6) < 0.8
     assert 0.88 < found["interval/coverage_90"] < 0.93
-    assert found["reduced_chi2"] == pytest.approx(1, abs=0.05) and found["listed_above_db"] > 2.5
+    assert found["reduced_chi2"] == pytest.approx(1, abs=0.05) and found["heard_above_db"] > 2.5
 
 
 def test_too_sure_and_too_unsure_are_told_apart(drawn):
@@ -129,7 +129,7 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
         Kriging(), silent, data.subset(row), 10 * np.log10(mean), np.full(len(row), 3.0)
     )
     scores = Scores("rssi", 0 * row, row, {"prediction": mean} | given, np.full(len(row), np.nan), spread)
-    figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "listed_above_db"}
+    figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "heard_above_db"}
     assert set(power_intervals(scores, data)) == figures
 
 
