@@ -1,5 +1,6 @@
-"""Lightning callbacks: densify and prune, opacity reset, checkpoint, cost ledger, pictures."""
+"""Lightning callbacks: densify and prune, bounds, opacity reset, checkpoint, cost ledger, pictures."""
 
+from gsparc.callbacks.bounds import Bounds
 from gsparc.callbacks.checkpoint import Checkpoint
 from gsparc.callbacks.densify import Densify
 from gsparc.callbacks.ledger import CostLedger
@@ -7,4 +8,4 @@ from gsparc.callbacks.pictures import Pictures
 from gsparc.callbacks.progress import StepProgress
 from gsparc.callbacks.reset import OpacityReset
 
-__all__ = ["Checkpoint", "CostLedger", "Densify", "OpacityReset", "Pictures", "StepProgress"]
+__all__ = ["Bounds", "Checkpoint", "CostLedger", "Densify", "OpacityReset", "Pictures", "StepProgress"]

@@ -43,7 +43,10 @@ class Densify(Checked, L.Callback):
         size_share: Gaussians up to this share of the scene radius are cloned, larger ones split.
         children: number N of children of a split; their scale is the parent's / (0.8 N).
         min_opacity: prune below this opacity.
-        max_radius: prune above this footprint radius [px]; null never does.
+        max_radius: prune above this footprint radius [px], from step `radius_from` on; null never does.
+        radius_from: first step that prunes by radius.
+        max_size_share: prune where the largest standard deviation is above this share of the scene's
+            diagonal; null never does.
         max_gaussians: never more than this many.
         min_gaussians: pruning stops at this many, the most opaque stay.
     """
@@ -57,10 +60,14 @@ class Densify(Checked, L.Callback):
     children: int = setting(2, whole(2))
     min_opacity: float = 0.005
     max_radius: float | None = setting(None, or_null(POSITIVE))
+    radius_from: int = setting(0, whole(0))
+    max_size_share: float | None = setting(None, or_null(POSITIVE))
     max_gaussians: int = setting(100_000, whole(1))
     min_gaussians: int = setting(16, whole(0))
     statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
+    _is_full: bool = field(default=False, init=False, repr=False)  # the last edit had more to add than room
+    _said_full: bool = field(default=False, init=False, repr=False)
 
     def _zero_statistics(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)
@@ -69,11 +76,11 @@ class Densify(Checked, L.Callback):
 
     def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
-        if module.rendered is None or module.rendered.raster is None:
+        if module.rendered is None or module.global_step >= to_steps(self.stop, module.total_steps):
             return
-        if module.global_step >= to_steps(self.stop, module.total_steps):
+        raster = module.rendered.raster or module.model.raster_of_weights(module.rendered, module.batch.rx)
+        if raster is None:
             return
-        raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
             self.statistics = self._zero_statistics(module.model)
         gradient = raster.means2d.grad
@@ -104,7 +111,7 @@ class Densify(Checked, L.Callback):
         with torch.no_grad():
             # Draws are a pure function of (seed, step): a resumed run makes the same children.
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
-            planned = self.plan(model, draws, in_place=module.solved)
+            planned = self.plan(model, draws, in_place=module.solved, by_radius=step >= self.radius_from)
             before = len(model.gaussians)
             solved = solve_readout(model, planned, batch) if module.solved else None
             change = 0.0 if solved is None else float(process_sum(solved.change)) ** 0.5
@@ -119,8 +126,14 @@ class Densify(Checked, L.Callback):
                 model.emission.bias2.copy_(solved.bias)
             self.statistics = self._zero_statistics(model)
         _log_edit(trainer, module, planned, before, step)
+        if self._is_full and not self._said_full:
+            text = "no room for more Gaussians since step %d: callbacks.densify.max_gaussians=%d"
+            log.info(text, step, self.max_gaussians)
+            self._said_full = True
 
-    def plan(self, model: GaussianModel, generator: torch.Generator, in_place: bool = False) -> edit.Edit:
+    def plan(
+        self, model: GaussianModel, generator: torch.Generator, in_place: bool = False, by_radius: bool = True
+    ) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far.
 
         Args:
@@ -128,6 +141,7 @@ class Densify(Checked, L.Callback):
             generator: of the places of children.
             in_place: children stay where the parent was, as large, and let through together what it did, so
                 that the field renders as before: for emissions that were solved for it.
+            by_radius: whether large footprints are removed.
         """
         gaussians = model.gaussians
         # Over the rows that saw it: a sum would grow with how often a Gaussian is in view.
@@ -138,14 +152,18 @@ class Densify(Checked, L.Callback):
         large = size > self.size_share * scene_radius
 
         prune = gaussians.opacities < self.min_opacity
-        if self.max_radius is not None:
+        if self.max_radius is not None and by_radius:
             prune |= self.statistics["radius"] > self.max_radius
+        if self.max_size_share is not None:
+            prune |= size > self.max_size_share * 2 * scene_radius
         prune = self._limit_pruning(prune, gaussians.opacities)
 
         room = max(self.max_gaussians - int((~prune).sum()), 0)
         # A split removes its parent, a clone leaves it there.
         cost = torch.where(large | in_place, self.children - 1, 1)
-        chosen = self._choose_within_room(under_reconstructed & ~prune, mean_gradient, cost, room)
+        wanted = under_reconstructed & ~prune
+        chosen = self._choose_within_room(wanted, mean_gradient, cost, room)
+        self._is_full = bool((wanted & ~chosen).any())
         clone, split = (chosen & ~large, chosen & large) if not in_place else (chosen & False, chosen)
         clones = clone.nonzero().squeeze(1)
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)

@@ -25,11 +25,13 @@ class Figure:
     better: Literal["larger", "smaller", "ratio"] = "larger"
 
 
-# SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default.
+# SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default; the first also of
+# images continued by zeros, as in the paper's tables.
 FIGURES = {
     "psnr_db": Figure("PSNR dB", ".2f"),
     "ssim_gauss": Figure("SSIM (Gauss 11)"),
     "ssim": Figure("SSIM (uniform 7)"),
+    "ssim_padded": Figure("SSIM (Gauss 11, zero padded)"),
     "mse": Figure("MSE", ".3g", "ratio"),
     "mae": Figure("MAE", ".3g", "smaller"),
     "nmse": Figure("NMSE", ".3g", "ratio"),

@@ -13,7 +13,8 @@ from gsparc.data.limits import Checked, choice, number, setting, whole
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops.transforms import full_precision
 
-ACTIVATIONS = ("auto", "sigmoid", "softplus", "linear")
+ACTIVATIONS = ("auto", "sigmoid", "signed_sigmoid", "softplus", "linear")
+LEAK = 0.01  # slope of `leaky_relu` below 0
 EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities
 
 
@@ -24,8 +25,9 @@ class EmissionSettings(Checked):
     Attributes:
         encoding: how the moving end's position enters.
         hidden: hidden units; 0 makes the network linear in the encoding.
-        activation: of the output: `sigmoid` (powers in (0, 1), carries the log-distance term),
-            `softplus` (powers without a ceiling) or `linear` (signed CSI).
+        rectifier: of the hidden units: `relu`, or `leaky_relu` of slope .01 below 0.
+        activation: of the output: `sigmoid` (in (0, 1), carries the log-distance term), `signed_sigmoid`
+            (twice that less 1, in (-1, 1)), `softplus` (powers without a ceiling) or `linear` (signed CSI).
         log_distance: subtract log d_i before the sigmoid (eq. 1 of the paper).
         init_scale: standard deviation of the last layer's initial weights.
         init_bias: initial bias of the output, in units of the activation's input; `auto` lets all
@@ -34,7 +36,10 @@ class EmissionSettings(Checked):
 
     encoding: EncodingSettings = field(default_factory=EncodingSettings)
     hidden: int = setting(0, whole(0))
-    activation: Literal["auto", "sigmoid", "softplus", "linear"] = setting("auto", choice(*ACTIVATIONS))
+    rectifier: Literal["relu", "leaky_relu"] = setting("relu", choice("relu", "leaky_relu"))
+    activation: Literal["auto", "sigmoid", "signed_sigmoid", "softplus", "linear"] = setting(
+        "auto", choice(*ACTIVATIONS)
+    )
     log_distance: bool = False
     init_scale: float = setting(0.1, number(0))
     init_bias: float | Literal["auto"] = "auto"
@@ -56,10 +61,10 @@ class Emission(nn.Module):
         self, settings: EmissionSettings, count: int, channels: int, encoding: PositionEncoding
     ) -> None:
         super().__init__()
-        if settings.log_distance and settings.activation != "sigmoid":
+        if settings.log_distance and settings.activation not in ("sigmoid", "signed_sigmoid"):
             raise ValueError(
-                f"model.emission.log_distance=true needs activation=sigmoid, got {settings.activation!r}: "
-                "a signed or unbounded output has no logarithm to shift"
+                f"model.emission.log_distance=true needs activation=sigmoid or signed_sigmoid, got "
+                f"{settings.activation!r}: an unbounded output has no logarithm to shift"
             )
         self.settings = settings
         self.channels = channels
@@ -83,7 +88,9 @@ class Emission(nn.Module):
 
     @full_precision
     def _networks(self, encoded: Tensor) -> Tensor:
-        inner = torch.relu(_shared_product(encoded, self.weight1) + self.bias1)
+        inner = _shared_product(encoded, self.weight1) + self.bias1
+        leak = LEAK if self.settings.rectifier == "leaky_relu" else 0.0
+        inner = nn.functional.leaky_relu(inner, leak)
         return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
 
     def forward(self, position: Tensor, distance: Tensor) -> Tensor:
@@ -91,8 +98,9 @@ class Emission(nn.Module):
         logits = self.logits(position)
         if self.settings.log_distance:
             logits = logits.sub_(distance.log().unsqueeze(-1))
-        if self.settings.activation == "sigmoid":
-            return logits.sigmoid_()
+        if self.settings.activation in ("sigmoid", "signed_sigmoid"):
+            bounded = logits.sigmoid_()
+            return bounded if self.settings.activation == "sigmoid" else 2 * bounded - 1
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
 
     def to_logits(self, emission: Tensor, distance: Tensor) -> Tensor:

@@ -41,7 +41,7 @@ class FrozenView:
             StalePlan: the field has changed since.
         """
         _check_version(self.version, model)
-        image = self.plan.render_visible(self.visible.emissions(tx, rx)).squeeze(1)
+        image = model.to_spectra(self.plan.render_visible(self.visible.emissions(tx, rx)))
         return Rendered(image, None, self.visible.unknown_shares(tx, rx))
 
 

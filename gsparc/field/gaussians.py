@@ -23,18 +23,21 @@ class FieldSettings(Checked):
 
     Attributes:
         count: initial number of Gaussians N.
-        placement: `uniform` in the scene box enlarged by `margin` (the paper), or `sphere`: evenly spread
-            directions around the static receiver at distances between `near` and `far`. `auto` is settled by
-            the group `init` (`gsparc.models.splat.auto_settings`).
+        placement: `uniform` in the scene box enlarged by `margin` (the paper), `grid`, every `spacing` there
+            (the authors' program), or `sphere`: evenly spread directions around the static receiver at
+            distances between `near` and `far`. `auto` is settled by the group `init`
+            (`gsparc.models.splat.auto_settings`).
         margin: enlargement of the box on each side [m].
+        spacing: of `grid` [m], which makes as many Gaussians as fit, whatever `count`.
         near, far: range of distances of `sphere` [m].
         opacity: initial opacity in (0, 1).
         scale: initial standard deviation [m]; null takes the spacing between neighbours.
     """
 
     count: int = setting(500, whole(0))
-    placement: Literal["auto", "uniform", "sphere"] = internal("auto")
+    placement: Literal["auto", "uniform", "grid", "sphere"] = internal("auto")
     margin: float = setting(2.0, number(0))
+    spacing: float = setting(0.3, POSITIVE)
     near: float = setting(1.0, number(0))
     far: float = setting(6.0, POSITIVE)
     opacity: float = setting(0.3, SHARE)
@@ -95,6 +98,18 @@ class GaussianField(nn.Module):
         return torch.sigmoid(self.opacity_logits)
 
 
+MOST_IN_GRID = 1_000_000  # Gaussians; networks of more need gigabytes
+
+
+def check_grid(counts: Tensor, spacing: float) -> None:
+    """Raise `ValueError`, which says what to set, where a grid of counts (3,) has more than a million."""
+    if (total := int(counts.prod())) > MOST_IN_GRID:
+        raise ValueError(
+            f"model.field.spacing={spacing:g} m makes {total:,} Gaussians of this box; at most "
+            f"{MOST_IN_GRID:,}: raise model.field.spacing"
+        )
+
+
 def create_field(
     settings: FieldSettings, box: Tensor, receiver: Tensor | None, rotation: Tensor | None
 ) -> GaussianField:
@@ -110,6 +125,14 @@ def create_field(
         ValueError: `sphere` without a static receiver, or nothing settled.
     """
     count = settings.count
+    if settings.placement == "grid":
+        low, high = box[0] - settings.margin, box[1] + settings.margin
+        counts = ((high - low) / settings.spacing).long().clamp_min(1)
+        check_grid(counts, settings.spacing)
+        axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(low, high, counts, strict=True)]
+        means = torch.cartesian_prod(*axes)
+        scales = torch.full((len(means), 3), float(settings.scale or settings.spacing))
+        return GaussianField(means, scales, settings.opacity)
     if settings.placement == "uniform":
         low, high = box[0] - settings.margin, box[1] + settings.margin
         means = low + (high - low) * torch.rand(count, 3)
@@ -118,7 +141,7 @@ def create_field(
         scales = torch.full((count, 3), float(settings.scale or spacing / 2))
         return GaussianField(means, scales, settings.opacity)
     if settings.placement != "sphere":
-        raise ValueError(f"placement={settings.placement!r} is not settled: choose uniform or sphere")
+        raise ValueError(f"placement={settings.placement!r} is not settled: choose uniform, grid or sphere")
     if receiver is None or rotation is None:
         raise ValueError("init=sphere needs a static receiver; here it moves: use init=uniform")
     step = torch.arange(count) + 0.5

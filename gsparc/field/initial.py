@@ -21,7 +21,17 @@ Snapshot = Literal["none", "phase", "phase_timing"]  # what every channel snapsh
 
 
 InitName = Literal[
-    "auto", "sphere", "uniform", "images", "vectors", "sources", "rays", "bearings", "diffuse", "scene"
+    "auto",
+    "sphere",
+    "uniform",
+    "grid",
+    "images",
+    "vectors",
+    "sources",
+    "rays",
+    "bearings",
+    "diffuse",
+    "scene",
 ]
 
 
@@ -30,11 +40,11 @@ class InitSettings(Checked):
     """Where a field's Gaussians come from; one instance of the config group `init`.
 
     Attributes:
-        name: `sphere` around a static receiver and `uniform` in the scene box with random weights; `images`,
-            the sphere with weights fitted to spectra; `vectors`, the same through an array whose phases are
-            retrieved; `sources`, image sources searched for; `rays`, where measured directions meet;
-            `bearings`, where those of a moving array cross; `scene`, mirror images in known walls; `diffuse`,
-            nowhere: the residual alone.
+        name: `sphere` around a static receiver, `uniform` and `grid` in the scene box, with random weights;
+            `images`, the sphere with weights fitted to spectra; `vectors`, the same through an array whose
+            phases are retrieved; `sources`, image sources searched for; `rays`, where measured directions
+            meet; `bearings`, where those of a moving array cross; `scene`, mirror images in known walls;
+            `diffuse`, nowhere: the residual alone.
         file: of the walls, for `scene`.
         searches: of sources: how many, with different seeds; all are kept and averaged.
         search_rows, rows: receivers times tones of a search, and of the final weights.

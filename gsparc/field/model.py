@@ -17,11 +17,13 @@ from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel
 from gsparc.field.emission import Emission, EmissionSettings
 from gsparc.field.encoding import PositionEncoding, Prior, unknown_share
 from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
-from gsparc.field.response import ArrayResponse, ChannelResponse, ResponseSettings
+from gsparc.field.response import ArrayResponse, ChannelResponse, MeanResponse, ResponseSettings
 from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
+from gsparc.ops.geometry import Gaussians
 from gsparc.ops.transforms import full_precision
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
+DARK = 1e-20  # least squared modulus of a pixel
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,13 @@ class Rendered:
         raster: of spectra; densification reads its gradients.
         unknown: (B,) in [0, 1], the share of the field's variance that training positions leave unknown; None
             where features do not tell.
+        weights: (P, N), mean over directions of alpha T, of channels that are means of an image.
     """
 
     mean: Tensor
     raster: Raster | None
     unknown: Tensor | None = None
+    weights: Tensor | None = None
 
 
 class GaussianModel(nn.Module):
@@ -115,7 +119,8 @@ class GaussianModel(nn.Module):
         shape: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
-        signed = site.kind == "csi" or settings.response.array
+        averaged = site.kind == "csi" and settings.response.channel == "mean"
+        signed = (site.kind == "csi" and not averaged) or settings.response.array
         if signed and settings.emission.activation != "linear":
             what = "channels are signed" if site.kind == "csi" else "fields at an array are signed"
             raise ValueError(
@@ -123,6 +128,7 @@ class GaussianModel(nn.Module):
             )
         self.settings = settings
         self.site = site
+        self.shape = shape or (1, 1)
         box, query_box = torch.as_tensor(site.box).float(), torch.as_tensor(site.query_box)
         self.gaussians: GaussianField = create_field(
             settings.field,
@@ -147,16 +153,18 @@ class GaussianModel(nn.Module):
         # Without the law the gain is a parameter all the same, so that state dicts have one shape.
         law = law if law.inverse_distance else AttenuationSettings()
         self.log_gain = nn.Parameter(torch.tensor(math.log(law.gain)), requires_grad=law.learn_gain)
-        self.response = self._response(*(shape or (1, 1)), transmitter)
+        self.response = self._response(*self.shape, transmitter)
 
     def _response(
         self, antennas: int, subcarriers: int, transmitter: Tensor | None
-    ) -> ArrayResponse | ChannelResponse | None:
+    ) -> ArrayResponse | ChannelResponse | MeanResponse | None:
         site, settings, means = self.site, self.settings.response, self.gaussians.means.detach()
         if settings.array:
             return ArrayResponse(site, settings.pattern)
         if site.kind != "csi":
             return None
+        if settings.channel == "mean":
+            return MeanResponse(antennas, subcarriers)
         middle = torch.as_tensor(site.box).float().mean(0)
         lengths = (means - middle).norm(dim=1)
         if transmitter is not None:
@@ -166,8 +174,12 @@ class GaussianModel(nn.Module):
 
     @property
     def channels(self) -> int:
-        """Real outputs of each emission network: one power, or one complex gain."""
-        return 2 if self.site.kind == "csi" or self.settings.response.array else 1
+        """Real outputs of each emission network: one power, one complex gain, or one of each channel."""
+        settings = self.settings.response
+        if self.site.kind == "csi" and settings.channel == "mean":
+            return 2 * math.prod(self.shape)
+        complex_image = self.site.kind == "spectrum" and settings.image != "power"
+        return 2 if self.site.kind == "csi" or settings.array or complex_image else 1
 
     @property
     def tells_unknown(self) -> bool:
@@ -186,6 +198,8 @@ class GaussianModel(nn.Module):
         """Return attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
         distance = self.relative_distances(tx)
         emitted = self.emission(self.site.moving(tx, rx), distance)
+        if self.site.kind == "spectrum" and self.settings.response.image == "real":
+            emitted = emitted[..., :1]  # nothing reads the imaginary part
         attenuation = self.attenuation(distance)
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
 
@@ -205,28 +219,70 @@ class GaussianModel(nn.Module):
         features = self.emissions(tx, rx)
         if self.site.kind == "spectrum":
             raster = self.rasterize(features, rx)
-            image, unknown = raster.image, self.unknown_shares(tx, rx)
-            mean = self.response(image, unknown) if self.response else image.squeeze(1)
-            return Rendered(mean, raster, unknown)
-        weights = ops.mean_weights(self.plan(rx), *self.gaussians.geometry()).share
+            unknown = self.unknown_shares(tx, rx)
+            return Rendered(self.to_spectra(raster.image, unknown), raster, unknown)
+        weights = ops.mean_weights(self.plan(rx), *self.gaussians.geometry())
+        if isinstance(self.response, MeanResponse):
+            if weights.mean.requires_grad:
+                weights.mean.retain_grad()  # densification reads it
+            return Rendered(self.response(weights.mean, features), None, weights=weights.mean)
         if self.response is None:
-            return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
+            return Rendered((weights.share.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
-        return Rendered(self.response(weights * gains), None)
+        return Rendered(self.response(weights.share * gains), None)
 
-    def rasterize(self, features: Tensor, rx: Pose) -> Raster:
-        """Return images of features (B, N, C) from one pose, or each from its own of B."""
-        return ops.rasterize(*self.gaussians.geometry(), features, rx, **self._raster_options())
+    def to_spectra(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:
+        """Return spectra (B, H, W) of composited images (B, C, H, W) and unknown shares (B,)."""
+        if isinstance(self.response, ArrayResponse):
+            return self.response(image, unknown)
+        if self.settings.response.image != "modulus":
+            return image[:, 0]
+        # `vector_norm` over two planes takes seven times as long; where nothing is, the slope is 0, not NaN.
+        return (image[:, 0].square() + image[:, 1].square()).clamp_min(DARK).sqrt()
+
+    def raster_of_weights(self, rendered: Rendered, rx: Pose) -> Raster | None:
+        """Return images whose means the channels are, after a backward pass; None where they are no means.
+
+        `means2d` has the gradient that rendering all channels would have given: that of one image of what the
+        loss asks of each Gaussian's weight.
+        """
+        if rendered.weights is None or rendered.weights.grad is None:
+            return None
+        with torch.enable_grad():
+            raster = self.rasterize(rendered.weights.grad.unsqueeze(-1), rx, detached=True)
+            raster.image.mean((-2, -1)).sum().backward()
+        return raster
+
+    def rasterize(self, features: Tensor, rx: Pose, detached: bool = False) -> Raster:
+        """Return images of features (B, N, C) from one pose, or each from its own of B.
+
+        Args:
+            features, rx: of the image.
+            detached: whether `means2d` alone takes a gradient, and no parameter.
+        """
+        geometry = self.gaussians.geometry()
+        if detached:
+            geometry = Gaussians(*(part.detach().requires_grad_() for part in geometry))
+        return ops.rasterize(*geometry, features, rx, **self._raster_options())
 
     def plan(self, rx: Pose) -> Plan:
         """Return footprints and depth order from one pose, or from each of B."""
         return ops.make_plan(*self.gaussians.geometry(), rx, **self._raster_options())
 
+    @property
+    def grid(self) -> SphereGrid:
+        """Of the site; else the directions that channels are seen from."""
+        if self.site.grid is not None:
+            return self.site.grid
+        if self.settings.response.channel == "mean":  # the paper's hemisphere of one degree
+            return SphereGrid.hemisphere(FULL_SPHERE_ROWS, 4 * FULL_SPHERE_ROWS)
+        return SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
+
     def _raster_options(self) -> dict[str, Any]:
         settings, image = self.settings.raster, self.site.kind == "spectrum"
         least = settings.alpha_cutoff if image else settings.relative_cutoff
         return {
-            "grid": self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS),
+            "grid": self.grid,
             "projection": settings.projection,
             "low_pass": settings.low_pass,
             "compensate": settings.compensate,

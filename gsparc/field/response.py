@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, internal, number, setting
+from gsparc.data.limits import Checked, choice, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering_matrix
@@ -24,7 +25,7 @@ SLOPE_ENDS = 1e-12  # of an unknown share: its square root has a finite slope ab
 
 @dataclass(frozen=True)
 class ResponseSettings(Checked):
-    """Coherent terms of the splatted field; off means not computed.
+    """From rendered Gaussians to targets; a coherent term that is off is not computed.
 
     Attributes:
         array: spectra arise in the static array: complex emissions are composited per direction to z, the
@@ -32,10 +33,33 @@ class ResponseSettings(Checked):
             of the field that training positions leave unknown; where emissions tell none (not started in
             closed form), `|A^H h|` normalised as the dataset is.
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
+        image: what of an image is a spectrum: `power`, of one emission a Gaussian; of complex ones, `modulus`
+            or `real` part.
+        channel: `sources`, gains of Gaussians through their steering and delays (`ChannelResponse`); `mean`,
+            the mean over all directions of an image of emissions, one a channel (paper, eq. 2).
     """
 
     array: bool = internal(False)
     pattern: float = setting(0.0, number(0))
+    image: Literal["power", "modulus", "real"] = setting("power", choice("power", "modulus", "real"))
+    channel: Literal["sources", "mean"] = setting("sources", choice("sources", "mean"))
+
+
+class MeanResponse(nn.Module):
+    """Channels as means over directions of an image: `h = sum_i (mean_u alpha_i T_i) s_i` (paper, eq. 2).
+
+    Args:
+        antennas, subcarriers: A and K; emissions are A K complex numbers of each Gaussian.
+    """
+
+    def __init__(self, antennas: int, subcarriers: int) -> None:
+        super().__init__()
+        self.shape = antennas, subcarriers
+
+    def forward(self, weights: Tensor, features: Tensor) -> Tensor:
+        """Return channels (B, A, K) complex of weights (P, N), P of 1 or B, and emissions (B, N, 2 A K)."""
+        total = torch.bmm(weights.expand(len(features), -1).unsqueeze(1), features)
+        return torch.view_as_complex(total.view(len(features), *self.shape, 2))
 
 
 class ChannelResponse(nn.Module):

@@ -18,8 +18,8 @@ class Choices:
     """What `auto` became; stored in checkpoints, so that a model reads back as it was trained.
 
     Attributes:
-        init: `sphere` or `uniform`, with random weights; `images` or `vectors`, the sphere with weights in
-            closed form.
+        init: `sphere`, `uniform` or `grid`, with random weights; `images` or `vectors`, the sphere with
+            weights in closed form.
         encoding: `kind` of the emission's `EncodingSettings`.
         activation: as in `EmissionSettings`.
         init_bias: as in `EmissionSettings`.
@@ -95,5 +95,5 @@ def apply_choices(settings: ModelSettings, choices: Choices) -> ModelSettings:
     emission = replace(
         settings.emission, encoding=encoding, activation=choices.activation, init_bias=choices.init_bias
     )
-    placement = "uniform" if choices.init == "uniform" else "sphere"
+    placement = choices.init if choices.init in ("uniform", "grid") else "sphere"
     return replace(settings, field=replace(settings.field, placement=placement), emission=emission)
