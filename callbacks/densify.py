@@ -41,10 +41,11 @@ class Densify(Checked, L.Callback):
         grad_threshold: mean screen-space gradient norm [loss per px] above which a Gaussian is
             under-reconstructed; read per sample before summing.
         size_share: Gaussians up to this share of the scene radius are cloned, larger ones split.
-        children: number N of children of a split; their scale is the parent's / (0.8 N).
+        children: number N of children of a split; their scale is the parent's / (`shrink` N).
+        shrink: see `children`.
         min_opacity: prune below this opacity.
         max_radius: prune above this footprint radius [px], from step `radius_from` on; null never does.
-        radius_from: first step that prunes by radius.
+        radius_from: first step that prunes by radius, or its share of all steps.
         max_size_share: prune where the largest standard deviation is above this share of the scene's
             diagonal; null never does.
         max_gaussians: never more than this many.
@@ -58,9 +59,10 @@ class Densify(Checked, L.Callback):
     grad_threshold: float = setting(2e-4, number(0))
     size_share: float = setting(0.01, number(0))
     children: int = setting(2, whole(2))
+    shrink: float = setting(0.8, POSITIVE)
     min_opacity: float = 0.005
     max_radius: float | None = setting(None, or_null(POSITIVE))
-    radius_from: int = setting(0, whole(0))
+    radius_from: int | float = setting(0, STEPS)
     max_size_share: float | None = setting(None, or_null(POSITIVE))
     max_gaussians: int = setting(100_000, whole(1))
     min_gaussians: int = setting(16, whole(0))
@@ -68,6 +70,11 @@ class Densify(Checked, L.Callback):
     _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
     _is_full: bool = field(default=False, init=False, repr=False)  # the last edit had more to add than room
     _said_full: bool = field(default=False, init=False, repr=False)
+
+    @property
+    def state_key(self) -> str:
+        """What its state is stored under: two of them may follow one another."""
+        return f"{type(self).__qualname__} from {self.start}"
 
     def _zero_statistics(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)
@@ -111,7 +118,8 @@ class Densify(Checked, L.Callback):
         with torch.no_grad():
             # Draws are a pure function of (seed, step): a resumed run makes the same children.
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
-            planned = self.plan(model, draws, in_place=module.solved, by_radius=step >= self.radius_from)
+            by_radius = step >= to_steps(self.radius_from, module.total_steps)
+            planned = self.plan(model, draws, in_place=module.solved, by_radius=by_radius)
             before = len(model.gaussians)
             solved = solve_readout(model, planned, batch) if module.solved else None
             change = 0.0 if solved is None else float(process_sum(solved.change)) ** 0.5
@@ -128,7 +136,7 @@ class Densify(Checked, L.Callback):
         _log_edit(trainer, module, planned, before, step)
         if self._is_full and not self._said_full:
             text = "no room for more Gaussians since step %d: callbacks.densify.max_gaussians=%d"
-            log.info(text, step, self.max_gaussians)
+            log.warning(text, step, self.max_gaussians)
             self._said_full = True
 
     def plan(
@@ -175,7 +183,7 @@ class Densify(Checked, L.Callback):
                 ~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(apart, LEAST)}
             )
         # Two children are 1 / 1.6 of their parent, as in B. Kerbl et al., 3D Gaussian splatting (2023).
-        smaller = gaussians.log_scales[splits] - math.log(0.8 * self.children)
+        smaller = gaussians.log_scales[splits] - math.log(self.shrink * self.children)
         scales = torch.cat([gaussians.log_scales[clones], smaller])
         spread = _sample_inside(gaussians.scales[splits], gaussians.quats[splits], generator)
         means = torch.cat([gaussians.means[clones], gaussians.means[splits] + spread])

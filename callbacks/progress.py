@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import lightning.pytorch as L
@@ -15,11 +16,19 @@ SHOWN = {  # all of it fits a terminal of 80 columns
 }
 
 
+TIMED = 50  # steps, after the first, from which the seconds of all are told
+LONG_S = 60.0  # trainings beyond are worth a line
+
+
 class StepProgress(L.Callback):
-    """A rich progress bar over optimiser steps (epochs mean little when data are few)."""
+    """A rich progress bar over optimiser steps (epochs mean little when data are few).
+
+    A line says after some steps how long all take here, where that is over a minute.
+    """
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
+        self._began: tuple[int, float] | None = None  # a step, and when it was done [s]
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Draw the bar, once for all devices."""
@@ -32,6 +41,7 @@ class StepProgress(L.Callback):
             TextColumn("{task.fields[figures]}"),
         )
         self._bar.start()
+        self._began = None
         stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
         self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
 
@@ -42,6 +52,12 @@ class StepProgress(L.Callback):
         task = self._bar.task_ids[0]
         step = trainer.global_step
         self._bar.update(task, completed=step)
+        self._began = self._began or (step, time.perf_counter())
+        if step - self._began[0] == TIMED:
+            each = (time.perf_counter() - self._began[1]) / TIMED
+            if (left := each * (trainer.max_steps - step)) > LONG_S:
+                pace = f"{trainer.max_steps:,} steps, {1000 * each:.0f} ms each here"
+                self._bar.console.print(f"{pace}: about {left / 60:.0f} min to go", highlight=False)
         if step % 20 == 0 or step == trainer.max_steps:
             result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
             figures = [form.format(float(value)) for form, value in result.items() if value is not None]

@@ -48,7 +48,7 @@ from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import all_methods, build, fill_defaults
 from gsparc.training import curve, tracking
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.time_budget import Effort, TimeBudget
 
 log = logging.getLogger(__name__)
 log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
@@ -245,7 +245,10 @@ def _say(config: DictConfig, method: MethodFactory, data: Measurements, split: S
     guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
     limit, folds = method.describe_time_limit(data.site, config.budget_s), len(split.folds)
     each = f", each of {folds} folds" if limit and folds > 1 else ""
-    log.info("%-10s%s", "fitting", f"{method.name}{each}{', ' * bool(limit)}{limit}{guessed}")
+    steps = config.trainer.max_steps
+    how = method.describe_fit(data, Effort().scale_by(config.effort), None if steps == -1 else steps)
+    how = f": {how}" if how else ""
+    log.info("%-10s%s", "fitting", f"{method.name}{how}{each}{', ' * bool(limit)}{limit}{guessed}")
 
 
 def _known_walls(config: DictConfig) -> Any:

@@ -18,7 +18,6 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 
 from gsparc.data.schema import Scored
-from gsparc.field.losses import STABILITY
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +26,7 @@ SMALLEST_UNIT = 1e-140  # beyond it or its inverse squares under- or overflow: f
 SILENCE = 1e-6  # of the true power: a silent prediction is 60 dB off, not infinitely
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
+C1, C2 = 0.01**2, 0.03**2  # of data range 1, Wang et al. 2004
 MEANS = "ssim_gauss", "ssim_padded", "psnr_db", "mse", "mae"
 
 
@@ -292,8 +292,8 @@ def _ssim_padded(prediction: np.ndarray, target: np.ndarray, measured: np.ndarra
     mean_p, mean_t = blur(prediction), blur(target)
     variances = blur(prediction**2) + blur(target**2) - mean_p**2 - mean_t**2
     covariance = blur(prediction * target) - mean_p * mean_t
-    light = (2 * mean_p * mean_t + STABILITY[0]) / (mean_p**2 + mean_t**2 + STABILITY[0])
-    local = light * (2 * covariance + STABILITY[1]) / (variances + STABILITY[1])
+    light = (2 * mean_p * mean_t + C1) / (mean_p**2 + mean_t**2 + C1)
+    local = light * (2 * covariance + C2) / (variances + C2)
     return float(local[measured].mean()) if measured.any() else float("nan")
 
 

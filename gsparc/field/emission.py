@@ -25,24 +25,24 @@ class EmissionSettings(Checked):
     Attributes:
         encoding: how the moving end's position enters.
         hidden: hidden units; 0 makes the network linear in the encoding.
-        rectifier: of the hidden units: `relu`, or `leaky_relu` of slope .01 below 0.
         activation: of the output: `sigmoid` (in (0, 1), carries the log-distance term), `signed_sigmoid`
             (twice that less 1, in (-1, 1)), `softplus` (powers without a ceiling) or `linear` (signed CSI).
         log_distance: subtract log d_i before the sigmoid (eq. 1 of the paper).
         init_scale: standard deviation of the last layer's initial weights.
         init_bias: initial bias of the output, in units of the activation's input; `auto` lets all
             Gaussians together start at unit power where they simply add up (RSSI), else 0.
+        rectifier: of the hidden units: `relu`, or `leaky_relu` of slope .01 below 0.
     """
 
     encoding: EncodingSettings = field(default_factory=EncodingSettings)
     hidden: int = setting(0, whole(0))
-    rectifier: Literal["relu", "leaky_relu"] = setting("relu", choice("relu", "leaky_relu"))
     activation: Literal["auto", "sigmoid", "signed_sigmoid", "softplus", "linear"] = setting(
         "auto", choice(*ACTIVATIONS)
     )
     log_distance: bool = False
     init_scale: float = setting(0.1, number(0))
     init_bias: float | Literal["auto"] = "auto"
+    rectifier: Literal["relu", "leaky_relu"] = setting("relu", choice("relu", "leaky_relu"))
 
 
 class Emission(nn.Module):

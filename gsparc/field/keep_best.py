@@ -65,6 +65,12 @@ class KeepBest(L.Callback):
             return
         trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
         taken = trainer.global_step
+        if module.solved and len(self.start):
+            log.info(
+                "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; with "
+                "experiment=field, from a random start, another loss or callback shows",
+                self.step, len(self.start), float(self.start.mean()), self.error,
+            )  # fmt: skip
         if self.step == taken:
             return
         model = module.model

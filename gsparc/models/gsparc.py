@@ -21,16 +21,18 @@ from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import EffectSettings, resolve_terms
 from gsparc.models.uplink.method import UplinkField
+from gsparc.training.time_budget import Effort
 
 log = logging.getLogger(__name__)
 
 
-def choose(data: Measurements, settings: Gsparc) -> Method:
+def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
     """Return the method of the first row of the table that the measurements call for, and log why.
 
     Args:
         data: measurements; targets are not looked at.
         settings: as configured.
+        quiet: whether nothing is logged, and no setting counts as read.
 
     Returns:
         Unfitted, under the name by which `model=NAME` has it directly.
@@ -78,6 +80,8 @@ def choose(data: Measurements, settings: Gsparc) -> Method:
             options += ["model.effects.image"] * (switches.image is True and site.kind == "csi")
         # Mixtures count it where a candidate hangs on it; powers always have their process.
         options += ["model.effects.residual"] * (rendered or (kind is Channels and plain))
+    if quiet:
+        return method
     heeded.count_reads(*options)
     for reason in reasons:
         log.info("%s", reason)
@@ -111,6 +115,13 @@ class Gsparc(LearnsTogether):
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std, self._field = effects, position_std, field
         self.own_terms = to_terms(terms)
+
+    def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
+        """See `MethodFactory`."""
+        method = choose(data, self, quiet=True)
+        how = method.describe_fit(data, effort, steps) or "in closed form"
+        paper = "; the paper's recipe: paper=gsparc" if data.site.kind != "rssi" else ""
+        return f"{method.name}, {how}{paper}"
 
     def create_for(self, data: Measurements) -> Method:
         """See `MethodFactory`; the log says what was chosen."""

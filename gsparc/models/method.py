@@ -22,6 +22,7 @@ from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.time_budget import Effort
 
 if TYPE_CHECKING:
     from gsparc.processes.powers import PowerProcess
@@ -101,6 +102,19 @@ class MethodFactory(ABC):
     def describe_time_limit(self, site: Site, budget_s: float | None) -> str:
         """Say what ends a fit at a site before all that is counted; "" where nothing does."""
         return "" if budget_s is None else f"within {budget_s:g} s"
+
+    def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
+        """Say how measurements would be learned, before they are; "" where the name says it.
+
+        Args:
+            data: measurements; targets are not looked at.
+            effort: what is counted where nothing else is asked for.
+            steps: of gradient that the Trainer is given; None: it is given none.
+
+        Raises:
+            ValueError: none serves them as configured.
+        """
+        return ""
 
     def learns_jointly(self, site: Site) -> bool:
         """Tell whether it learns several stations of this site at once, told which by `Query.station`."""

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gsparc.callbacks import Densify
+from gsparc.callbacks import Bounds, Densify
 from gsparc.callbacks.densify import _sample_inside
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
@@ -158,3 +158,35 @@ def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
     densify.on_train_batch_start(trainer, module)
     assert seen == [({"densify/removed": 0, "densify/added": 2}, 200)]
     assert "step 200: 0 Gaussians removed or split, 2 added: 10 -> 12" in caplog.text
+
+
+def test_a_cap_that_leaves_no_room_was_not_said(model, caplog):
+    """The ablations started at their cap, and never densified."""
+    densify = with_gradient(
+        Densify(grad_threshold=0.5, size_share=1.0, max_gaussians=10, interval=1, start=0), [2, 7]
+    )
+    module = at(model, 600, 1000)
+    trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[], logger=None)
+    densify.on_train_batch_start(trainer, module)
+    with_gradient(densify, [2])
+    densify.on_train_batch_start(trainer, module)
+    said = [line for line in caplog.messages if "no room" in line]
+    assert said == ["no room for more Gaussians since step 600: callbacks.densify.max_gaussians=10"]
+
+
+def test_large_ones_go_by_size_and_by_radius_from_a_step_on(model):
+    with torch.no_grad():
+        model.gaussians.log_scales[3] = 3.0
+    densify = with_gradient(Densify(max_size_share=0.1, max_radius=5.0, min_gaussians=0), [])
+    densify.statistics["radius"][4] = 6.0
+    assert (~densify.plan(model, draws()).keep).nonzero().flatten().tolist() == [3, 4]
+    assert (~densify.plan(model, draws(), by_radius=False).keep).nonzero().flatten().tolist() == [3]
+
+
+def test_centres_are_held_near_the_scene(model):
+    with torch.no_grad():
+        model.gaussians.means[2] = 100.0
+    Bounds(margin=1.0).on_train_batch_end(None, at(model, 1, 10))
+    high = torch.as_tensor(model.site.box[1]).float() + 1
+    torch.testing.assert_close(model.gaussians.means[2].detach(), high)
+    assert int(model.gaussians.version) == 1

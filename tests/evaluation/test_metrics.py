@@ -210,3 +210,20 @@ def test_what_nothing_was_measured_of_is_not_perfect(kind):
     ):
         for figure in (name, "mse", "mae"):
             assert figures[figure] == pytest.approx(kept[figure]), figure
+
+
+def test_the_authors_similarity_is_of_zero_padded_images():
+    """By a convolution of 11 x 11 with a Gaussian window, as their program has it."""
+    draw = torch.Generator().manual_seed(0)
+    prediction, target = torch.rand(2, 2, 20, 30, generator=draw, dtype=torch.float64)
+    line = torch.exp(-0.5 * ((torch.arange(11) - 5) / 1.5) ** 2).double()
+    window = torch.outer(line / line.sum(), line / line.sum())[None, None]
+    blur = lambda image: torch.nn.functional.conv2d(image[:, None], window, padding=5)[:, 0]  # noqa: E731
+    a, b = blur(prediction), blur(target)
+    aa, bb, ab = blur(prediction**2) - a * a, blur(target**2) - b * b, blur(prediction * target) - a * b
+    local = (2 * a * b + 1e-4) * (2 * ab + 9e-4) / ((a * a + b * b + 1e-4) * (aa + bb + 9e-4))
+    metric = SpectrumMetrics()
+    metric.update(prediction, target)
+    expected = local.mean((1, 2)).numpy()
+    np.testing.assert_allclose(metric.compute()["ssim_padded"], expected, rtol=1e-6)
+    assert metric.summary(metric.compute())["ssim_padded"] == pytest.approx(expected.mean(), rel=1e-6)

@@ -32,7 +32,7 @@ def test_sphere_needs_a_receiver_that_stays():
 
 
 def test_an_unknown_start_is_refused():
-    with pytest.raises(ValueError, match="choose uniform or sphere"):
+    with pytest.raises(ValueError, match="choose uniform, grid or sphere"):
         create_field(FieldSettings(placement="auto"), BOX, RECEIVER, TURN)
 
 
@@ -54,3 +54,12 @@ def test_a_flat_box_still_gives_positive_scales():
     flat = torch.tensor([[0.0, 0, 0], [4, 4, 0]])
     field = create_field(FieldSettings(count=10, placement="uniform", margin=0.0), flat, None, None)
     assert (field.scales > 0).all() and field.log_scales.isfinite().all()
+
+
+def test_a_grid_fills_the_box_and_says_where_it_is_too_fine():
+    box = torch.tensor([[-7.0, -4.0, 0.0], [7.0, 6.0, 4.0]])
+    field = create_field(FieldSettings(placement="grid", margin=0, spacing=0.3), box, None, None)
+    assert len(field) == 46 * 33 * 13 and float(field.scales.max()) == pytest.approx(0.3)
+    assert torch.equal(field.means.amin(0), box[0]) and torch.equal(field.means.amax(0), box[1])
+    with pytest.raises(ValueError, match=r"spacing=0.01 m makes 560,000,000 Gaussians .* raise model.field"):
+        create_field(FieldSettings(placement="grid", margin=0, spacing=0.01), box, None, None)

@@ -7,6 +7,7 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.frozen import freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
+from gsparc.field.response import ResponseSettings
 from gsparc.ops import Pose, StalePlan
 
 RAW = EncodingSettings("raw")
@@ -96,3 +97,48 @@ def test_poses_of_a_batch_are_seen_each_for_itself(campaign):
     for i in range(4):
         alone = field(batch.tx[i : i + 1], batch.rx[i : i + 1]).mean
         assert torch.allclose(together[i], alone[0], atol=1e-6)
+
+
+def mean_of_images(data, shape=(1, 1), **settings) -> GaussianModel:
+    torch.manual_seed(0)
+    emission = EmissionSettings(RAW, hidden=3, activation="signed_sigmoid", log_distance=True, init_bias=0.0)
+    field = FieldSettings(count=20, placement="uniform", opacity=0.5)
+    whole = ModelSettings(field, emission, INVERSE, response=ResponseSettings(**settings))
+    transmitter = torch.from_numpy(data.tx[0]).float()
+    return GaussianModel(whole, data.site, None, transmitter, shape=shape)
+
+
+def test_channels_are_means_over_an_image_of_emissions(campaign):
+    """Equation 2 of the paper, by its weights: the image is not rendered."""
+    data = campaign("csi", static_end="tx")
+    batch = data.batch(np.arange(3))
+    field = mean_of_images(data, (2, 3), channel="mean")
+    image = field.rasterize(field.emissions(batch.tx, batch.rx), batch.rx).image.mean((-2, -1))
+    expected = torch.view_as_complex(image.view(3, 2, 3, 2))
+    torch.testing.assert_close(field(batch.tx, batch.rx).mean, expected, rtol=1e-3, atol=1e-5)
+
+
+def test_densification_sees_what_a_mean_asks_of_footprints(campaign):
+    data = campaign("csi", static_end="tx")
+    batch = data.batch(np.arange(3))
+    field = mean_of_images(data, (1, 2), channel="mean")
+    rendered = field(batch.tx, batch.rx)
+    (rendered.mean - 1).abs().square().sum().backward()
+    raster = field.raster_of_weights(rendered, batch.rx)
+    whole = field.rasterize(field.emissions(batch.tx, batch.rx).detach(), batch.rx)
+    mean = torch.view_as_complex(whole.image.mean((-2, -1)).view(3, 1, 2, 2))
+    (mean - 1).abs().square().sum().backward()
+    torch.testing.assert_close(raster.means2d.grad, whole.means2d.grad, rtol=1e-2, atol=1e-6)
+    assert raster.means2d.grad.abs().max() > 1e-4
+
+
+def test_a_spectrum_is_the_modulus_or_the_real_part_of_a_complex_image(campaign):
+    data = campaign("spectrum", static_end="tx")
+    batch = data.batch(np.arange(3))
+    modulus, real = (mean_of_images(data, image=part) for part in ("modulus", "real"))
+    image = modulus.rasterize(modulus.emissions(batch.tx, batch.rx), batch.rx).image
+    torch.testing.assert_close(modulus(batch.tx, batch.rx).mean, image.norm(dim=1))
+    torch.testing.assert_close(real(batch.tx, batch.rx).mean, image[:, 0])
+    dark = modulus.to_spectra(torch.zeros(1, 2, 4, 4, requires_grad=True))
+    dark.sum().backward()
+    assert dark.max() < 1e-9

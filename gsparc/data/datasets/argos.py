@@ -33,13 +33,15 @@ FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets
 
 
 def load_argos(
-    root: str | Path, *, antenna: int | str = 0, positions: str | bool = "encoder", align: bool = True
-) -> Measurements:
-    """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, 26) complex64.
+    root: str | Path, *, antenna: int | str = 0, tone: int | str = "all", positions: str | bool = "encoder",
+    align: bool = True
+) -> Measurements:  # fmt: skip
+    """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, K) complex64.
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
         antenna: number of the antenna to predict, or `all`.
+        tone: number of the downlink's tone to predict, or `all` 26.
         positions: `encoder`, those of `encode_positions` by the training rows, or `true` where the folder has
             `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
@@ -56,6 +58,8 @@ def load_argos(
     places = _antennas(root, description, csi.shape[1])
     count = csi.shape[1]
     or_word(whole(0, count - 1), "all").check("dataset.antenna", antenna)
+    or_word(whole(0, UPLINK - 1), "all").check("dataset.tone", tone)
+    downlink = np.arange(UPLINK, 2 * UPLINK) if tone == "all" else np.array([UPLINK + int(tone)])
     chosen = np.arange(count) if antenna == "all" else np.array([antenna])
     tones = np.array(description.get("tones", TONES), dtype=np.float64)
     spacing = float(description.get("spacing_hz", SPACING_HZ))
@@ -65,7 +69,7 @@ def load_argos(
     scale = rounded_rms(csi)
     # In complex128, as the reciprocal of a small scale overflows in complex64.
     csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
-    uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
+    uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen][..., downlink])
     problems = Problems(root)
     split = read_split(root, len(csi), problems)
     problems.raise_if_any()
@@ -75,7 +79,7 @@ def load_argos(
     facts = {name: str(description[name]) for name in FACTS if name in description}
     base, frequency = places.mean(axis=0), carrier + tones * spacing
     site = Site(
-        STAND_IN if simulated else "argos", "csi", "tx", None, None, carrier, frequency[UPLINK:],
+        STAND_IN if simulated else "argos", "csi", "tx", None, None, carrier, frequency[downlink],
         stand_in="argos" if simulated else None, target_scale=scale, uplink_array=places - base,
         uplink_hz=frequency[:UPLINK], antennas=chosen,
     )  # fmt: skip

@@ -4,6 +4,9 @@ gateway_info.yml     dataset_name, then per gateway: position [m], orientation (
 tx_pos.csv           header x,y,z; row i (from 1) belongs to spectrum/%05d.png of i [m]
 spectrum/00001.png   8-bit grey, 360 wide (azimuth, degrees) x 90 high (elevation, row 0 = 0 degrees)
 train_index.txt, test_index.txt   optional, both or none: one number per line
+
+GSpaRC's room has the same with `rx_pos.csv`: the gateway is the transmitter that stands, the receiver moves
+and its axes are the world's. Its spectra are `00001.npy`: (90, 360) real numbers from 0 to 1, or of 8 bits.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
 from gsparc.data.limits import finite_array
 from gsparc.data.own_checks import is_unit, quaternion_to_matrix
-from gsparc.data.schema import LIGHT, Measurements, Site, TrainTest
+from gsparc.data.schema import LIGHT, End, Measurements, Site, TrainTest
 from gsparc.ops import SphereGrid
 
 if TYPE_CHECKING:
@@ -73,7 +76,8 @@ def load_rfid(
         raise DataError(f"{root}: no such folder; expected gateway_info.yml, tx_pos.csv and spectrum/ in it")
     problems = Problems(root)
     info = _read_gateway(root / "gateway_info.yml", gateway, problems)
-    positions = _read_positions(root / "tx_pos.csv", problems)
+    moving: End = "rx" if (root / "rx_pos.csv").exists() else "tx"
+    positions = _read_positions(root / f"{moving}_pos.csv", problems)
     count = None if positions is None else len(positions)
     spectra = _read_spectra(root / "spectrum", count, problems)
     release_split = read_split(root, count, problems, first=1)
@@ -88,15 +92,22 @@ def load_rfid(
     simulated = info.dataset == STAND_IN
     layout = {} if array is None else array
     places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
+    suffix = ".png" if spectra.dtype == np.uint8 else ".npy"
+    # Of a receiver that moves neither array nor carrier are in the files.
+    known = (places, LIGHT / float(wavelength_m)) if moving == "tx" else (None, None)
     site = Site(
-        STAND_IN if simulated else "rfid", "spectrum", "rx", SphereGrid.hemisphere(HEIGHT, WIDTH), places,
-        LIGHT / float(wavelength_m), None, normalisation=str(normalisation),
-        stand_in="rfid" if simulated else None,
+        STAND_IN if simulated else "rfid" if moving == "tx" else info.dataset, "spectrum",
+        "rx" if moving == "tx" else "tx", SphereGrid.hemisphere(HEIGHT, WIDTH), *known, None,
+        normalisation=str(normalisation), stand_in="rfid" if simulated else None,
     )  # fmt: skip
-    rx, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, info.rotation))
+    still, turned = (
+        np.repeat(one[None], len(rows), axis=0)
+        for one in (info.position, info.rotation if moving == "tx" else np.eye(3))
+    )
+    ends = (positions[rows], still) if moving == "tx" else (still, positions[rows])
     return centre_positions(Measurements(
-        site, positions[rows], rx, rotation, spectra if listed is None else spectra[rows],
-        row_names=[f"spectrum/{i + 1:05d}.png" for i in rows], release_split=release_split,
+        site, *ends, turned, spectra if listed is None else spectra[rows],
+        row_names=[f"spectrum/{i + 1:05d}{suffix}" for i in rows], release_split=release_split,
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
     ))  # fmt: skip
 
@@ -161,7 +172,7 @@ def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gatewa
 
 
 def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
-    """Tag positions (S, 3) float64 [m]."""
+    """Positions (S, 3) float64 [m] of the end that moves."""
     sheet = problems.attempt(lambda: _sheet(path, ["x", "y", "z"], problems))
     axes = [] if sheet is None else [sheet.numbers(axis) for axis in "xyz"]
     known = [values for values in axes if values is not None]
@@ -173,23 +184,25 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
 
 
 def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.ndarray | None:
-    """Images (S, 90, 360) uint8, in the order of their numbers; on disk where they are many."""
+    """Images (S, 90, 360) uint8 or float32, in the order of their numbers; on disk where they are many."""
     if not folder.is_dir():
         return problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
-    there = {path.name for path in folder.glob("*.png")}
+    suffix = ".npy" if any(folder.glob("*.npy")) else ".png"
+    there = {path.name for path in folder.glob(f"*{suffix}")}
     if count is None:
         return None
-    expected = [f"{i:05d}.png" for i in range(1, count + 1)]
+    expected = [f"{i:05d}{suffix}" for i in range(1, count + 1)]
     missing = [name for name in expected if name not in there]
     extra = sorted(there - set(expected))
-    problems.add_rows(folder, missing, f"missing, but tx_pos.csv has {count} rows")
-    problems.add_rows(folder, extra, f"no row for it in tx_pos.csv, which has {count} rows")
+    problems.add_rows(folder, missing, f"missing, but the positions have {count} rows")
+    problems.add_rows(folder, extra, f"no row for it in the positions, which have {count}")
     if missing:
         return None
     # On disk where it is large: the release's 6,123 spectra are 200 MB.
-    spectra = allocate((count, HEIGHT, WIDTH), np.uint8)
+    spectra = allocate((count, HEIGHT, WIDTH), np.uint8 if suffix == ".png" else np.float32)
+    read = _read_image if suffix == ".png" else _read_numbers
     for i, name in enumerate(expected):
-        fault = _read_image(folder / name, spectra[i])
+        fault = read(folder / name, spectra[i])
         if fault:
             problems.add(folder / name, fault)
     return spectra
@@ -208,6 +221,22 @@ def _read_image(path: Path, into: np.ndarray) -> str | None:
             into[:] = np.asarray(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         return f"{expected}, not readable ({error})"
+    return None
+
+
+def _read_numbers(path: Path, into: np.ndarray) -> str | None:
+    """Read one array into (90, 360) float32 from 0 to 1; returns what is wrong with it."""
+    expected = f"expected an array of {HEIGHT} x {WIDTH} numbers from 0 to 1, or of 8 bits"
+    try:
+        image = np.load(path, allow_pickle=False).squeeze()
+    except (OSError, ValueError, EOFError) as error:
+        return f"{expected}, not readable ({error})"
+    if image.shape != (HEIGHT, WIDTH) or image.dtype.kind not in "fu":
+        return f"{expected}, found {image.dtype} {image.shape}"
+    values = image / 255 if image.dtype == np.uint8 else image
+    if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
+        return f"{expected}, found {values.min():g} to {values.max():g}"
+    into[:] = values
     return None
 
 

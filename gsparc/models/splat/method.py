@@ -47,7 +47,7 @@ from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Clock, Spent, TimeBudget, worst_clock
+from gsparc.training.time_budget import Clock, Effort, Spent, TimeBudget, worst_clock
 
 log = logging.getLogger(__name__)
 
@@ -184,12 +184,34 @@ class LearnedField(Method):
         context.log_curve(budget.by_clock.wall, what, step=self.steps_taken, num_gaussians=count)
         return FitReport(budget.by_clock.wall, limited_by=self._limited_by)
 
+    def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
+        """See `MethodFactory`."""
+        self._refuse_site(data.site)
+        with heeded.set_apart():
+            choices, _ = resolve_auto(self.settings, self.init.name, data.site)
+        asked = self.most_steps if steps is None else steps
+        if choices.closed_form:
+            usual = f"at most {effort.steps_after_solving}"
+            return f"closed form, then {usual if asked is None else asked} gradient steps"
+        return f"{effort.steps if asked is None else asked} gradient steps from init={choices.init}"
+
+    def _refuse_site(self, site: Site) -> None:
+        """Raise `ValueError`, one line, where it has no such field."""
+        if self.settings.response.channel != "mean" or (site.kind != "rssi" and site.static_end is not None):
+            return
+        why = "the target is powers" if site.kind == "rssi" else "both ends move"
+        raise ValueError(
+            f"{self.name}: the paper's field is of spectra and channels between an end that stands and one "
+            f"that moves; here {why}: take model=gsparc without paper="
+        )
+
     def _begin_fit(self, data: Measurements, fold: Fold, extra: Mapping[str, Any]) -> None:
         """Look at the site, and take what an interrupted run has marked; {} of a new one.
 
         Raises:
             ValueError: it has no such field.
         """
+        self._refuse_site(data.site)
         self.site, self._ends = data.site, _static_end_position(data, int(fold.train[0]))
         if data.site.kind == "csi":
             if np.isnan([data.tx, data.rx_position]).any():
@@ -199,6 +221,12 @@ class LearnedField(Method):
         self.choices, reasons = resolve_auto(self.settings, self.init.name, data.site)
         for reason in reasons:
             log.info("%s", reason)
+        if data.site.kind == "csi" and self.choices.activation == "sigmoid":
+            log.warning(
+                "%s: a sigmoid is positive, so that real and imaginary parts of these channels cannot be "
+                "negative; model.emission.activation=signed_sigmoid is the smallest change that can be",
+                self.name,
+            )
         self._paying, self.init_s = extra.get("paying"), float(extra.get("init_s", 0.0))
         self.steps_taken, self._earlier_s = int(extra.get("taken", 0)), float(extra.get("earlier_s", 0.0))
         self.spent, self._apart = {}, _validation_distance(data, fold)

@@ -93,3 +93,12 @@ def test_true_positions_are_asked_for_as_yaml_reads_them() -> None:
     data = load({"name": "argos_sim", "stand_in": stand_in, "positions": True})
     where = np.load(folder() / "positions.npy")
     assert np.allclose(data.moving + data.site.origin, where)
+
+
+def test_one_tone_of_the_downlink_is_chosen(tmp_path) -> None:
+    every = load_argos(_copy(tmp_path))
+    one = load_argos(tmp_path / "argos", tone=3)
+    assert one.target.shape[2] == 1 and np.array_equal(one.target[..., 0], every.target[..., 3])
+    assert one.site.subcarriers_hz.tolist() == [every.site.subcarriers_hz[3]]
+    with pytest.raises(ValueError, match=r"dataset\.tone=26"):
+        load_argos(tmp_path / "argos", tone=26)

@@ -3,6 +3,7 @@ import logging
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from poses import boresight_degrees
 
 from gsparc.data.datasets.rfid import WAVELENGTH, load_rfid, planar_array
@@ -96,3 +97,30 @@ def test_a_mistyped_root_was_another_dataset(name, tmp_path):
     """The stand-in took the place of any folder that is not there."""
     with pytest.raises(DataError, match=r"nowhere (does not exist|is not there)"):
         load({"name": name, "root": str(tmp_path / "nowhere")})
+
+
+def test_a_moving_receiver_s_folder_is_read(rfid_folder):
+    """The layout of the paper's room: rx_pos.csv, spectra as arrays, the gateway transmits."""
+    (rfid_folder / "tx_pos.csv").rename(rfid_folder / "rx_pos.csv")
+    images = load_rfid_images(rfid_folder)
+    data = load_rfid(rfid_folder)
+    assert data.site.moving_end == "rx" and data.target.dtype == np.float32
+    assert data.site.wavelength is None and data.row_names[2] == "spectrum/00003.npy"
+    np.testing.assert_allclose(data.target, images, atol=1e-6)
+    np.testing.assert_allclose(data.tx[3] + data.site.origin, [5.0, 0.26, 0.0])
+    np.testing.assert_allclose(data.rx_position + data.site.origin, [[0.1 * i, 0.2, 1.0] for i in range(6)])
+    assert data.batch(np.array([4, 0])).rx.batched
+    np.save(rfid_folder / "spectrum" / "00002.npy", 1.5 * images[1])
+    with pytest.raises(DataError, match=r"00002.npy: expected an array of 90 x 360 numbers from 0 to 1"):
+        load_rfid(rfid_folder)
+
+
+def load_rfid_images(folder):
+    """Images of a folder (S, 90, 360) in [0, 1], rewritten there as arrays."""
+    images = []
+    for path in sorted((folder / "spectrum").glob("*.png")):
+        with Image.open(path) as image:
+            images.append(np.asarray(image, np.float32) / 255)
+        np.save(path.with_suffix(".npy"), images[-1])
+        path.unlink()
+    return np.stack(images)
