@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from gsparc.processes.factor import Factor, solve_as_pairs
@@ -44,6 +45,16 @@ class Conditioned:
         """Condition values (n, R) with a covariance (n, n), noise included; see `Factor.from_gram`."""
         factor = Factor.from_gram(covariance, failing)
         return cls(factor, values, factor.solve(values))
+
+    @property
+    def in_float32(self) -> Conditioned:
+        """The same in float32."""
+        single = (
+            part.to(torch.float32 if part.is_floating_point() else torch.complex64)
+            for part in (self.factor.lower, self.values, self.weights)
+        )
+        lower, values, weights = single
+        return Conditioned(Factor(lower), values, weights)
 
     @cached_property
     def nll(self) -> float:
