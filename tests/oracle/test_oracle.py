@@ -29,7 +29,7 @@ def test_a_fresh_fit_chooses_as_it_did(name, tmp_path):
     now, before = fitted(name, tmp_path), FIGURES[name]
     for choice in ("choices", "class", "effects", "init"):
         assert now[f"model/{choice}"] == before[f"model/{choice}"]
-    assert now["error"] <= 1.03 * before["error"]
+    assert now["error"] <= 1.01 * before["error"]  # settings of `test_processors.py` move it by 6e-4
 
 
 def test_two_trees_are_told_apart():
