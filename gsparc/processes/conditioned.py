@@ -49,12 +49,8 @@ class Conditioned:
     @property
     def in_float32(self) -> Conditioned:
         """The same in float32."""
-        single = (
-            part.to(torch.float32 if part.is_floating_point() else torch.complex64)
-            for part in (self.factor.lower, self.values, self.weights)
-        )
-        lower, values, weights = single
-        return Conditioned(Factor(lower), values, weights)
+        kind = torch.complex64 if self.values.is_complex() else torch.float32
+        return Conditioned(Factor(self.factor.lower.to(kind)), self.values.to(kind), self.weights.to(kind))
 
     @cached_property
     def nll(self) -> float:

@@ -152,7 +152,10 @@ class RowVariance:
             member = Posterior(member.rows.select_rows(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility
         self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.float().contiguous()
-        self.phasor, self.power = scene.phase_factors.cfloat(), scene.log_amplitude.mul(2).exp().float()
+        self.phasor, self.power = (
+            scene.phase_factors.to(torch.complex64),
+            scene.log_amplitude.mul(2).exp().float(),
+        )
         self.noise = math.exp(scene.log_noise)
         there = torch.stack([member.waves.real.T, member.waves.imag.T], 1)[:, None].float()  # (K, 1, 2, n)
         there = there * self.power[:, None, None, None]
