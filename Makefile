@@ -86,8 +86,8 @@ hard-cases: setup ## every hard case on every backend, and the tables of docs/ha
 grid: setup ## every kind of data with defaults beside the plain methods (two hours, resumable; GRID=--seed 7: others)
 	$(RUN) tests/grid/sweep.py build/grid/results$(subst $() ,,$(GRID)).jsonl $(GRID)
 
-oracle: setup ## fixed problems fitted and stored anew (tests/oracle/stored), with what moved, old -> new
-	OMP_NUM_THREADS=1 $(RUN) tests/oracle/stored_fits.py
+oracle: setup ## what fits and answers of fixed problems moved since BASE=COMMIT, both trees on this machine (five minutes)
+	OMP_NUM_THREADS=1 $(RUN) tests/oracle/two_trees.py $(or $(BASE),HEAD)
 
 bench: setup ## seconds of the kernels beside plain PyTorch
 	$(RUN) -m gsparc bench

@@ -6,7 +6,10 @@ What is large is imported where it is needed: pytest-xdist starts its workers af
 from __future__ import annotations
 
 import gc
+import os
+import re
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,12 +32,27 @@ def pytest_collection_finish():
     gc.enable()
 
 
+def pytest_terminal_summary(terminalreporter):
+    """Skipped tests by their reasons, without what is of one file or machine, in one line."""
+    reasons = Counter(
+        re.sub(r"\S*/(?=shared/data)|^Skipped: ", "", report.longrepr[2])
+        for report in terminalreporter.stats.get("skipped", [])
+    )
+    if reasons:
+        counted = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        terminalreporter.write_line(f"{reasons.total()} skipped: {counted}")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _short_trainings_end_at_once():
     import quick
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1, "blas")  # as every command has it
+    if kernels := os.environ.get("GSPARC_TEST_KERNELS"):
+        from gsparc.ops import _native
+
+        assert _native.use_instruction_set(kernels), f"this machine or build has no {kernels}"
     with pytest.MonkeyPatch.context() as patch:
         for one in (quick.compose_once, quick.look_once, quick.time_and_draw_less):
             one(patch)

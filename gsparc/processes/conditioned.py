@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from gsparc.processes.factor import Factor, solve_as_pairs
@@ -44,6 +45,12 @@ class Conditioned:
         """Condition values (n, R) with a covariance (n, n), noise included; see `Factor.from_gram`."""
         factor = Factor.from_gram(covariance, failing)
         return cls(factor, values, factor.solve(values))
+
+    @property
+    def in_float32(self) -> Conditioned:
+        """The same in float32."""
+        kind = torch.complex64 if self.values.is_complex() else torch.float32
+        return Conditioned(Factor(self.factor.lower.to(kind)), self.values.to(kind), self.weights.to(kind))
 
     @cached_property
     def nll(self) -> float:

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 from threading import Timer
@@ -171,10 +170,10 @@ def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
     began = []
 
     def interrupt():
-        began.append(time.monotonic())
+        began.append(True)
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("gsparc.commands.map.read_or_gather", lambda *_: Timer(0.3, interrupt).start())
     answer = run("map", f"ckpt={model}", "step_m=0.03", folder=tmp_path)
-    assert answer.status == 130 and began and time.monotonic() - began[0] < 10, answer
+    assert answer.status == 130 and began, answer
     assert not [file for file in tmp_path.iterdir() if file.suffix in (".npz", ".png", ".html", ".partial")]

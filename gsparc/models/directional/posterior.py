@@ -121,11 +121,11 @@ class SightedSources:
 
     @cached_property
     def conditioned(self) -> Conditioned:
-        """The rows given their covariance."""
-        covariance = self._cross_covariance(self.waves, self._coherence(), self.power)
-        return condition_with_noise(
-            covariance * self._gain_correlation(self.kernel), self.kernel.noise, self.rows.target
-        )
+        """The rows given their covariance, which is factored in float64."""
+        exact = to_double(replace(self))
+        covariance = exact._cross_covariance(exact.waves, exact._coherence(), exact.power)
+        covariance *= exact._gain_correlation(self.kernel)
+        return condition_with_noise(covariance, self.kernel.noise, exact.rows.target).in_float32
 
     @cached_property
     def dual_weights(self) -> Tensor:

@@ -45,6 +45,7 @@ class EnsembleMeans:
     """
 
     def __init__(self, members: Sequence[Posterior], variance_rows: int = VARIANCE_ROWS) -> None:
+        exact = [member.in_float64 for member in members]
         rows, scenes = members[0].rows, [member.scene for member in members]
         self.places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
         self.counts = [len(scene.sequences) for scene in scenes]
@@ -55,19 +56,20 @@ class EnsembleMeans:
         constant, angle, length = each.unbind(1)
         # |u - v|^2 of unit vectors is 2 - 2 u.v.
         self.by_angle = (2 * MATERN32 / angle**2).float()
-        self.by_length, constant = (MATERN32 / length**2).float(), constant.float()
+        self.by_length = (MATERN32 / length**2).float()
         toward = unit_vectors(moving_end(self.places), self.sources)
         self.towards = (toward * -self.by_angle).mT.contiguous()
         # Not at the first query, which may be for inference alone.
         hides = any(len(scene.clutter) for scene in scenes)
         self.hiding = [(scene.unfolding, scene.obstacles) for scene in scenes] if hides else []
-        dual = torch.cat([member.dual_weights for member in members])
-        dual = dual * torch.cat([scene.phase_factors for scene in scenes])[:, None, None]
+        dual = torch.cat(
+            [member.dual_weights * member.scene.phase_factors[:, None, None] for member in exact]
+        )
         weight = torch.zeros(len(dual), len(self.places), rows.target.shape[1], dtype=dual.dtype)
         real = torch.view_as_real(weight.index_add_(1, place_of, dual)).flatten(2)  # (K, n, 2 R)
-        self.weights = (real * (1 - constant)).contiguous()
-        self.level = real.sum(1, keepdim=True) * constant
-        self.variance = RowVariance(members[0], place_of, variance_rows) if variance_rows else None
+        self.weights = (real * (1 - constant)).float().contiguous()
+        self.level = (real.sum(1, keepdim=True) * constant).float()
+        self.variance = RowVariance(exact[0], place_of, variance_rows) if variance_rows else None
 
     def visible_share(self, queries: Tensor) -> Tensor | None:
         """Return visible shares (K, m) of sources from queries (m, 3 or 6) [m]; None without clutter."""
@@ -139,7 +141,7 @@ class RowVariance:
     """Variance of a process at new places, from some of its rows.
 
     Args:
-        member: the process, over n rows.
+        member: the process, over n rows, in float64.
         place_of: (n,) int64, number of each row's place.
         count: of the rows used.
     """
@@ -149,10 +151,13 @@ class RowVariance:
         if len(few) < len(member.rows):
             member = Posterior(member.rows.select_rows(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility
-        self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.contiguous()
-        self.phasor, self.power = scene.phase_factors, scene.log_amplitude.mul(2).exp()
+        self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.float().contiguous()
+        self.phasor, self.power = (
+            scene.phase_factors.to(torch.complex64),
+            scene.log_amplitude.mul(2).exp().float(),
+        )
         self.noise = math.exp(scene.log_noise)
-        there = torch.stack([member.waves.real.T, member.waves.imag.T], 1)[:, None]  # (K, 1, 2, n)
+        there = torch.stack([member.waves.real.T, member.waves.imag.T], 1)[:, None].float()  # (K, 1, 2, n)
         there = there * self.power[:, None, None, None]
         self.level, self.there = there * float(kernel.constant), there * (1 - float(kernel.constant))
         self.along, across = quadrature_variances(scene.quadrature).tolist()

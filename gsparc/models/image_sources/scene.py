@@ -41,15 +41,15 @@ class KernelVisibility:
     angle: float | Tensor = 0.5
     length: float | Tensor = 2.0
 
-    def correlation(self, places: Tensor, source: Tensor) -> Tensor:
-        """Return (n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
+    def correlation(self, places: Tensor, source: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+        """Return (n, n) in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
-        squared = _squared_distances(unit_vectors(moving_end(places), source)) / self.angle**2
+        squared = _squared_distances(unit_vectors(moving_end(places), source, dtype)) / self.angle**2
         if not _needs_float64(places, float(torch.as_tensor(self.length).detach())):
-            places = places.float()
-        squared = squared + _squared_distances(places).float() / self.length**2
+            places = places.to(dtype)
+        squared = squared + _squared_distances(places).to(dtype) / self.length**2
         return self.constant + (1 - self.constant) * matern32_of_squares(squared)
 
     @staticmethod
@@ -128,7 +128,7 @@ class Scene:
     def phase_factors(self) -> Tensor:
         """(K,) complex64 of size 1, the phases."""
         assert self.phase is not None
-        return torch.polar(torch.ones(()), self.phase)
+        return torch.polar(torch.ones_like(self.phase), self.phase)
 
     def visible_share(self, places: Tensor) -> Tensor:
         """Return shares (n, K), or (1, 1), of sources that clutter lets through to places (n, 3) [m]."""
@@ -188,7 +188,7 @@ class Scene:
 
 
 def spherical_waves(rows: Rows, sources: Tensor) -> Tensor:
-    """Return the spherical waves (n, K) complex64 of sources at every row.
+    """Return the spherical waves (n, K) of sources at every row, in the precision of its targets.
 
     Args:
         rows: n of them.
@@ -201,7 +201,7 @@ def spherical_waves(rows: Rows, sources: Tensor) -> Tensor:
         if sources.dim() == 2:
             raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
         sources = sources.index_select(0, rows.element)  # (n, K, 3)
-    return point_wave(ranges(rows.position, sources), rows.frequency[:, None])
+    return point_wave(ranges(rows.position, sources), rows.frequency[:, None], rows.target.real.dtype)
 
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:

@@ -58,6 +58,15 @@ def test_first_order_images_are_found_and_the_channel_extrapolates(small):
     assert error(method, data, fold.test) < 0.01
 
 
+def test_rows_factored_in_float32_answered_otherwise_on_other_machines(small):
+    """By up to 3e-4 of the deviation."""
+    query, members = small[3].query, [member.in_float64 for member in small[3].members]
+    exact = torch.cat([one.dual_weights.sum(1) * one.scene.phase_factors[:, None] for one in members])
+    constant = members[0].scene.visibility.constant
+    known = torch.view_as_real(exact).flatten(1)[:, None] * constant
+    assert (query.level - known).abs().max() < 1e-7 * known.abs().max()
+
+
 def test_variance_is_of_the_size_of_the_error(small):
     _, data, fold, method, _ = small
     prediction = _predicted(method, data, fold.test)

