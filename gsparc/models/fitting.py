@@ -5,6 +5,7 @@ Nothing else goes on from it than what learns from the same rows with the same s
 
 from __future__ import annotations
 
+import copy
 import logging
 import re
 from collections import Counter
@@ -19,6 +20,7 @@ import yaml
 from gsparc.data import heeded
 from gsparc.data.assemble import auxiliary_hash
 from gsparc.data.errors import list_first
+from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
@@ -67,22 +69,28 @@ def fit_or_resume(
     """
     budget = TimeBudget()
     # Before the method is made, as another may be called for once rows share a phase.
-    (data, rows), left = align_phases(data, fold), context.resume
-    aligning = budget.spent if data.site.freedom != "none" else 0.0
+    ordered, rows = order_rows(data, fold)
+    if context.datamodule is not None and context.datamodule.measurements is data:
+        module = copy.copy(context.datamodule)
+        module.measurements = ordered
+        context = replace(context, datamodule=module)
+    (ordered, rows), left = align_phases(ordered, rows), context.resume
+    aligning = budget.spent if ordered.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count_reads("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
-            return _restore_fit(factory, data, fold, context, left / checkpoint.MODEL)
+            whole = replace(data, site=ordered.site)
+            return _restore_fit(factory, whole, fold, context, left / checkpoint.MODEL)
         # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
-    method = factory.create_for(data)
+    method = factory.create_for(ordered)
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
-    report = method.fit(data, rows, context)
+    report = method.fit(ordered, rows, context)
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
         report = replace(report, seconds=report.seconds + aligning, cost=cost)

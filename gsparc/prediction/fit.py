@@ -14,6 +14,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
+from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
@@ -73,7 +74,8 @@ def fit(
     except DataError as refused:
         said = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
         raise DataError(said) from None
-    data = set_freedom(reading.data, align)
+    none = np.zeros(0, np.int64)
+    data, _ = order_rows(set_freedom(reading.data, align), Fold(none, none, none))
     for note in reading.notes:
         log.warning("%s", note)
     kind, own = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
