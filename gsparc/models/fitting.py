@@ -90,7 +90,7 @@ def fit_or_resume(
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
-    report = method.fit(ordered, rows, context)
+    report = method.fit(ordered, rows, replace(context, fold=fold))
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
         report = replace(report, seconds=report.seconds + aligning, cost=cost)
@@ -155,7 +155,8 @@ class Origin:
     @classmethod
     def from_fit(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
         """Return the origin of a fit that begins."""
-        return cls(data.site, auxiliary_hash(data), hash_indices((fold,)), context.seed, context.config_yaml)
+        rows = hash_indices((context.fold or fold,))
+        return cls(data.site, auxiliary_hash(data), rows, context.seed, context.config_yaml)
 
     def to_extra(self) -> dict[str, Any]:
         """Return what a checkpoint has as `extra`; it holds the configuration itself."""
