@@ -92,7 +92,7 @@ Part = tuple[Arrays, Stations | None, list[str]]
 
 
 def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selection, source: str) -> Part:
-    """Apply all settings: steps of levels, stations, runs, level, then number of rows, of which none is a copy.
+    """Apply all settings: steps of levels, stations, runs, level, copies, then number of rows.
 
     Args:
         arrays: of links.

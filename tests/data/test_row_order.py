@@ -34,8 +34,10 @@ def rows_of(kind: str) -> dict[str, np.ndarray]:
         "both": {"rx_position": places, "tx_position": places[::-1] + 9, "rssi_db": levels[:, 0]},
         "channels": {**one, "csi": waves, "_frequency_hz": 5e9 + 1e6 * np.arange(4)},
         "stations' channels": {"rx_position": places, "_station_position": POSTS,
-                               "csi": rng.normal(size=(60, 3, 2, 4)) + 0j, "_frequency_hz": 5e9 + np.arange(4)},
-        "spectra": {"_rx_position": POSTS[0], "tx_position": places, "spectrum": rng.uniform(size=(60, 12, 24))},
+                               "csi": rng.normal(size=(60, 3, 2, 4)) + 0j,
+                               "_frequency_hz": 5e9 + np.arange(4)},
+        "spectra": {"_rx_position": POSTS[0], "tx_position": places,
+                    "spectrum": rng.uniform(size=(60, 12, 24))},
     }[kind]  # fmt: skip
 
 
@@ -78,7 +80,7 @@ def test_rows_that_stand_twice_count_once(kind, copied):
 
 
 def test_equal_whole_decibels_of_visits_are_measurements():
-    """A place visited ten times hears the same whole decibel again: that is evidence, unless all is doubled."""
+    """A place visited ten times hears the same whole decibel again: evidence, unless all is doubled."""
     rng = np.random.default_rng(0)
     place = np.repeat(np.arange(20), 10)
     level = np.round(rng.normal(-70, 1, 200))
