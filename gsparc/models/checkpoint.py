@@ -151,7 +151,8 @@ def _content_digest(content: Mapping[str, Any]) -> str:
         value = left.pop()
         if isinstance(value, Tensor):
             digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
-            digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+            packed = torch.empty(value.numel(), dtype=value.dtype).copy_(value.detach().flatten())
+            digest.update(packed.view(torch.uint8).numpy())  # one number may have strides of 0
         elif isinstance(value, Mapping):
             digest.update(f"{len(value)} {list(value)}".encode())
             left += value.values()

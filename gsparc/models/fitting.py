@@ -19,7 +19,7 @@ import yaml
 
 from gsparc.data import heeded
 from gsparc.data.assemble import auxiliary_hash
-from gsparc.data.errors import list_first
+from gsparc.data.errors import Caution, list_first
 from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices
@@ -33,6 +33,7 @@ from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
+FEW_PLACES = 10
 FOLDS, STATIONS = r"fold\d+", r"station\d+|unheard"  # names of parts' folders
 LAST = ("refit/last.ckpt", "last.ckpt")  # what an interrupted part leaves, the later stage first
 # Settings that a run must share with what it goes on from.
@@ -91,6 +92,9 @@ def fit_or_resume(
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
     report = method.fit(ordered, rows, replace(context, fold=fold))
+    if 0 < (places := len(np.unique(ordered.moving[rows.train], axis=0))) < FEW_PLACES:
+        few = Caution(f"{places} places to learn from are too few to tell errors: deviations are guesses")
+        report = replace(report, notes=(*report.notes, few))
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
         report = replace(report, seconds=report.seconds + aligning, cost=cost)

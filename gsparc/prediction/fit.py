@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.checks.coherence import set_freedom
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError
 from gsparc.data.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
@@ -88,7 +88,7 @@ def fit(
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
     method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
-        log.info("%s", note)
+        log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if save is not None:
         checkpoint.save(save, method, extra={"train_s": report.seconds})
     return Predictor(method, data.site)
