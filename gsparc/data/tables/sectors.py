@@ -61,7 +61,8 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
         used: heads that are read as something else.
     """
     found: dict[str, np.ndarray] = {}
-    notes, unread, heads = [], [], []
+    notes: list[str] = []
+    unread, heads = [], []
     for head in [head for head in sheet.heads if head not in used]:
         name, unit = sector_quantity(head), unit_of(head)[1]
         words = sheet.words(head) if name else np.zeros(0, str)
