@@ -26,5 +26,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     ends = [value for name, value in facts.items() if name.startswith(("predict/lowest", "predict/highest"))]
     if ends:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
+    before += f", {empty} predictions empty" if (empty := facts["predict/empty"]) else ""
     before += f"; predictions in {facts['out']}; summary "
     return finish_run(run_directory(), facts | {"ckpt": str(config.ckpt)}, before=before)

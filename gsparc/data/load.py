@@ -29,6 +29,7 @@ from gsparc.data.instantiate import (
     suggest_or_list,
 )
 from gsparc.data.limits import choice
+from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
 from gsparc.data.splits import FileSettings, Split, SplitSettings, make_split, remove_rows, rows_to_leave_out
@@ -109,7 +110,8 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         log.info(text, len(data), len(np.unique(place)))
     # From the lowest place on: where stations stand moves local coordinates, and would move squares.
     where = data.moving - data.moving.min(axis=0)
-    return answerable(make_split(where, settings, data.release_split, wrong, place, unit), data)
+    order = content_order(data) if settings.name == "none" else None
+    return answerable(make_split(where, settings, data.release_split, wrong, place, unit, order), data)
 
 
 def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Split] | None = None) -> Split:

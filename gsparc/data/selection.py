@@ -17,6 +17,7 @@ from gsparc.data.blocks import take
 from gsparc.data.errors import DataError, list_first, suggest_name
 from gsparc.data.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
+from gsparc.data.row_order import find_copies, hash_rows
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
@@ -91,7 +92,7 @@ Part = tuple[Arrays, Stations | None, list[str]]
 
 
 def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selection, source: str) -> Part:
-    """Apply all settings: steps of levels, stations, runs, level, then number of rows.
+    """Apply all settings: steps of levels, stations, runs, level, copies, then number of rows.
 
     Args:
         arrays: of links.
@@ -109,10 +110,10 @@ def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selec
     notes: list[str] = []
 
     def kept(option: str, keep: np.ndarray) -> Arrays:
-        if keep.sum() < FEWEST:
-            raise DataError(f"{option}: {keep.sum()} rows of {source} are left; expected {FEWEST} or more")
         if keep.all():
             return arrays
+        if keep.sum() < FEWEST:
+            raise DataError(f"{option}: {keep.sum()} rows of {source} are left; expected {FEWEST} or more")
         notes.append(f"{option}: {(~keep).sum()} of {len(keep)} rows left out")
         return take_rows(arrays, np.flatnonzero(keep), len(keep))
 
@@ -136,9 +137,20 @@ def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selec
             # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
             level = 10 * np.log10(arrays[measured]) if measured == "rssi" else arrays[measured]
             arrays = kept(option, np.logical_not(level < part.min_rssi_db))
+    arrays = kept("copies of other rows (same places, station and values)", ~_copies(arrays, measured))
     if part.max_rows is not None:
         arrays = kept(f"dataset.max_rows={part.max_rows}", _spread(arrays["file_row"], part.max_rows))
     return arrays, stations, notes
+
+
+def _copies(arrays: Arrays, measured: str) -> np.ndarray:
+    rows, number = len(arrays[measured]), arrays.get("station")
+    ends = [arrays.get(f"{end}_position", np.zeros(0)) for end in ("rx", "tx")]
+    places = [end.astype(np.float64) for end in ends if end.shape == (rows, 3) and end.dtype.kind in "iuf"]
+    if not places:  # one that repeats is no row's own
+        return np.zeros(rows, bool)
+    place = hash_rows(*places)
+    return find_copies(place, place if number is None else hash_rows(place, number), arrays[measured])
 
 
 def _there(stations: Stations | None, name: str, source: str) -> Stations:

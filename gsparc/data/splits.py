@@ -174,6 +174,7 @@ def make_split(
     outliers: np.ndarray | None = None,
     place: np.ndarray | None = None,
     station: np.ndarray | None = None,
+    order: np.ndarray | None = None,
 ) -> Split:
     """Split rows by the positions of the moving end; what is held out is so for all stations.
 
@@ -191,6 +192,7 @@ def make_split(
         outliers: (n,) rows that `leave_out=outliers` means.
         place: (S,) int64; rows of one place stay together. None where every row is one.
         station: (S,) int64, of which station, for `runs` of which run, a row is; needed by these two.
+        order: (S,) rows as `none` draws those that validate; None: by their numbers.
 
     Raises:
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
@@ -214,6 +216,9 @@ def make_split(
             _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
         where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
+        if order is not None and settings.name == "none":
+            drawn = np.argsort(np.argsort(order)[rows_left][first])
+            pairs = enumerate([(drawn, drawn[:0])])
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
     folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
     return Split(settings.name, folds, hash_indices(folds), named is not None)

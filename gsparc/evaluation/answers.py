@@ -106,6 +106,13 @@ def predict_file(
     # A power of 0 is -inf dB, which would be the lowest of every file and no number of a summary.
     mean = predictions.said.mean.numpy()
     known = mean[np.isfinite(mean)]
+    empty = ~np.isfinite(mean.reshape(len(mean), -1)).all(axis=1)
+    facts["predict/empty"] = int(empty.sum())
+    if empty.any():
+        why = "a power of 0, weaker than single precision holds" if np.isneginf(mean).any() else "no number"
+        first = queries.rows[predictions.place[int(np.argmax(empty))]]
+        log.warning("%s: %d of %d predictions are empty (%s), the first in %s", places, empty.sum(),
+                    len(mean), why, first)  # fmt: skip
     if power is not None and len(known):
         ends = {"lowest": float(known.min()), "highest": float(known.max())}
         facts |= {f"predict/{name}_{unit_suffix(power)}": value for name, value in ends.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import pickle
 from collections.abc import Iterable, Mapping
@@ -106,11 +107,13 @@ def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     path = Path(path)
     content = _read_content(path)
     _stored_from_content(content, path)  # refuses what is incomplete
+    _refuse_changed(content, path)
     content["extra"] = {**content["extra"], **_to_plain(dict(extra), "extra")}
     _write(path, content)
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
+    content["sha256"] = _content_digest(content)
     try:
         with whole_file(path) as partial, partial.open("wb") as file:
             torch.save(content, file)
@@ -129,7 +132,36 @@ def read(path: str | Path) -> Stored:
             that are NaN or infinite.
     """
     path = Path(path)
-    return _stored_from_content(_read_content(path), path)
+    content = _read_content(path)
+    stored = _stored_from_content(content, path)
+    _refuse_changed(content, path)
+    return stored
+
+
+def _refuse_changed(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse what is not as it was written: an archive's own sums are right of whatever was put in it."""
+    if content.get("sha256", "") not in ("", _content_digest(content)):  # older files have none
+        raise CheckpointError(f"{path}: damaged, or changed by another program; take another copy of it")
+
+
+def _content_digest(content: Mapping[str, Any]) -> str:
+    """SHA-256 of all that a checkpoint holds, of tensors type, shape and bytes."""
+    digest, left = hashlib.sha256(), [value for name, value in sorted(content.items()) if name != "sha256"]
+    while left:
+        value = left.pop()
+        if isinstance(value, Tensor):
+            digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
+            packed = torch.empty(value.numel(), dtype=value.dtype).copy_(value.detach().flatten())
+            digest.update(packed.view(torch.uint8).numpy())  # one number may have strides of 0
+        elif isinstance(value, Mapping):
+            digest.update(f"{len(value)} {list(value)}".encode())
+            left += value.values()
+        elif isinstance(value, (list, tuple)):
+            digest.update(f"{type(value)} {len(value)}".encode())
+            left += value
+        else:
+            digest.update(f"{value!r};".encode())
+    return digest.hexdigest()
 
 
 def _read_content(path: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ Nothing else goes on from it than what learns from the same rows with the same s
 
 from __future__ import annotations
 
+import copy
 import logging
 import re
 from collections import Counter
@@ -18,7 +19,8 @@ import yaml
 
 from gsparc.data import heeded
 from gsparc.data.assemble import auxiliary_hash
-from gsparc.data.errors import list_first
+from gsparc.data.errors import Caution, list_first
+from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
@@ -31,6 +33,7 @@ from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
+FEW_PLACES = 10
 FOLDS, STATIONS = r"fold\d+", r"station\d+|unheard"  # names of parts' folders
 LAST = ("refit/last.ckpt", "last.ckpt")  # what an interrupted part leaves, the later stage first
 # Settings that a run must share with what it goes on from.
@@ -67,22 +70,31 @@ def fit_or_resume(
     """
     budget = TimeBudget()
     # Before the method is made, as another may be called for once rows share a phase.
-    (data, rows), left = align_phases(data, fold), context.resume
-    aligning = budget.spent if data.site.freedom != "none" else 0.0
+    ordered, rows = order_rows(data, fold)
+    if context.datamodule is not None and context.datamodule.measurements is data:
+        module = copy.copy(context.datamodule)
+        module.measurements = ordered
+        context = replace(context, datamodule=module)
+    (ordered, rows), left = align_phases(ordered, rows), context.resume
+    aligning = budget.spent if ordered.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count_reads("*")
     if left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
-            return _restore_fit(factory, data, fold, context, left / checkpoint.MODEL)
+            whole = replace(data, site=ordered.site)
+            return _restore_fit(factory, whole, fold, context, left / checkpoint.MODEL)
         # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
             resume = next((left / name for name in LAST if (left / name).exists()), None)
             context = replace(context, resume=resume)
-    method = factory.create_for(data)
+    method = factory.create_for(ordered)
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
-    report = method.fit(data, rows, context)
+    report = method.fit(ordered, rows, replace(context, fold=fold))
+    if 0 < (places := len(np.unique(ordered.moving[rows.train], axis=0))) < FEW_PLACES:
+        few = Caution(f"{places} places to learn from are too few to tell errors: deviations are guesses")
+        report = replace(report, notes=(*report.notes, few))
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
         report = replace(report, seconds=report.seconds + aligning, cost=cost)
@@ -147,7 +159,8 @@ class Origin:
     @classmethod
     def from_fit(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
         """Return the origin of a fit that begins."""
-        return cls(data.site, auxiliary_hash(data), hash_indices((fold,)), context.seed, context.config_yaml)
+        rows = hash_indices((context.fold or fold,))
+        return cls(data.site, auxiliary_hash(data), rows, context.seed, context.config_yaml)
 
     def to_extra(self) -> dict[str, Any]:
         """Return what a checkpoint has as `extra`; it holds the configuration itself."""

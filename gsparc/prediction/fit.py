@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.checks.coherence import set_freedom
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError
 from gsparc.data.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
+from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
@@ -73,7 +74,8 @@ def fit(
     except DataError as refused:
         said = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
         raise DataError(said) from None
-    data = set_freedom(reading.data, align)
+    none = np.zeros(0, np.int64)
+    data, _ = order_rows(set_freedom(reading.data, align), Fold(none, none, none))
     for note in reading.notes:
         log.warning("%s", note)
     kind, own = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
@@ -86,7 +88,7 @@ def fit(
     context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
     method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
-        log.info("%s", note)
+        log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if save is not None:
         checkpoint.save(save, method, extra={"train_s": report.seconds})
     return Predictor(method, data.site)

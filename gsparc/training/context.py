@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting, whole
-from gsparc.data.splits import FileSettings, SplitSettings
+from gsparc.data.splits import FileSettings, Fold, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import LINE, NO_COST, Cost
 from gsparc.training.race import Race
@@ -66,6 +66,7 @@ class FitContext(Checked):
         leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
         race: the best of other solutions on these groups: searches end that fall behind.
         beside: solutions that were fitted before this one, by name.
+        fold: what is learned, in the run's own numbers of rows; None: the fold that a method is given.
         resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -92,6 +93,7 @@ class FitContext(Checked):
     leave_out: tuple[np.ndarray, ...] = ()
     race: Race | None = None
     beside: Mapping[str, Any] = field(default_factory=dict)
+    fold: Fold | None = None
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = setting(16, whole(1))
@@ -109,6 +111,7 @@ class FitContext(Checked):
 
     def for_part(self, folder: str, **changes: Any) -> FitContext:
         """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        changes = {"fold": None, **changes}
         if self.loggers:
             from gsparc.training.tracking import PartLogger  # imports Lightning
 

@@ -2,10 +2,12 @@
 
 import csv
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from campaigns import compose
 from doors import knock
 from drives import city_drive, write_table
@@ -22,6 +24,7 @@ from gsparc.evaluation.answers import predict_file
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
@@ -416,3 +419,18 @@ def test_an_end_that_stood_still_is_where_it_was(town, tmp_path, caplog):
     found = answered(town, tmp_path, heads, [[5, 5, 1.5, 9, 9, 9]], station="mast")
     assert "not used: coordinates of the transmitter; that end is where it was measured" in caplog.text
     assert len(found) == 1 and column(found, "rx_x")[0] == 5
+
+
+def test_empty_predictions_left_without_a_word(town, tmp_path, caplog, monkeypatch):
+    """66 of 3,000 cells were empty, and the closing line said 3,000 predictions."""
+    places = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5], [6, 5, 1.5]])
+    assert predict_file(town, places)["predict/empty"] == 0
+    sound, gone = Predictor.predict, torch.tensor([[1], [torch.nan]])
+
+    def predict(self, **ends):
+        one = sound(self, **ends)
+        return replace(one, mean=one.mean * gone)
+
+    monkeypatch.setattr(Predictor, "predict", predict)
+    assert predict_file(town, places, overwrite=True)["predict/empty"] == 3
+    assert "3 of 6 predictions are empty (no number), the first in line 3" in caplog.text

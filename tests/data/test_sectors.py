@@ -138,3 +138,69 @@ def test_stations_without_heights_stood_at_0_m_with_no_warning(tmp_path):
     reading = read_any(drive, stations_file=write(tmp_path / "sites.csv", heads, sites))
     said = next(note for note in reading.notes if "no height of the stations: taken as 0 m" in note)
     assert isinstance(said, Caution)
+
+
+COLUMNS = {
+    "DL EARFCN": 3,
+    "Antenna Height [m]": 6,
+    "Azimuth": 7,
+    "M-Tilt": 8,
+    "E-Tilt": 9,
+    "HBW": 10,
+    "Tx Power [dBm]": 11,
+}
+
+
+@pytest.mark.parametrize("head", COLUMNS)
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_a_column_of_a_list_was_believed_at_any_magnitude(tmp_path, head, factor):
+    """A power of 20,000 was good: levels of -560 to 27 dBm."""
+    _, drive, heads, sites = drive_of(tmp_path)
+    column = COLUMNS[head]
+    scaled = [[*row[:column], row[column] * factor, *row[column + 1 :]] for row in sites]
+    listed = write(tmp_path / "sites.csv", [one.partition(" [")[0] for one in heads], scaled)
+    try:
+        notes = " ".join(read_any(drive, stations_file=listed).notes)
+    except DataError as refused:
+        notes = str(refused)
+    assert any(
+        word in notes
+        for word in (head.partition(" [")[0] + "' holds", "earfcn: some", "are no listed stations")
+    ), notes
+
+
+def read_list(folder, **columns):
+    """Stations of a list with further columns, and all notes."""
+    _, drive, heads, sites = drive_of(folder)
+    names = [*heads[:6], *columns]
+    rows = [
+        [*row[:6], *(values[i % len(values)] for values in columns.values())] for i, row in enumerate(sites)
+    ]
+    reading = read_any(drive, stations_file=write(folder / "sites.csv", names, rows))
+    return reading.data.site, " ".join(reading.notes)
+
+
+@pytest.mark.parametrize(("head", "values", "says"), [
+    ("Power", [20000], r"name its unit, as in 'Power \[W\]', where W or mW"),
+    ("EIRP", [2000], r"name its unit, as in 'EIRP \[W\]'"),
+    ("Azimuth", [0, 0.9, 0.6], r"'Azimuth \[rad\]'"),
+])  # fmt: skip
+def test_the_unit_that_fits_is_named(tmp_path, head, values, says):
+    with pytest.raises(DataError, match=says):
+        read_list(tmp_path, **{head: values})
+
+
+def test_unknown_azimuths_and_widths_are_no_numbers(tmp_path):
+    """An azimuth of -1 was 359 degrees, a width of 0 no positive definite covariance."""
+    site, notes = read_list(tmp_path, Azimuth=[-1, 30, 120], HBW=[0, 65, 65], Tilt=[-2, -4, -6])
+    sector = site.stations.sector
+    assert np.isnan(sector[:, 0]).any() and np.isnan(sector[:, 2]).any()
+    assert "-1 unknown" in notes and "0 unknown" in notes and (sector[:, 1] > 0).all()
+    assert "'Tilt' are all below 0: read as below the horizon" in notes
+
+
+def test_frequencies_in_kilohertz_and_channels_of_nr(tmp_path):
+    """1842500 was 1.8 MHz, 632628 was 57 GHz."""
+    site, notes = read_list(tmp_path, Frequency=[1842500])
+    assert site.carrier_hz == 1842.5e6 and "carrier_hz in kHz" in notes
+    np.testing.assert_allclose(earfcn_hz(np.array([632628.0, 422000.0])), [3489.42e6, 2110e6])

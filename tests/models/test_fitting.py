@@ -59,7 +59,7 @@ def test_stations_were_mixed_up_and_done_again_by_a_resumed_run(town, tmp_path, 
 
 def test_a_folder_of_stations_that_were_finished_was_not_gone_on_from(town, tmp_path):
     """Of a run's folder only its own `last.ckpt` was taken, which stations have in folders of their own."""
-    fitted(town, tmp_path / "run")
+    fitting.fit_or_resume(PerStation(Resumable()), *town, FitContext(tmp_path / "run"))
     Resumable.fits = 0
     fitting.fit_or_resume(
         PerStation(Resumable()), *town, FitContext(tmp_path / "on", resume=tmp_path / "run")

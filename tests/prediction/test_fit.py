@@ -146,3 +146,12 @@ def test_methods_without_deviations_say_so():
 def test_mistakes_are_said_with_their_array(wrong, said):
     with pytest.raises((DataError, ValueError), match=said):
         gsparc.fit(tx=END, **wrong)
+
+
+def test_two_rows_stated_a_deviation_without_a_word(caplog):
+    """.11 dB of a model of two rows."""
+    places = np.random.default_rng(0).uniform(0, 9, (12, 3))
+    gsparc.fit(rx=places, tx=[20.0, 3, 2], rssi=-60 - places[:, 0], model="gp")
+    assert "too few to tell errors" not in caplog.text
+    gsparc.fit(rx=places[:2], tx=[20.0, 3, 2], rssi=-60 - places[:2, 0], model="gp")
+    assert "2 places to learn from are too few to tell errors" in caplog.text

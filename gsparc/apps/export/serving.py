@@ -219,7 +219,7 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
             task.cancel()
         writer.shutdown(wait=False, cancel_futures=True)
 
-    app = FastAPI(title="gsparc", lifespan=life)
+    app = FastAPI(title="gsparc", lifespan=life, docs_url=None, redoc_url=None)  # scripts from elsewhere
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
@@ -267,18 +267,22 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
             return Response(whole, headers=about, media_type=kind)
         return StreamingResponse(stream_blocks(values, raw), headers=about, media_type=kind)
 
-    return app if token is None else _guarded(app, f"Bearer {token}".encode())
+    return _guarded(app, None if token is None else f"Bearer {token}".encode())
 
 
-def _guarded(app: ASGIApp, wanted: bytes) -> ASGIApp:
-    """Whatever is asked, but for /healthz, needs the token."""
+def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
+    """Requests have one end, and whatever is asked, but for /healthz, needs the token, if there is one."""
 
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
-        given = dict(scope.get("headers", ())).get(b"authorization", b"")
-        free = scope["type"] == "lifespan" or scope["path"] == "/healthz"
-        fault = {"detail": "Authorization: Bearer TOKEN is needed"}
-        refused = JSONResponse(fault, 401, {"connection": "close"})
-        await (app if free or hmac.compare_digest(given, wanted) else refused)(scope, receive, send)
+        heads = dict(scope.get("headers", ()))
+        free = wanted is None or scope["type"] == "lifespan" or scope["path"] == "/healthz"
+        fault, status = "", 400
+        if heads.keys() >= {b"content-length", b"transfer-encoding"}:  # two ends hide a second request
+            fault = "Content-Length beside Transfer-Encoding"
+        elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
+            fault, status = "Authorization: Bearer TOKEN is needed", 401
+        refused = JSONResponse({"detail": fault}, status, {"connection": "close"})
+        await (refused if fault else app)(scope, receive, send)
 
     return guard
 
@@ -286,6 +290,8 @@ def _guarded(app: ASGIApp, wanted: bytes) -> ASGIApp:
 def _read(end: str, asked: Asked) -> np.ndarray:
     """World places (n, 3) float64 [m] of a body; raises ValueError."""
     try:
+        if not asked.raw and asked.body.count(b'"') != 2:  # of one key: of two alike the last would count
+            raise ValueError
         raw = np.frombuffer(asked.body, "<f4").reshape(-1, 3) if asked.raw else None
         places = PlacesBody.model_validate_json(asked.body).places if raw is None else raw
     except (ValidationError, ValueError):

@@ -25,6 +25,7 @@ STRAIGHT, EVEN = -0.9, 0.7  # cosine at the middle row of three, and ratio of it
 OWN = {NEAR: 0.7, IN_LINE: 0.45}  # share of the correlation that rows with phases of their own keep at most
 ALIKE = {NEAR: (0.5, 0.8), IN_LINE: (0.6, 0.8)}  # correlation of neighbours of one shape, at least
 CHANCE = 2.0  # times the correlation of noise, within these limits
+SPREAD = 1.17  # standard error of such a scatter of independent pairs, times the root of their number
 MORE = 0.1  # of correlation that a free delay must bring
 SCATTER_DB = {NEAR: 2.0, IN_LINE: 3.2}  # of levels between neighbours, more than fading makes
 
@@ -95,7 +96,8 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
     noise = np.sqrt(max(np.log(max(len(resolvable_delays(rows.tones)), 3)), 1.0) / values[0].size)
     if measured < OWN[reach] * phase and max(phase, delay) > np.clip(CHANCE * noise, *ALIKE[reach]):
         freedom = "phase+delay" if delay > phase + MORE else "phase"
-        freedom = "phase+delay+gain" if scatter > SCATTER_DB[reach] else freedom
+        least = scatter * (1 - 2 * SPREAD / np.sqrt(len(near)))  # few pairs that fade scatter by chance
+        freedom = "phase+delay+gain" if least > SCATTER_DB[reach] else freedom
     apart = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
     return Coherence(len(near), float(np.median(apart)), float(measured), phase, delay, scatter, freedom)
 

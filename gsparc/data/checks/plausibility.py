@@ -42,7 +42,7 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         steps: `find_level_steps` them.
     """
     severe = map(Severe, [*level_warnings(levels.level_db), *floor_warnings(levels)])
-    warnings = [*severe, *duplicate_warnings(levels), *outlier_row_warnings(levels)]
+    warnings = [*severe, *repeat_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
 
@@ -166,19 +166,15 @@ def find_marks(values: np.ndarray) -> list[float]:
         rest = rest[~np.isin(rest, found)]
 
 
-def duplicate_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of rows of one place and station: copies of equal value, repeated measurements else."""
-    rows, known = levels.rows, np.flatnonzero(np.isfinite(levels.level_db))
+def repeat_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of places that one station measured several times, with different levels."""
+    known = np.flatnonzero(np.isfinite(levels.level_db))
     links = np.column_stack([levels.position, levels.station, levels.level_db])[known]
-    different, first, which = np.unique(links, axis=0, return_index=True, return_inverse=True)
-    same = [f"{rows[known[i]]} of {rows[known[j]]}" for i, j in enumerate(first[which.reshape(-1)]) if i != j]
-    fine = "fine if measured twice (rows of a place stay on one side of a split), as are repeats near by"
-    copies = f"copies (same place, station and level): {list_first(same)}; {fine}, else leave out"
-    apart = np.split(different[:, -1], np.flatnonzero(np.diff(different[:, :-1], axis=0).any(axis=1)) + 1)
-    spreads = [one.std(ddof=1) for one in apart if len(one) > 1]
+    links = links[np.lexsort(links.T[::-1])]
+    apart = np.split(links[:, -1], np.flatnonzero(np.diff(links[:, :-1], axis=0).any(axis=1)) + 1)
+    spreads = [spread for one in apart if len(one) > 1 and (spread := one.std(ddof=1)) > 0]
     repeated = f"{len(spreads)} places were measured more than once by one station, with different levels"
-    spread = f"(standard deviation {np.median(spreads or [0]):.2g} dB, median)"
-    return [copies] * bool(same) + [f"{repeated} {spread}"] * bool(spreads)
+    return [f"{repeated} (standard deviation {np.median(spreads or [0]):.2g} dB, median)"] * bool(spreads)
 
 
 def outlier_row_warnings(levels: LinkLevels) -> list[str]:

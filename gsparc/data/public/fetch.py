@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import yaml
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from gsparc.data.errors import DataError, explain_error, suggest_name
 from gsparc.data.files import platform_cache, read_shipped_table
@@ -23,6 +25,7 @@ MIRROR = "GSPARC_DATA_URL"  # environment variable: a server laid out as GitHub'
 RAW = "https://raw.githubusercontent.com"
 STALLED_S = 30.0  # without a byte
 CHUNK = 2**16  # bytes
+SLOWEST, PATIENCE = 20e3, 10  # bytes a second of a whole file, beside so many times the wait for a byte
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,13 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
     _licence(wanted, accept)
     try:
         wanted.folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(wanted.folder / ".lock"):
+        lock = FileLock(wanted.folder / ".lock")
+        try:
+            held = lock.acquire(timeout=0)
+        except Timeout:
+            log.warning("%s: another process fetches it; waiting for it to end", wanted.name)
+            held = lock.acquire()
+        with held:
             # Of a fetch that was killed: nobody else holds the lock.
             for stray in {*wanted.folder.rglob("tmp*")} - wanted.files().keys():
                 stray.unlink()
@@ -207,10 +216,37 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
         task = progress.add_task(wanted.name, total=sum(source.bytes for source in wanted.sources))
         for name, source in files.items():
             try:  # of what is there, only the hash is taken
-                store.fetch(name, downloader=pooch.HTTPDownloader(timeout=timeout_s, chunk_size=CHUNK))
+                store.fetch(name, downloader=partial(_download, source=source, timeout_s=timeout_s))
             except (requests.RequestException, ValueError) as error:
                 raise DataError(_fault(source, error, wanted.name)) from None
             progress.advance(task, source.bytes)
+
+
+def _download(url: str, output_file: Any, _: Any, source: Source, timeout_s: float) -> None:
+    """Write what a server sends, as it sends it, until it is more than the file or takes too long.
+
+    Raises:
+        ValueError: another size.
+        requests.RequestException: no such file, cut short, or out of time.
+    """
+    import requests
+    from urllib3.exceptions import HTTPError
+
+    end, size = time.monotonic() + PATIENCE * timeout_s + source.bytes / SLOWEST, 0
+    plain = {"Accept-Encoding": "identity"}
+    asked = requests.get(url, headers=plain, timeout=timeout_s, stream=True)
+    with asked as answer, Path(output_file).open("wb") as file:
+        answer.raise_for_status()
+        try:
+            while part := answer.raw.read1(CHUNK, decode_content=False):
+                size += len(part)
+                if size > source.bytes:
+                    raise ValueError("more than the pinned file holds")
+                if time.monotonic() > end:
+                    raise requests.Timeout(f"timed out after {size:,} bytes")
+                file.write(part)
+        except HTTPError as error:
+            raise requests.exceptions.ChunkedEncodingError(error) from None
 
 
 def _fault(source: Source, error: Exception, name: str) -> str:
@@ -221,7 +257,8 @@ def _fault(source: Source, error: Exception, name: str) -> str:
     if isinstance(error, requests.HTTPError | requests.TooManyRedirects):
         return f"{source.url}: {explain_error(error).partition(' for url')[0]}; {again}"
     if "timed out" in str(error):
-        return f"{source.url}: the server sends nothing; {again}"
+        slowly = "too little in the time that such a file may take" if "after" in str(error) else "nothing"
+        return f"{source.url}: the server sends {slowly}; {again}"
     if isinstance(error, requests.exceptions.ChunkedEncodingError) or "IncompleteRead" in str(error):
         return f"{source.url}: cut short; {again}"
     if isinstance(error, requests.RequestException):

@@ -282,8 +282,9 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     naming = [head for head in sheet.heads if parse_head(head).role == "station"]
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
-    # What is of a beam is no measurement, whatever its head says besides.
-    others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in (*SECTOR, *TILTS)]]
+    # What is of a beam, or a carrier, is no measurement, whatever its head says besides.
+    own = {*SECTOR, *TILTS, "carrier_hz"}
+    others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in own]]
     chosen, notes = choose_columns(
         replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {}
     )

@@ -5,15 +5,27 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, list_first
+from gsparc.data.errors import Caution, DataError, list_first
 from gsparc.data.files import read_shipped_table
 from gsparc.data.tables.heads import LISTS, SHEET, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
+from gsparc.data.units import UNITS, Unit
 
 HEADS = {text: name for name, texts in SHEET["sectors"].items() for text in texts}
 # 3GPP TS 36.101, table 5.7.3-1: lowest downlink frequency [MHz] of a band, and its first EARFCN.
 BANDS = pd.DataFrame(read_shipped_table(__package__, "bands.csv")).astype(float).set_index("band")
 TILTS = ("total", "mechanical", "electrical")
+# Lowest and highest that there is, and what the largest reaches unless all are 0; the kind of their unit.
+RANGES = {
+    "station_azimuth": (-360, 360, 1, "angle"), "station_width": (0, 360, 1, "angle"),
+    "station_thickness": (0, 360, 1, "angle"), "total": (-90, 90, 0.1, "angle"),
+    "mechanical": (-90, 90, 0.1, "angle"), "electrical": (-90, 90, 0.1, "angle"),
+    "station_power_db": (-50, 100, 1, "power"), "height": (-500, 9000, 0.3, "length"),
+    "carrier_hz": (2e8, 1.1e11, 0, "frequency"),
+}  # fmt: skip
+FIRST_NR = (
+    100_000  # channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1)
+)
 MOST_BAND = 90  # numbers beyond are frequencies [MHz]
 MHZ = 1e6
 
@@ -25,10 +37,14 @@ def sector_quantity(head: str) -> str | None:
 
 
 def earfcn_hz(channel: np.ndarray) -> np.ndarray:
-    """Return downlink frequencies [Hz] of LTE channel numbers (n,), NaN of none (3GPP TS 36.101, 5.7.3)."""
+    """Return downlink frequencies [Hz] of LTE or NR channel numbers (n,), NaN of none (TS 36.101, 5.7.3)."""
     lowest, first = BANDS.sort_values("first_earfcn").to_numpy().T
     at = np.searchsorted(first, np.nan_to_num(channel, nan=-1), side="right") - 1
-    return np.where(at >= 0, (lowest[at] + 0.1 * (channel - first[at])) * MHZ, np.nan)
+    lte = np.where(at >= 0, lowest[at] + 0.1 * (channel - first[at]), np.nan)
+    nr = np.where(channel < 600_000, 0.005 * channel, 3000 + 0.015 * (channel - 600_000))
+    nr = np.where(channel < 2_016_667, nr, 24250.08 + 0.06 * (channel - 2_016_667))
+    lte = np.where((channel % 1 == 0) & (channel <= 3_279_165), lte, np.nan)
+    return np.where((channel < FIRST_NR) | np.isnan(lte), lte, nr) * MHZ
 
 
 def band_hz(band: np.ndarray) -> np.ndarray:
@@ -45,7 +61,8 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
         used: heads that are read as something else.
     """
     found: dict[str, np.ndarray] = {}
-    notes, unread, heads = [], [], []
+    notes: list[str] = []
+    unread, heads = [], []
     for head in [head for head in sheet.heads if head not in used]:
         name, unit = sector_quantity(head), unit_of(head)[1]
         words = sheet.words(head) if name else np.zeros(0, str)
@@ -53,15 +70,28 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
         if name is None or name in found or not np.isfinite(values).any():
             unread.append(repr(head))
             continue
-        if name == "carrier_hz" and unit is None and np.nanmax(values) < MHZ:
-            values = values * MHZ
+        said = name
+        if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
+            own = next(
+                (one for one in ("Hz", "kHz", "MHz", "GHz") if _fits(UNITS[one.lower()], values, name)), "Hz"
+            )
+            values, said = UNITS[own.lower()].convert(values), f"{name} in {own}"
         elif unit is not None and unit.kind == "power" and name == "station_power_db":
             with np.errstate(divide="ignore", invalid="ignore"):
                 values = 10 * np.log10(unit.convert(values)) + 30
         elif unit is not None:
             values = unit.convert(values)
+        if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
+            values, said = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
+        if name in ("station_width", "station_thickness") and (values == 0).any():
+            values, said = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
+        if name in TILTS and (values < 0).any() and not (values > 0).any():
+            notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
+            values = -values
+        if name in RANGES and not _fits(UNITS["m"], values, name):
+            _refuse_range(sheet, head, name, values)
         found[name] = values
-        heads.append(f"{head!r} as {name}")
+        heads.append(f"{head!r} as {said}")
     parts = [found.pop(name) for name in TILTS if name in found]
     if parts:
         total = np.nansum(parts[-2:] if len(parts) < 3 else parts[:1], axis=0)
@@ -71,12 +101,40 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
             carrier = turned(found.pop(name))
             if np.isfinite(carrier).all():
                 found.setdefault("carrier_hz", carrier)
+                notes.append(f"{sheet.source}: carriers by {name}: {list_first(_in_mhz(carrier), 4)}")
+            elif "carrier_hz" not in found:
+                notes.append(Caution(f"{sheet.source}: {name}: some of it names no frequency; not read"))
     if heads:
         notes.append(f"{sheet.source}: of sectors {', '.join(heads)}")
     if unread:
         heads_ = f"column{'s' * (len(unread) > 1)} {list_first(unread, 8)}"
         notes.append(Caution(f"{sheet.source}: not read: {heads_}"))
     return found, notes
+
+
+def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
+    """Whether values (n,) that are in a unit can be those of a quantity of `RANGES`."""
+    low, high, least, _ = RANGES[name]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = unit.convert(values[np.isfinite(values)])
+        own = 10 * np.log10(own) + 30 if unit.kind == "power" else own
+    return not own.any() or bool(((own >= low) & (own <= high)).all() and np.abs(own).max() >= least)
+
+
+def _refuse_range(sheet: Sheet, head: str, name: str, values: np.ndarray) -> None:
+    """Refuse a column in a unit that it cannot be in, and name those that it can (DataError)."""
+    low, high, least, kind = RANGES[name]
+    fitting = [unit.name for unit in UNITS.values() if unit.kind == kind and _fits(unit, values, name)]
+    fits = f", where {' or '.join(fitting[:3])} would fit" if len(fitting) > 1 else ""
+    remedy = f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'{fits}" if fitting else ""
+    raise DataError(
+        f"{sheet.source}: column {head!r} holds {np.nanmin(values):g} to {np.nanmax(values):g}; expected "
+        f"{name} of {low:g} to {high:g}, {least:g} at least once{remedy}"
+    )
+
+
+def _in_mhz(carrier: np.ndarray) -> list[str]:
+    return [f"{one / MHZ:g} MHz" for one in np.unique(carrier)]
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from hashlib import file_digest, sha256
+from importlib.metadata import distribution, packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -37,10 +38,13 @@ OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 PROGRAM = (".py", ".cpp", ".cu", ".h", ".hpp", ".cuh", ".so")
+UNREAD = (".pyc", ".md", ".rst", ".log")  # by no plugin
 OURS = ("gsparc", "ops", "callbacks", "conf", "hydra_plugins")  # folders of gsparc's checkout
 STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
 REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
-DOCSTRING = re.compile(rf'(:\n\s+|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
+# After the head of a definition, or its last line: text after other colons is read by a program.
+HEAD = r"(?m:^)[ \t]*(?:async def|def|class|\))[^\n]*:\n\s+"
+DOCSTRING = re.compile(rf'({HEAD}|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
 LIBRARIES = {"lightning", "torch"}  # named by every configuration; their versions stand in each summary
 
 
@@ -196,16 +200,26 @@ def package_hash(package: str) -> str:
 
 
 def program_files(package: str) -> tuple[Path, list[str]]:
-    """Return a folder and the files below it that are a package's program; of gsparc's its own folders'."""
+    """Return a folder and the files below it that are a package's program; of gsparc's its own folders'.
+
+    Of a plugin it is all that was installed with it, or stands beside it in packages or alone: what it
+    imports, and the tables and weights that it reads.
+    """
     spec = find_spec(package)
-    if spec is None:
+    if spec is None or not (spec.origin or spec.submodule_search_locations):
         return Path(), []
-    if spec.submodule_search_locations is None:  # one module
-        return Path(), [spec.origin] if spec.origin else []
-    folder = Path(spec.origin).parent if spec.origin else Path(next(iter(spec.submodule_search_locations)))
-    root, parts = folder.parent, OURS if package == "gsparc" else (folder.name,)
-    every = (file for part in parts for file in (root / part).rglob("*"))
-    return root, [str(file.relative_to(root)) for file in every if file.suffix in PROGRAM]
+    inside = spec.submodule_search_locations
+    root = Path(spec.origin).parent if spec.origin else Path(next(iter(inside or ())))
+    root = root if inside is None else root.parent
+    if package == "gsparc":
+        every = (file for part in OURS for file in (root / part).rglob("*"))
+        return root, [str(file.relative_to(root)) for file in every if file.suffix in PROGRAM]
+    if root.name in ("site-packages", "dist-packages"):
+        names = packages_distributions().get(package, ())
+        return root, [str(file) for name in names for file in distribution(name).files or ()]
+    packages = {one.parent for one in root.glob("*/__init__.py")} | ({root / package} if inside else set())
+    beside = {*root.iterdir(), *(file for one in packages for file in one.rglob("*"))}
+    return root, [str(one.relative_to(root)) for one in beside if one.suffix not in UNREAD]
 
 
 def strip_comments(text: str) -> str:

@@ -24,6 +24,7 @@ from gsparc.training.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
+IN_VAIN = 0.9  # of the power left out: two such searches, and no others begin
 QUADRATURE = 0.4  # initial `Scene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
@@ -80,7 +81,8 @@ def run_searches(
     def is_unwanted(number: int) -> bool:
         """Tell whether those before it are all that is wanted."""
         before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
-        return stopped.is_set() or reached_noise_floor(before, noise_floor)
+        in_vain = sum(error > IN_VAIN for error in before) >= 2  # as where each row has its own phase
+        return stopped.is_set() or in_vain or reached_noise_floor(before, noise_floor)
 
     def run_search(number: int) -> Member:
         """Return sources, their phases, and the clutter that the noise does not hide."""

@@ -262,7 +262,7 @@ def test_the_stated_error_missed_the_metres_under_a_station(monkeypatch):
     rx = rng.uniform([0, 0, 0], [400, 400, 2], (300, 3))
     level = -40 - 20 * np.log10(np.linalg.norm(rx - tx, axis=1))
     predictor = gsparc.fit(rx=rx, tx=tx, rssi=level, model="idw")
-    found = make.compile_model(predictor, 1024)
+    found = make.compile_model(predictor, 4096)
     assert found.form.predictor is not None and "RMSE dB" in found.summary and "at the worst" in found.summary
     places = make.random_places(predictor.site, 3_000, 9)
     own, whole = (make.ask_model(one, places)[:, 0] for one in (found.form.predictor, predictor))
@@ -320,3 +320,18 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
     said = subprocess.run(query, check=True, capture_output=True, text=True).stdout
     expected = float(predictor.rssi(rx=[110.0, 60, 1], unit="linear")[0])
     assert float(said.split("first value ")[1].split(",")[0]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_distilled_form_was_wrong_by_the_law_of_distance_outside_its_box():
+    """19 dB far away, where the training box was told to .011 dB."""
+    predictor = of_powers(80, "kriging")
+    found = make.compile_model(predictor, 256)
+    assert found.form.predictor is not None and "outside their box" in found.summary
+    for away in (3.0, 30.0, 200.0):
+        middle = predictor.site.moving_box.mean(0) + predictor.site.origin
+        around = np.linspace(0, 2 * np.pi, 24)
+        reach = away * np.ptp(predictor.site.moving_box[:, :2], axis=0).max() / 2
+        places = middle + reach * np.c_[np.cos(around), np.sin(around), 0 * around]
+        error = found.form.predictor.rssi(**{predictor.site.moving_end: places})
+        error = error - predictor.rssi(**{predictor.site.moving_end: places})
+        assert np.abs(error).max() < 1.5, (away, np.abs(error).max())

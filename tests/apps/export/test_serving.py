@@ -411,3 +411,28 @@ def test_an_honest_client_is_answered_among_hostile_ones(kind, tmp_path, request
         mb = f"{after[0]:.0f} MB, then {min(after):.0f} to {max(after):.0f}"
         sys.stderr.write(f"{len(late)} answers, median, p99, last {times}; {mb}\n")
     assert hostile.returncode == 0 and max(after) - after[0] < 20
+
+
+def test_a_second_request_hid_in_a_body_of_two_ends(served):
+    """`Content-Length` beside `Transfer-Encoding` was answered, and what stood behind it, too."""
+    body = as_json([[1, 2, 1]])
+    chunked = f"{len(body):x}\r\n{body.decode() if isinstance(body, bytes) else body}\r\n0\r\n\r\n"
+    head = "POST /predict HTTP/1.1\r\nHost: a\r\nContent-Type: application/json\r\nContent-Length: 4\r\n"
+    with socket.create_connection(("127.0.0.1", served.port), timeout=10) as client:
+        client.sendall((head + "Transfer-Encoding: chunked\r\n\r\n" + chunked).encode())
+        client.sendall(b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n")
+        answer = b""
+        with contextlib.suppress(ConnectionResetError):
+            while part := client.recv(65536):
+                answer += part
+    assert answer.startswith(b"HTTP/1.1 400") and answer.count(b"HTTP/1.1") == 1
+    assert b"Content-Length beside Transfer-Encoding" in answer and b"connection: close" in answer
+
+
+def test_a_repeated_key_answered_the_second(served):
+    body = b'{"places": [[1, 2, 1]], "places": [[9, 9, 1]]}'
+    assert ask_http(served.port, "POST", "/predict", body, {"Content-Type": "application/json"})[0] == 422
+
+
+def test_no_page_loads_scripts_from_elsewhere(served):
+    assert [ask_http(served.port, "GET", path, None, {})[0] for path in ("/docs", "/redoc")] == [404, 404]

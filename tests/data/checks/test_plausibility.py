@@ -110,16 +110,14 @@ def test_whole_decibels_are_sound():
     assert plausibility.level_warnings(np.array([np.nan, np.nan])) == []
 
 
-def test_copies_and_repeated_measurements():
+def test_repeated_measurements():
     place, level = room(count=20)
-    place[5], level[5] = place[3], level[3]  # a copy
     place[9], level[9] = place[8], level[8] + 2  # measured again
     place[11] = place[10]  # of another station
     level[11] = level[10]
     links = replace(as_links(place, level[:, None], ["a"]), station=np.arange(20) // 11 % 2)
-    found = plausibility.duplicate_warnings(links)
-    assert len(found) == 2 and "row 5 of row 3; fine if measured twice" in found[0]
-    assert "1 places were measured more than once" in found[1] and "1.4 dB" in found[1]
+    found = plausibility.repeat_warnings(links)
+    assert len(found) == 1 and "1 places were measured more than once" in found[0] and "1.4 dB" in found[0]
 
 
 def test_a_wild_row_is_named():
@@ -196,16 +194,6 @@ def test_real_outages_are_not_taken_for_silence():
         "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line for line in found
     )
     assert not any("sensitivity_db" in line for line in found)
-
-
-def test_copies_in_a_file_of_links_were_one_row():
-    """Rows of one place and station were entered into one cell before anyone looked for copies."""
-    place, level, station = walk(0, 60)
-    where = np.repeat(np.column_stack([place, np.ones(60)]), 2, axis=0)
-    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
-    links = {"rx_position": where, "station_position": posts, "station": np.repeat(np.arange(60) % 2, 2)}
-    found = warnings_of(link_levels(from_arrays({**links, "rssi_db": np.repeat(level, 2)})))
-    assert found[0].startswith("copies (same place, station and level): row 1 of row 0, row 3 of row 2")
 
 
 def test_a_station_for_each_place_is_no_outage_of_the_others():

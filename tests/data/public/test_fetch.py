@@ -1,16 +1,20 @@
 """Public data from a local server: what comes, what is refused in one line, and what is kept."""
 # ruff: noqa: E501 (a case is a row of a table)
 
+import contextlib
 import csv
+import gzip
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import mirrors
 import pytest
+from filelock import FileLock
 from mirrors import mirrored, offer, sound, source_of
 from releases import real
 
@@ -186,6 +190,7 @@ SLOW = """
 import sys
 sys.path[:0] = [{helpers!r}]
 import pytest
+from filelock import FileLock
 from mirrors import offer, source_of
 from gsparc.data.public.fetch import fetch
 with pytest.MonkeyPatch.context() as patch:
@@ -246,3 +251,69 @@ def test_the_list_tells_size_licence_and_source(capsys):
     listed = capsys.readouterr().out
     assert "newrf-rooms: all nine rooms" in listed and "5.6 MB in 9 files; MIT; dataset=newrf" in listed
     assert "github.com/wenchaozheng/WRF-GSplus at e564f31844" in listed and "no licence stated" in listed
+
+
+def test_more_than_the_known_size_is_not_read(mirror, monkeypatch, tmp_path):
+    """A mirror that sent 300 MB for 386 kB was read thrice to its end."""
+    sent = []
+
+    def flood(request, content):
+        request.send_response(200)
+        request.end_headers()
+        with contextlib.suppress(OSError):
+            for _ in range(1000):
+                request.wfile.write(os.urandom(2**16))
+                sent.append(2**16)
+
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, flood, flood, flood))
+    with pytest.raises(DataError, match="not the 3,000 bytes of the pinned revision"):
+        fetch("room")
+    assert sum(sent) < 3 * 20e6
+
+
+def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path):
+    def drips(request, content):
+        request.send_response(200)
+        request.send_header("Content-Length", str(len(content)))
+        request.end_headers()
+        with contextlib.suppress(OSError):
+            for one in content:
+                request.wfile.write(bytes([one]))
+                if mirror.stop.wait(0.02):
+                    return
+
+    monkeypatch.setattr(fetching, "PATIENCE", 2)
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, drips))
+    with pytest.raises(DataError, match="the server sends too little in the time"):
+        fetch("room", timeout_s=0.1, retries=0)
+
+
+def test_what_is_packed_on_the_wire_is_not_unpacked(mirror, monkeypatch, tmp_path):
+    def packed(request, content):
+        body = gzip.compress(bytes(10**7))
+        request.send_response(200)
+        request.send_header("Content-Encoding", "gzip")
+        request.send_header("Content-Length", str(len(body)))
+        request.end_headers()
+        with contextlib.suppress(OSError):
+            request.wfile.write(body)
+
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, packed))
+    with pytest.raises(DataError, match="not the 3,000 bytes"):
+        fetch("room", retries=0)
+
+
+def test_who_waits_for_another_fetch_is_told(mirror, monkeypatch, tmp_path, caplog):
+    room = offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE))
+    room.folder.mkdir(parents=True)
+    held = threading.Event()
+
+    def hold():
+        with FileLock(room.folder / ".lock"):
+            held.set()
+            time.sleep(0.3)
+
+    threading.Thread(target=hold).start()
+    held.wait()
+    fetch("room")
+    assert "another process fetches it" in caplog.text and not room.missing()

@@ -177,6 +177,30 @@ def test_commits_of_comments_alone_made_every_cell_stale():
     assert strip_comments("x = 1  # one\n") == strip_comments("x = 1\n") != strip_comments("x = 2\n")
 
 
+def test_text_after_a_colon_was_taken_for_a_docstring():
+    one, two = (f'WORDS = {{\n    "a":\n        """{word}""",\n}}\n' for word in ("one", "two"))
+    assert strip_comments(one) != strip_comments(two)
+    assert "said" not in strip_comments('def f(\n    x,\n) -> int:\n    """said"""\n    return x\n')
+
+
+def test_a_plugin_s_helper_or_weights_were_edited_and_it_counted_as_done(tmp_path, monkeypatch):
+    """Two jobs were done already, 2.93 dB where over 20 is right."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "lone_plugin.py").write_text("import lone_helper\n")
+    (tmp_path / "lone_parts").mkdir()
+    files = ["lone_helper.py", "weights.npz", "lone_parts/__init__.py", "lone_parts/table.csv"]
+    for name in files:
+        (tmp_path / name).write_text("1\n")
+    hashes = [package_hash("lone_plugin")]
+    for name in files:
+        (tmp_path / name).write_text("2\n")
+        hashes.append(package_hash("lone_plugin"))
+    assert len({*hashes}) == 5
+    (tmp_path / "outputs").mkdir()  # of runs
+    (tmp_path / "outputs" / "summary.json").write_text("{}")
+    assert package_hash("lone_plugin") == hashes[-1]
+
+
 def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     walls, states = tmp_path / "walls.yaml", []
     for text in ("[]", "[1]"):

@@ -71,6 +71,7 @@ def sound(tmp_path_factory) -> tuple[Path, Path]:
 
 def altered(sound: Path, to: Path, **changes: object) -> Path:
     content = torch.load(sound, weights_only=True)
+    del content["sha256"]  # as of an older file: other guards are asked
     content.update(changes)
     torch.save(content, to)
     return to

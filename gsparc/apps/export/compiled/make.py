@@ -53,6 +53,7 @@ class CompiledForm:
 # As `gsparc evaluate` has them.
 FIGURES: dict[Kind, str] = {"spectrum": "MSE", "csi": "NMSE", "rssi": "RMSE dB"}
 NEAREST = 1e-3  # of the way to the other end: where the largest errors are looked for
+FAR_SHARE, FARTHEST = 8, 300.0  # one far place for so many; widths of the box that are away, at most
 SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
 
@@ -85,6 +86,9 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     found = np.array([squared[:count].mean(), squared.max()]) / max(power[:count].mean(), 1e-300)
     error, worst = np.maximum(np.sqrt(found) if site.kind == "rssi" else found, 1e-12).tolist()
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
+    if site.kind == "rssi":
+        away, _ = _squares(form.predictor, predictor, far_places(site, 256, seed + 4))
+        figure += f", {np.sqrt(away.mean()):.2g} outside their box"
     return CompiledForm(form, error, worst, f"{_NAMES[form.kind]}, distilled from {method.name}: {figure}")
 
 
@@ -154,7 +158,10 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     if site.kind == "spectrum":
         raise ValueError(f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)")
     sources = _sources_of(method) if site.kind == "csi" else None
-    data = sample_model(predictor, random_places(site, ANSWERED[site.kind], seed))
+    places = random_places(site, ANSWERED[site.kind], seed)
+    if sources is None:  # the law of distance that goes on outside the box
+        places = np.concatenate([places, far_places(site, len(places) // FAR_SHARE, seed)])
+    data = sample_model(predictor, places)
     if sources is not None:
         return _sources_given(sources, data)
     every = np.arange(len(data))
@@ -197,6 +204,14 @@ def random_places(site: Site, count: int, seed: int) -> np.ndarray:
     """
     low, high = site.moving_box
     return np.random.default_rng(seed).uniform(low, high, (count, len(low))).astype(np.float32)
+
+
+def far_places(site: Site, count: int, seed: int) -> np.ndarray:
+    """Return places like `random_places`, moved away from the middle, evenly in the logarithm of how much."""
+    places, middle = random_places(site, count, seed + 3), site.moving_box.mean(axis=0)
+    away = FARTHEST ** np.random.default_rng(seed + 3).uniform(size=(count, 1))
+    flat = np.tile([1, 1, 0], places.shape[1] // 3).astype(bool)  # heights stay
+    return np.where(flat, middle + away * (places - middle), places).astype(np.float32)
 
 
 def near_places(site: Site, count: int, seed: int) -> np.ndarray:

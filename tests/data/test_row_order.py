@@ -1,0 +1,102 @@
+"""Copies of rows count once, and what draws rows does not ask for their order in the file."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import gsparc
+from gsparc.data.checks.describe import describe
+from gsparc.data.own import from_arrays, interpret
+from gsparc.data.raw import Raw
+from gsparc.data.row_order import find_copies, order_rows
+from gsparc.data.splits import Fold
+
+NONE = np.zeros(0, np.int64)
+POSTS = np.array([[20.0, 3, 6], [-5, 30, 6], [40, 40, 9]])
+
+
+def rows_of(kind: str) -> dict[str, np.ndarray]:
+    """Arrays of 60 rows of a kind and layout; those named `_` belong to no row."""
+    rng = np.random.default_rng(3)
+    places = np.cumsum(rng.normal(size=(60, 3)), axis=0)
+    waves = rng.normal(size=(60, 2, 4)) + 1j * rng.normal(size=(60, 2, 4))
+    levels = np.round(
+        -60 - 0.5 * np.linalg.norm(places[:, None] - POSTS, axis=2) + rng.normal(size=(60, 3)), 1
+    )
+    one = {"rx_position": places, "_tx_position": POSTS[0]}
+    station = rng.permutation(np.arange(60) % 3)
+    return {
+        "powers": {**one, "rssi_db": levels[:, 0]},
+        "wide": {"rx_position": places, "_station_position": POSTS, "rssi_db": levels},
+        "long": {"rx_position": places, "_station_position": POSTS, "station": station,
+                 "rssi_db": levels[np.arange(60), station]},
+        "both": {"rx_position": places, "tx_position": places[::-1] + 9, "rssi_db": levels[:, 0]},
+        "channels": {**one, "csi": waves, "_frequency_hz": 5e9 + 1e6 * np.arange(4)},
+        "stations' channels": {"rx_position": places, "_station_position": POSTS,
+                               "csi": rng.normal(size=(60, 3, 2, 4)) + 0j,
+                               "_frequency_hz": 5e9 + np.arange(4)},
+        "spectra": {"_rx_position": POSTS[0], "tx_position": places,
+                    "spectrum": rng.uniform(size=(60, 12, 24))},
+    }[kind]  # fmt: skip
+
+
+def measurements(arrays: dict[str, np.ndarray], order: np.ndarray):
+    return from_arrays({name.lstrip("_"): a if name[0] == "_" else a[order] for name, a in arrays.items()})
+
+
+KINDS = ("powers", "wide", "long", "both", "channels", "stations' channels", "spectra")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_order_of_the_file_is_one_order(kind):
+    """Rows for learning were drawn by their numbers: a drive reversed was answered otherwise by 1 dB."""
+    arrays, every = rows_of(kind), []
+    for order in (np.arange(60), np.arange(60)[::-1], np.random.default_rng(1).permutation(60)):
+        data = measurements(arrays, order)
+        east = data.moving[:, 0] > np.median(data.moving[:, 0])
+        every.append(order_rows(data, Fold(np.flatnonzero(east), np.flatnonzero(~east), NONE)))
+    (data, fold), *others = every
+    assert len(fold.train) and len(fold.val)
+    for other, its in others:
+        for name in ("tx", "rx_position", "target", "mask", "station", "place", "censored"):
+            assert np.array_equal(getattr(data, name), getattr(other, name)), name
+        assert np.array_equal(fold.train, its.train) and np.array_equal(fold.val, its.val)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "copied", [lambda n: np.tile(n, 2), lambda n: np.repeat(n, 2), lambda n: np.r_[n, n[:20]]]
+)
+def test_rows_that_stand_twice_count_once(kind, copied):
+    """A packet logged twice told of coherence, noise and lengths; lists of the strongest were not seen."""
+    arrays, rows = rows_of(kind), np.arange(60)
+    once, more = measurements(arrays, rows), measurements(arrays, copied(rows))
+    assert len(more) == len(once) and np.array_equal(np.sort(once.moving, 0), np.sort(more.moving, 0))
+    assert dict(describe(once)).get("phases") == dict(describe(more)).get("phases")
+    note = f"copies of other rows (same places, station and values): {len(copied(rows)) - 60}"
+    raw = Raw({name.lstrip("_"): a if name[0] == "_" else a[copied(rows)] for name, a in arrays.items()}, {})
+    assert any(one.startswith(note[:40]) for one in interpret(raw, "file").notes)
+
+
+def test_equal_whole_decibels_of_visits_are_measurements():
+    """A place visited ten times hears the same whole decibel again: evidence, unless all is doubled."""
+    rng = np.random.default_rng(0)
+    place = np.repeat(np.arange(20), 10)
+    level = np.round(rng.normal(-70, 1, 200))
+    assert not find_copies(place, place, level).any()
+    twice = np.tile(np.arange(200), 2)
+    assert find_copies(place[twice], place[twice], level[twice]).sum() == 200
+
+
+def test_a_drive_reversed_is_answered_alike(caplog):
+    """Rows that validate were drawn by number."""
+    caplog.set_level(logging.ERROR)
+    arrays = rows_of("channels")
+    asked = arrays["rx_position"][:9] + 0.1
+    answers = [
+        gsparc.fit(rx=arrays["rx_position"][order], tx=POSTS[0], csi=arrays["csi"][order],
+                   frequency_hz=arrays["_frequency_hz"], model="complex_gp", align="none").csi(rx=asked)
+        for order in (np.arange(60), np.arange(60)[::-1])
+    ]  # fmt: skip
+    assert np.abs(answers[0] - answers[1]).max() < 1e-6 * np.abs(answers[0]).std()
