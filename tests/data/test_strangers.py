@@ -243,3 +243,14 @@ def test_places_and_tones_that_a_file_lacks_can_be_said(capsys):
 def test_groups_of_places_were_said_twice(write, caplog):
     Own(write(long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES))).load()
     assert sum("groups of places" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
+    """Android's -1 and a computer's largest number are no value; beside weak levels alone not heard."""
+    some = RNG.random(LEVELS.shape) < 0.1
+    for mark in (-1, 2147483647, -32768):
+        cells = np.where(some, mark, LEVELS.astype(int)).astype(str)
+        path = write(table("x,y,AP1,AP2,AP3", *PLACES.T, *cells.T))
+        found, data = said(path), read_any(path).data
+        assert "as well as weak ones: no value, left out" in found and data.censored is None, found
+        assert len(data) == (~some).sum()

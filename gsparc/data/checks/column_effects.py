@@ -25,7 +25,7 @@ NEAR = 8  # rows that a row is compared with
 REPEATED = 4  # rows for each value of a column that may name something
 REACHES, NUGGETS = (1 / 3, 1 / 10, 1 / 30, 1 / 100), (0.05, 0.2, 0.7, 3.0)  # as in `level_steps`
 RATIO = math.log(30)  # of likelihoods
-COPY, LESS, WEAK = 0.9, 0.9, 0.85  # see `_contrast`
+COPY, LESS, WEAK = (0.9, 0.7), 0.9, 0.85  # see `_contrast`
 TOLERANCE = 0.2  # of a slope that should be 1, or another power of ten
 MOST_EFFECTS = 4
 ALIKE = 1.03  # contrasts within this ratio are of columns that tell the same
@@ -97,8 +97,9 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
         alike = (one for one in known if one.contrast < ALIKE * known[0].contrast)
         best = min(alike, key=lambda one: texts[one.head].max())
         found.append(best)
-        if best.kind == "number":
-            links = replace(links, level=links.level - best.size * np.nan_to_num(values[best.head]))
+        value = values[best.head]
+        if best.kind == "number" and value is not None:
+            links = replace(links, level=links.level - best.size * value)
         elif best.kind == "device":
             links = replace(links, level=links.level - _devices(links, texts[best.head]).offsets(links))
         else:
@@ -198,9 +199,15 @@ def _contrast(
         code: (n,) the column's values, or numbers.
         slope: that multiplies numbers; 0: none.
     """
-    level = links.level
-    if np.var(level - slope * code if slope else _centred(level, code)) < (1 - COPY) * np.var(level):
-        return 1.0
+    level, stations = links.level, np.unique(links.station)
+    left = level - slope * code if slope else level
+    for own in (links.station == one for one in stations):
+        within = left[own] if slope else _centred(left[own], code[own])
+        if (
+            np.var(within) < (1 - COPY[len(stations) > 1]) * np.var(level[own])
+            and own.sum() >= LEAST_ROWS / 3
+        ):
+            return 1.0
     rest = []
     for first, second in (pair.T for pair in pairs):
         change, step = level[first] - level[second], code[first] - code[second]
@@ -209,7 +216,9 @@ def _contrast(
             return 1.0
         rest.append(float((left**2).mean() / max((change**2).mean(), 1e-12)))
     contrast = rest[0] / max(rest[1], 1e-12)
-    return contrast if contrast < (1 if rest[1] > WEAK else LESS) else 1.0
+    if rest[1] > WEAK and contrast < 1 / LESS:  # it tells nothing of far rows
+        return min(contrast, LESS)
+    return contrast if contrast < LESS else 1.0
 
 
 def _centred(value: np.ndarray, group: np.ndarray) -> np.ndarray:
