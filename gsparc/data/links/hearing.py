@@ -158,7 +158,8 @@ def _forget_unknown(check: Checker, moving: str) -> None:
     marks = find_marks(values)
     heard = np.isfinite(values) & ~np.isin(values, marks) & np.isfinite(place).all(1)
     for mark in marks:
-        beside, marked = [], (values == mark) & np.isfinite(place).all(1)
+        beside: list[bool] = []
+        marked = (values == mark) & np.isfinite(place).all(1)
         for one in np.unique(station[marked]):
             own, asked = (np.flatnonzero(rows & (station == one)) for rows in (heard, marked))
             if len(own) < BESIDE:
