@@ -166,6 +166,7 @@ def test_feather_and_gzip_were_unknown_endings(tmp_path):
 
 @pytest.mark.parametrize("start, way", [
     (b"\x93NUMPY", "savez it beside rx_position"), (b"! VNA\n# Hz S MA R 50\n", r"Touchstone"),
+    (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
     (b"\x80\x05", "a pickle; write Parquet"), (b"PK\x03\x04", "save it as CSV"),
 ])  # fmt: skip
 def test_files_that_no_reader_takes_show_the_way_out(tmp_path, start, way):

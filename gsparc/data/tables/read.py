@@ -137,6 +137,9 @@ class Builder:
                 if {"loss", "pathloss", "pl"} & set(words_of(head)):
                     how = say_column("rssi_db", f"{head}*-1")
                     return self.refuse(f"{fault}; {how} takes losses for levels")
+                if "asu" in words_of(head):
+                    ways = [say_column("rssi_db", f"{head}{turn}") for turn in ("-140", "*2-113")]
+                    return self.refuse(f"{fault}; {head!r} is ASU: {ways[0]} of LTE, {ways[1]} of GSM")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
