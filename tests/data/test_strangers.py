@@ -75,8 +75,6 @@ CASES = {
         "two groups of places 399.9 km apart", "millimetres"),
     "floors": (long("Storey", FLOOR, level=LEVELS[:, 0] - 15 * FLOOR), {}, "dataset.columns.z=Storey*3.2",
         ""),
-    "floors as metres": (long("floor", FLOOR), {"columns": {"z": "floor"}}, "floors as heights in metres?",
-        ""),
     "a floor of 3.2 m": (long("floor", FLOOR), {"columns": {"z": "floor*3.2"}}, "x 6.40 m", "warning"),
     "a flight in feet": (
         table(
@@ -111,6 +109,10 @@ CASES = {
     ),
     "a quality": (table("x,y,quality", *PLACES.T, LEVELS[:, 0] + 110), {},
         "'quality' is a quality, not a level", ""),
+    "arbitrary strength units": (table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140), {},
+        "dataset.columns.rssi_db=asu-140 of LTE, dataset.columns.rssi_db=asu*2-113 of GSM", ""),
+    "units that are said": (table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140),
+        {"columns": {"rssi_db": "asu-140"}}, "good", "warning"),
     "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),
     "units in cells": (long("t", range(ROWS), level=[f"{v} dBm" for v in LEVELS[:, 0]]), {}, "good",
         "refused"),
@@ -158,7 +160,7 @@ def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
         line.removeprefix("warning").strip() for line in said(path).splitlines() if line.startswith("warning")
     ]
     logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warned) > 2 and all(any(text in line for line in logged) for text in warned), warned
+    assert len(warned) > 1 and all(any(text in line for line in logged) for text in warned), warned
 
 
 def test_absent_links_are_silent_only_where_somebody_says_so(write):
@@ -245,3 +247,14 @@ def test_places_and_tones_that_a_file_lacks_can_be_said(capsys):
 def test_groups_of_places_were_said_twice(write, caplog):
     Own(write(long("grid", np.where(np.arange(ROWS) < 80, "32T", "33T"), places=ZONES))).load()
     assert sum("groups of places" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
+    """Android's -1 and a computer's largest number are no value; beside weak levels alone not heard."""
+    some = RNG.random(LEVELS.shape) < 0.1
+    for mark in (-1, 2147483647, -32768):
+        cells = np.where(some, mark, LEVELS.astype(int)).astype(str)
+        path = write(table("x,y,AP1,AP2,AP3", *PLACES.T, *cells.T))
+        found, data = said(path), read_any(path).data
+        assert "as well as weak ones: no value, left out" in found and data.censored is None, found
+        assert len(data) == (~some).sum()

@@ -105,6 +105,47 @@ def test_records_were_refused_without_a_word_of_tables(tmp_path, name):
     assert reading.data.site.georeference.latitude == pytest.approx(np.median(LATITUDE), abs=1e-4)
 
 
+WITHOUT = {
+    "place.json": json.dumps([*RECORDS, {"pci": "1", "rsrp": -70}]),
+    "place.geojson": json.dumps(
+        {"features": [*POINTS["features"], {"geometry": None, "properties": {"pci": "1"}}]}
+    ),
+    "place.gpx": TRACK.replace(
+        "</trkseg>", "<trkpt><extensions><rsrp>-70</rsrp></extensions></trkpt></trkseg>"
+    ),
+    "place.kml": MARKS.replace("</Document>", "<Placemark><name>a</name></Placemark></Document>"),
+    "level.json": json.dumps([*RECORDS, {k: v for k, v in RECORDS[0].items() if k != "rsrp"}]),
+}
+
+
+@pytest.mark.parametrize("name", WITHOUT)
+def test_a_record_without_its_place_or_level_was_a_traceback(tmp_path, name):
+    (tmp_path / name).write_text(WITHOUT[name], encoding="utf-8")
+    found = said(tmp_path / name)
+    assert "no place; these 1 of" in found or ("1 of" in found and "values are missing" in found), found
+
+
+BROKEN = {
+    "a.geojson": ('{"features": []}', "no column of levels"),
+    "b.json": ("{}", "no rows"),
+    "c.jsonl": ("\n".join(map(json.dumps, RECORDS))[:-9], f"line {len(RECORDS)}, column"),
+    "d.json": (json.dumps([{k: v for k, v in one.items() if k != "pci"} | ({"pci": "7"} if i else {})
+        for i, one in enumerate(RECORDS)]), "row 0: no station"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_records_were_a_traceback_or_another_line(tmp_path, name):
+    content, says = BROKEN[name]
+    (tmp_path / name).write_text(content)
+    assert says in said(tmp_path / name)
+
+
+def test_columns_of_json_as_pandas_writes_them_were_one_record(tmp_path):
+    pd.DataFrame(RECORDS).to_json(tmp_path / "log.json")
+    assert_levels(read_any(tmp_path / "log.json"))
+
+
 def test_gateways_of_an_uplink_stand_where_it_says(tmp_path):
     (tmp_path / "ttn.jsonl").write_text(FILES["ttn.jsonl"])
     site = read_any(tmp_path / "ttn.jsonl").data.site
@@ -125,6 +166,7 @@ def test_feather_and_gzip_were_unknown_endings(tmp_path):
 
 @pytest.mark.parametrize("start, way", [
     (b"\x93NUMPY", "savez it beside rx_position"), (b"! VNA\n# Hz S MA R 50\n", r"Touchstone"),
+    (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
     (b"\x80\x05", "a pickle; write Parquet"), (b"PK\x03\x04", "save it as CSV"),
 ])  # fmt: skip
 def test_files_that_no_reader_takes_show_the_way_out(tmp_path, start, way):
@@ -175,14 +217,6 @@ def test_networks_with_names_of_their_own_were_no_levels(tmp_path):
     reading = read_any(path)
     assert_levels(reading, ("Office WiFi", "printer"))
     assert any("by their values, as no head says so" in note for note in reading.notes)
-
-
-def test_a_column_that_tells_beacons_apart_was_not_named(tmp_path):
-    rows = [(i // 2, *ROOM[i // 2, :2], CELLS[i % 2], LEVEL[i // 2, i % 2]) for i in range(2 * COUNT)]
-    path = tmp_path / "beacons.csv"
-    path.write_text(text("scan,x,y,Minor,rssi", *zip(*rows, strict=True)))
-    assert "column 'Minor' tells rows of a place apart; dataset.columns.station=Minor" in said(path)
-    assert_levels(read_any(path, columns={"station": "Minor"}))
 
 
 def test_rows_between_two_fixes_were_refused_one_by_one(tmp_path):

@@ -143,9 +143,9 @@ def find_saturation(values: np.ndarray) -> float | None:
 def find_marks(values: np.ndarray) -> list[float]:
     """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
-    At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end not below 0,
-    as rows beside a station are strong; at the lower end a pile needs only a gap, as a receiver's own levels
-    have none.
+    At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end, as rows
+    beside a station are strong, not below 0 or nearly as far as all others lie apart; at the lower end a
+    pile needs only a gap, as a receiver's own levels have none.
     """
     marks: list[float] = []
     rest = values[np.isfinite(values)]
@@ -159,7 +159,8 @@ def find_marks(values: np.ndarray) -> list[float]:
         piled = counts[0] > max(PILE * len(rest), 10) and counts[0] > 5 * float(np.median(counts))
         piled = piled and steps[0] >= usual
         enough = (steps[[0, -1]] > np.maximum(APART_DB, 0.3 * np.array(spans))) & (counts[[0, -1]] >= REPEATS)
-        found = different[[0, -1]][enough & [True, different[-1] >= 0] | [piled, False]].tolist()
+        beyond = different[-1] >= 0 or steps[-1] > max(1.5 * APART_DB, 0.7 * spans[1])
+        found = different[[0, -1]][enough & [True, beyond] | [piled, False]].tolist()
         if not found:
             return marks
         marks += found

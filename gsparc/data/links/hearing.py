@@ -7,16 +7,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import find_marks, find_saturation
 from gsparc.data.errors import Caution
 from gsparc.data.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.own_checks import Checker
-from gsparc.data.schema import Links
+from gsparc.data.schema import OTHER, Links
 from gsparc.data.selection import take_rows
 
 POWERS = ("rssi", "rssi_db")
+BESIDE, LEAST_MARKS = 6, 12  # rows around a mark; marks that tell
+WEAK_SHARE = 0.62  # of marks beside rows that are weaker than half of the station's: not heard
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 
 
@@ -48,6 +51,8 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         links: of its rows; None is returned where something is wrong.
         unlisted: rows that lists of the strongest leave out.
     """
+    if measured == "rssi_db" and links.static_end is not None:
+        _forget_unknown(check, f"{OTHER[links.static_end]}_position")
     values, arrays, before = check.raw.arrays[measured], check.raw.arrays, len(check.problems)
     floor = _stated_floor(check, measured, values)
     if len(check.problems) > before:
@@ -138,6 +143,38 @@ def _below_floor(
             "is it the receiver's? places where nothing was heard count as weaker still"
         )
     return below
+
+
+def _forget_unknown(check: Checker, moving: str) -> None:
+    """Make marks that lie beside strong levels as well as beside weak ones NaN: no value, and not unheard."""
+    values, place = check.raw.arrays["rssi_db"], check.raw.arrays.get(moving, np.zeros(0))
+    if (
+        check.raw.attributes.get("not_heard") is not None
+        or values.ndim > 1
+        or place.shape != (len(values), 3)
+    ):
+        return
+    station = check.raw.arrays.get("station", np.zeros(len(values), np.int64))
+    marks = find_marks(values)
+    heard = np.isfinite(values) & ~np.isin(values, marks) & np.isfinite(place).all(1)
+    for mark in marks:
+        beside: list[bool] = []
+        marked = (values == mark) & np.isfinite(place).all(1)
+        for one in np.unique(station[marked]):
+            own, asked = (np.flatnonzero(rows & (station == one)) for rows in (heard, marked))
+            if len(own) < BESIDE:
+                continue
+            near = cKDTree(place[own]).query(place[asked], k=BESIDE)[1]
+            level = values[own].astype(float)
+            beside += (level[near].mean(1) < np.median(level)).tolist()
+        # A coin that falls on either side: of few marks nothing is told.
+        if len(beside) < LEAST_MARKS or np.mean(beside) > WEAK_SHARE:
+            continue
+        check.raw.arrays["rssi_db"] = np.where(values == mark, np.nan, check.raw.arrays["rssi_db"])
+        share = f"{int((values == mark).sum())} of {len(values)} levels"
+        said = f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others, beside strong levels "
+        said += "as well as weak ones: no value, left out"
+        check.notes.append(Caution(f"{said}; dataset.not_heard=[{mark:.12g}] takes them as not heard"))
 
 
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:

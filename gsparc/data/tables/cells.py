@@ -49,7 +49,7 @@ def _numbers(cell: Any) -> np.ndarray | None:
         if not inside and not re.search(r"\d\s*\*?[ij]\s*\)?\s*$", cell[0]):
             return None
         cell = [re.sub(r"[()*\s]", "", one).replace("i", "j") for one in cell]
-    if not isinstance(cell, list | np.ndarray):
+    if not isinstance(cell, list | np.ndarray) or not len(cell):
         return None
     try:
         return np.array([complex(one) for one in cell])

@@ -38,12 +38,14 @@ class Column(Head):
     Attributes:
         head: of the column; None for a number.
         value: the number, or the first and the last of evenly spaced ones; none: the number of the row.
+        plus: columns and numbers that are added to it.
         **rest: see `Head`; no unit is the schema's, no word a column that was said.
     """
 
     role: str = ""
     head: str | None = None
     value: tuple[float, ...] = ()
+    plus: tuple[Column, ...] = ()
 
     @property
     def by_row(self) -> bool:
@@ -62,10 +64,20 @@ class Column(Head):
             remedy = heads.PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
             return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
         marks = self.role == "rssi_db"
-        return sheet.numbers(self.head, self.unit, lambda unit: unit_suits(self.role, unit), marks)
+        values = sheet.numbers(self.head, self.unit, lambda unit: unit_suits(self.role, unit), marks)
+        for other in self.plus:
+            more = other.numbers(sheet)
+            values = None if values is None or more is None else values + more
+        return values
 
 
 Chosen = dict[str, tuple[Column, ...]]
+
+
+def used_heads(chosen: Chosen) -> set[str | None]:
+    """Return the heads of all columns that are used."""
+    columns = [column for one in chosen.values() for column in one]
+    return {column.head for one in columns for column in (one, *one.plus)}
 
 
 def choose_columns(
@@ -90,11 +102,11 @@ def choose_columns(
             chosen[columns[0].role] = columns
     if sheet.problems:
         return chosen, []
-    used_heads = {column.head for columns in chosen.values() for column in columns}
+    said = used_heads(chosen)
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = heads.parse_head(head) if head not in used_heads else Head()
-        if head not in used_heads and head in labelled:
+        meaning = heads.parse_head(head) if head not in said else Head()
+        if head not in said and head in labelled:
             power = "rssi" if meaning.role == "rssi" else "rssi_db"
             meaning = Head(power, labelled[head], meaning.unit, "station", meaning.strange)
         role = meaning.role
@@ -144,12 +156,15 @@ def choose_columns(
     # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
         notes += _wide_survey(sheet, chosen)
-    used = {column.head for columns in chosen.values() for column in columns}
+    used = used_heads(chosen)
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
         timed = heads.SHEET["times"] * any(LISTS["time"] & set(words_of(head)) for head in unused)
         notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
-    return chosen, [*notes, *(() if only is not None else _telling(sheet, chosen, used))]
+    return chosen, [
+        *notes,
+        *(() if only is not None else _more_levels(sheet, chosen.get("rssi_db", ()), used)),
+    ]
 
 
 def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
@@ -188,7 +203,7 @@ NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
 
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
     """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels; the notes."""
-    used = {column.head for columns in chosen.values() for column in columns}
+    used = used_heads(chosen)
     rest = [head for head in sheet.heads if head not in used]
     named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
     alike = named or [head for head in rest if _may_be_levels(sheet, head)]
@@ -209,61 +224,6 @@ def _may_be_levels(sheet: Sheet, head: str) -> bool:
 
 
 BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
-
-
-def _telling(sheet: Sheet, chosen: Chosen, used: Container[str | None]) -> list[str]:
-    """Warnings of columns that are not used though their heads speak of something that matters."""
-    stations = [column.head for column in chosen.get("station", ())]
-    notes: list[str] = []
-    apart: dict[str, str] = {}  # topics of columns that tell stations apart, each beside those before it
-    ends, have = set(heads.END_WORDS), {"a floor": "z", "a height": "z", "a carrier": "carrier_hz"}
-    for head in sheet.heads:
-        lone = "station" not in chosen and not any(columns[0].label for columns in chosen.values())
-        topic = heads.topic_of(head) or ("a station" if lone and ends & set(words_of(head)) else None)
-        if topic is None or head in used:
-            if topic == "a floor" and any(c.head == head and c.unit is None for c in chosen.get("z", ())):
-                say = f"{say_column('z', f'{head}*3.2')} takes 3.2 m each"
-                notes.append(Caution(f"column {head!r}: floors as heights in metres? {say}"))
-            continue
-        wanted = have.get(topic)
-        # Heights are said per end or for the end without a name; either is enough.
-        if wanted in chosen or (wanted == "z" and {"rx_z", "tx_z"} & set(chosen)):
-            continue
-        words, beside = sheet.words(head), [*stations, *apart]
-        names = sheet.joined(beside) if beside else np.zeros(len(sheet), str)
-        pairs = {pair for pair in zip(names.tolist(), words.tolist(), strict=True) if pair[1]}
-        groups = len({name for name, _ in pairs}) if wanted != "z" else 1
-        # A column matters where one station has several values of it, with rows enough for each.
-        if len(pairs) > groups and (wanted is not None or len(pairs) <= len(sheet) // REPEATED):
-            joined, remedy = "+".join([*map(str, beside), head]), heads.SHEET["remedies"].get(topic)
-            if remedy is None:
-                apart[head] = topic
-                continue
-            how = "; ".join(say_column(r, t.format(head=head, joined=joined)) + w for r, t, w in remedy)
-            notes.append(Caution(f"column {head!r} speaks of {topic} and is not used: {how}"))
-    if apart:
-        s, do = ("s", "is") if len(apart) == 1 else ("", "are")
-        how = f"{say_column('station', '+'.join([*map(str, stations), *apart]))} tells them apart"
-        told = _names(Column(head=head) for head in apart)
-        notes.append(Caution(f"{told} speak{s} of {next(iter(apart.values()))} and {do} not used: {how}"))
-    notes += [] if notes else _repeated(sheet, chosen, [h for h in sheet.heads if h not in used])
-    return notes + _more_levels(sheet, chosen.get("rssi_db", ()), used)
-
-
-def _repeated(sheet: Sheet, chosen: Chosen, rest: list[str]) -> list[str]:
-    """Warn of a column of `rest` that tells rows of one place and station apart, where most have others."""
-    places = [role for role in chosen if KINDS[role] in ("length", "angle")]
-    said = [*chosen.get("station", ()), *(chosen[role][0] for role in places)]
-    if len(chosen.get("rssi_db", ())) != 1 or not places:
-        return []
-    key = sheet.frame[[column.head for column in said if column.head]].astype(str).agg(" ".join, axis=1)
-    repeats = len(sheet) // max(key.nunique(), 1)
-    for head in rest if repeats > 1 else ():
-        words = pd.Series(sheet.words(head), key.index)
-        if 1 < words.nunique() <= len(sheet) // REPEATED and (key + words).nunique() == len(sheet):
-            how = say_column("station", "+".join([*(c.head or "" for c in chosen.get("station", ())), head]))
-            return [Caution(f"column {head!r} tells rows of a place apart; {how} if it says what was heard")]
-    return []
 
 
 def _more_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> list[str]:
@@ -291,13 +251,9 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
-    # A factor, as in `pathloss*-1`, is looked for after the head as it is: heads may hold a `*`.
-    times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text)
-    head = _head(sheet, times[1].strip()) if times and KINDS[role] != "text" else None
-    if times and head is not None:
-        unit = _unit(head, role) or Unit("", KINDS[role])
-        unit = replace(unit, times=times[2], factor=unit.factor * float(times[2]))
-        return (Column(role, unit=unit, head=head),)
+    # After the head as it is: heads may hold a `*`, a `+` or a `-`.
+    if KINDS[role] != "text" and (column := _sum_of_columns(sheet, role, text)) is not None:
+        return (column,)
     joined = [_head(sheet, part.strip()) for part in text.split("+")] if role == "station" else []
     if len(joined) > 1 and all(joined):
         return tuple(Column(role, JOINED, head=part) for part in joined)
@@ -318,6 +274,38 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     hint = suggest_name(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
     hint += f"; or say dataset.columns.{key}=null"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
+
+
+def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
+    """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`, `rssi-tx_power`."""
+    for cut in [len(text), *(found.start() for found in re.finditer(r"[-+]", text))]:
+        times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text[:cut].strip())
+        factor = times[2] if times else ""
+        head = _head(sheet, times[1].strip() if times else text[:cut].strip()) if cut else None
+        if head is None:
+            continue
+        unit, rest = _unit(head, role), text[cut + 1 :].strip()
+        if times:
+            unit = unit or Unit("", KINDS[role])
+            unit = replace(unit, times=factor, factor=unit.factor * float(factor))
+        column = Column(role, unit=unit, head=head)
+        if cut == len(text):
+            return column
+        if re.fullmatch(r"\d*\.?\d+", rest):
+            return replace(column, plus=(Column(role, value=(float(text[cut] + rest),)),))
+        more = _sum_of_columns(sheet, role, rest)
+        if more is not None:
+            first = replace(more, plus=())
+            return replace(column, plus=(_signed(first, text[cut]), *more.plus))
+    return None
+
+
+def _signed(column: Column, sign: str) -> Column:
+    """The same, taken off where the sign says so."""
+    if sign == "+":
+        return column
+    unit = column.unit or Unit("", KINDS[column.role])
+    return replace(column, unit=replace(unit, times=f"-{unit.times or 1}", factor=-unit.factor))
 
 
 def _head(sheet: Sheet, text: str) -> str | None:
@@ -394,8 +382,13 @@ def say_column(role: str, text: str) -> str:
     >>> print(say_column("rssi_db", "RSRP*-1"), say_column("station", "Cell id"))
     dataset.columns.rssi_db=RSRP*-1 'dataset.columns.station="Cell id"'
     """
-    plain = re.fullmatch(r"[\w.*+-]+", text)
-    return f"dataset.columns.{role}={text}" if plain else f"'dataset.columns.{role}=\"{text}\"'"
+    plain, name = re.fullmatch(r"[\w.*+-]+", text), setting_name(role)
+    return f"dataset.columns.{name}={text}" if plain else f"'dataset.columns.{name}=\"{text}\"'"
+
+
+def setting_name(role: str) -> str:
+    """Return what `dataset.columns` calls a quantity."""
+    return role.replace("latitude", "lat").replace("longitude", "lon")
 
 
 def _choice(column: Column) -> str:

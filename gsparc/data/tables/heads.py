@@ -37,8 +37,6 @@ KINDS = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | 
 STATION_WORDS, END_WORDS = LISTS["station"], meaning_by_word("ends")
 TOGETHER = {word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()}
 _AXIS, _PART = meaning_by_word("axes"), meaning_by_word("part")
-_TOPIC = dict.fromkeys(STATION_WORDS | LISTS["less"], "a station") | meaning_by_word("topics")
-_TOPIC |= {word: "a height" for word, axis in _AXIS.items() if axis == "z"}
 
 
 @dataclass(frozen=True)
@@ -60,13 +58,6 @@ class Head:
     word: str = ""
     strange: str = ""
     less: bool = False
-
-
-def topic_of(head: str) -> str | None:
-    """Tell of which of the topics a head speaks; None: of none."""
-    words = words_of(unit_of(head)[0])
-    topics = (_TOPIC[word] for word in words if word in _TOPIC)
-    return None if LISTS["accuracy"] & set(words) else next(topics, None)
 
 
 def parse_head(text: str) -> Head:

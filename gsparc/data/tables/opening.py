@@ -42,7 +42,7 @@ def read_frame(path: Path, kind: str) -> Sheet:
     frame.columns = frame.columns.astype(str)
     for name in frame.columns[frame.columns.duplicated()]:
         raise DataError(f"{source}: two columns are named {name!r}; rename one")
-    if not len(frame):
+    if frame.empty:
         raise DataError(f"{source}: no rows")
     return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))), problems=Problems(source))
 

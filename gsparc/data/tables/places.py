@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gsparc.data.errors import Caution, DataError, list_first, name_row_ranges
 from gsparc.data.links.stations import PER_STATION, SECTOR
@@ -62,7 +63,7 @@ def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -
         if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
             found = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
-            fault = f"{found}; say dataset.columns.{missing}=COLUMN"
+            fault = f"{found}; say {say_column(missing, 'COLUMN')}"
             return sheet.refuse(fault)
         absent = np.zeros(len(sheet), bool)
         if unknown:
@@ -246,6 +247,13 @@ class StationList:
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
         names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
         return replace(self, names=names, label=None if names == self.names else self.names)
+
+    def part_by(self, words: np.ndarray, longer: np.ndarray) -> StationList:
+        """Return a station for each of `longer` names (S,), where that of words (S,) is listed."""
+        names, first = np.unique(longer, return_index=True)
+        which = pd.Index(self.names).get_indexer(words[first])
+        facts = {name: array[which] for name, array in self.extra.items()}
+        return StationList(tuple(map(str, names)), self.places.take(which), facts)
 
     def match_heads(self, parts: Mapping[str, str]) -> tuple[StationList, dict[str, str]]:
         """Return the same under the names that heads, or their `parts`, hold, and that of each such head."""

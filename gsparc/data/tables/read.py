@@ -28,6 +28,7 @@ from gsparc.data.tables.columns import (
     choose_columns,
     say_column,
     schema_unit,
+    used_heads,
 )
 from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
 from gsparc.data.tables.opening import read_sheet
@@ -42,6 +43,7 @@ from gsparc.data.tables.places import (
 )
 from gsparc.data.tables.sheet import MEASURED, Sheet
 from gsparc.data.tables.slots import unfold_slots, unfold_tones
+from gsparc.data.tables.unused import say_effects
 from gsparc.data.units import UNITS, WATTS
 
 
@@ -84,6 +86,7 @@ def parse_table(
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()
+    told = say_effects(sheet, chosen, arrays)
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
     about = {}
     if power is not None and "rssi_db" in chosen:
@@ -91,7 +94,7 @@ def parse_table(
     # A column that is scaled has the schema's unit.
     if power is not None and power.unit is not None and power.unit.name in WATTS and not power.unit.times:
         about["unit"] = power.unit.name
-    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes))
+    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes, *told))
 
 
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
@@ -134,6 +137,9 @@ class Builder:
                 if {"loss", "pathloss", "pl"} & set(words_of(head)):
                     how = say_column("rssi_db", f"{head}*-1")
                     return self.refuse(f"{fault}; {how} takes losses for levels")
+                if "asu" in words_of(head):
+                    ways = [say_column("rssi_db", f"{head}{turn}") for turn in ("-140", "*2-113")]
+                    return self.refuse(f"{fault}; {head!r} is ASU: {ways[0]} of LTE, {ways[1]} of GSM")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
@@ -224,7 +230,7 @@ class Builder:
         # Said beside what is wrong with levels: one look at the file mends both.
         if {f"{end}{axis}" for end in by_end for axis in AXES if axis != "z"}.isdisjoint(self.chosen):
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
-            return self.refuse(f"{fault}, or .latitude, .longitude")
+            return self.refuse(f"{fault}, or .lat, .lon")
         if self.sheet.problems:
             return
         # Two named ends and one without a name: nothing says which of the named ones it would replace.
@@ -266,7 +272,9 @@ class Builder:
             if not named:
                 other = "tx" if moving == "rx" else "rx"
                 axis = "latitude" if ends[""].degrees else "x"
-                rename = f"if not, name them {other}_{axis}, ..., or say dataset.columns.{other}_{axis}=..."
+                rename = (
+                    f"if not, name them {other}_{axis}, ..., or say {say_column(f'{other}_{axis}', '...')}"
+                )
                 self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; {rename}")
             return moving, ends.pop("")
         # Both ends are named and the receiver never moves: the rows are places of the transmitter.
@@ -299,8 +307,11 @@ class Builder:
             listed, joined = self.listed.use_names_of(plain), self.listed.use_names_of(words)
             exact = columns[0].label == JOINED and bool(columns[0].word)
             # Where the list knows the names without what other columns add to them, these are taken.
-            words = plain if exact and set(plain) <= set(listed.names) else words
-            self.listed = listed if words is plain else joined
+            known = set(plain) <= set(listed.names)
+            words = plain if exact and known else words
+            # What other columns add to a listed name stands where that does: antennas, carriers, devices.
+            apart = known and not set(words) <= set(joined.names)
+            self.listed = listed.part_by(plain, words) if apart else listed if words is plain else joined
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
         if self.listed is not None:
             self._all_listed(words, head)
@@ -343,7 +354,7 @@ class Builder:
         self._all_listed(np.array(labels), None)
         names = self.listed.label or self.listed.names
         silent = [own for own, name in zip(names, self.listed.names, strict=True) if name not in labels]
-        used = {column.head for columns in self.chosen.values() for column in columns}
+        used = used_heads(self.chosen)
         for name in silent:
             # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
             for head in difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6):

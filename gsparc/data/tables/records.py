@@ -30,7 +30,8 @@ def read_records(path: Path) -> pd.DataFrame:
         inner = pd.json_normalize([one if isinstance(one, dict) else {} for one in frame.pop(name)])
         frame = frame.join(inner.add_prefix(f"{name}."))
     for name in [name for name in frame if name.rpartition(".")[2] == "coordinates"]:
-        places = pd.DataFrame([one if isinstance(one, list) else [] for one in frame.pop(name)])
+        padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
+        places = pd.DataFrame([one[:3] for one in padded], dtype=float)
         frame = frame.join(places.rename(columns=dict(enumerate(PLACE))).loc[:, lambda p: p.notna().any()])
     short = Counter(name.rpartition(".")[2] for name in frame)
     return frame.rename(columns=lambda name: last if short[last := name.rpartition(".")[2]] == 1 else name)
@@ -43,14 +44,33 @@ def _holds_records(value: Any) -> bool:
 def _of_json(text: str) -> list[dict[str, Any]]:
     try:
         content = json.loads(text)
-    except json.JSONDecodeError:  # a record a line
-        content = [json.loads(line) for line in text.splitlines() if line.strip()]
+    except json.JSONDecodeError as whole:  # a record a line
+        if "\n" not in text.strip():
+            raise
+        content = [_of_line(line, n) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
+        if len(content) < 2 or not all(isinstance(one, dict) for one in content):
+            raise whole from None
     if isinstance(content, dict):
         held = [value for value in content.values() if _holds_records(value)]
-        content = held[0] if len(held) == 1 else [content]
+        content = held[0] if len(held) == 1 else _of_columns(content) or [content]
     if not _holds_records(content):
         raise ValueError("no records: expected [{...}, ...], or one {...} a line")
     return [one for one in content if isinstance(one, dict)]
+
+
+def _of_line(line: str, number: int) -> Any:
+    try:
+        return json.loads(line)
+    except json.JSONDecodeError as fault:
+        raise ValueError(f"line {number}, column {fault.colno}: {fault.msg}; is it cut off?") from None
+
+
+def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
+    """Records of {column: {row: value}} or {column: [value]}, as pandas writes them; else none."""
+    columns = [list(c.values()) if isinstance(c, dict) else c for c in content.values()]
+    if len(columns) < 2 or not all(isinstance(c, list) and len(c) == len(columns[0]) > 1 for c in columns):
+        return []
+    return [dict(zip(content, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 def _of_xml(text: str) -> list[dict[str, Any]]:

@@ -1,0 +1,264 @@
+"""What a column explains of levels that places and stations do not: another transmitter, a device, a number.
+
+Levels of each station are a correlated field over places, and noise. Three rivals are scored by likelihood,
+with a Bayesian information criterion for constants: a field for each value of the column (transmitters), an
+offset for each value over all stations (devices), a multiple of the value (a number). A column that follows
+the level, a quality or another reading of it, would win them all: it tells far rows as well as near ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from scipy.linalg import cholesky, solve_triangular
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
+CENTRES = 6  # about which those are chosen, so that they stay dense
+NEAR = 8  # rows that a row is compared with
+REPEATED = 4  # rows for each value of a column that may name something
+REACHES, NUGGETS = (1 / 3, 1 / 10, 1 / 30, 1 / 100), (0.05, 0.2, 0.7, 3.0)  # as in `level_steps`
+RATIO = math.log(30)  # of likelihoods
+COPY, LESS, WEAK = (0.9, 0.7), 0.9, 0.85  # see `_contrast`
+TOLERANCE = 0.2  # of a slope that should be 1, or another power of ten
+MOST_EFFECTS = 4
+ALIKE = 1.03  # contrasts within this ratio are of columns that tell the same
+Kind = Literal["transmitter", "device", "number"]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a column does to levels.
+
+    Attributes:
+        head: of the column.
+        kind: its values name transmitters, or devices that each have an offset, or are added to the level.
+        share: of the variance that places and stations leave, that it explains.
+        size: a device's largest offset to another [dB], or what a number is multiplied by.
+        contrast: what it leaves of differences between near rows over what it leaves between far ones.
+    """
+
+    head: str
+    kind: Kind
+    share: float
+    size: float = 0.0
+    contrast: float = 0.0
+
+
+@dataclass(frozen=True)
+class LevelsAtPlaces:
+    """Levels of links.
+
+    Attributes:
+        place: (n, d) [m].
+        station: (n,) int64.
+        level: (n,) [dB], finite.
+    """
+
+    place: np.ndarray
+    station: np.ndarray
+    level: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.level)
+
+    def take(self, rows: np.ndarray) -> LevelsAtPlaces:
+        """Return some of them."""
+        return LevelsAtPlaces(self.place[rows], self.station[rows], self.level[rows])
+
+
+def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]) -> list[Effect]:
+    """Return what columns explain, the most first, each beside those before it.
+
+    Args:
+        links: whose stations are taken for granted.
+        row: (n,) of a table, of each link.
+        columns: by their heads, a text for each row of the table; empty: no value.
+    """
+    rng, found = np.random.default_rng(0), list[Effect]()
+    dense = _dense_rows(links.place, rng)
+    links, row = links.take(dense), row[dense]
+    texts = {head: pd.factorize(words[row])[0] for head, words in columns.items()}
+    values = {head: _numbers(words[row]) for head, words in columns.items()}
+    while len(links) >= LEAST_ROWS and len(found) < MOST_EFFECTS:
+        plain, pairs = _fit(links, links.station), (_near_pairs(links), _far_pairs(links, rng))
+        rest = [head for head in columns if head not in {one.head for one in found}]
+        tried = [_effect(links, plain, pairs, head, texts[head], values[head]) for head in rest]
+        known = sorted((one for one in tried if one is not None), key=lambda one: one.contrast)
+        if not known:
+            break
+        # Of columns that tell the same apart the first of the fewest values.
+        alike = (one for one in known if one.contrast < ALIKE * known[0].contrast)
+        best = min(alike, key=lambda one: texts[one.head].max())
+        found.append(best)
+        value = values[best.head]
+        if best.kind == "number" and value is not None:
+            links = replace(links, level=links.level - best.size * value)
+        elif best.kind == "device":
+            links = replace(links, level=links.level - _devices(links, texts[best.head]).offsets(links))
+        else:
+            links = replace(links, station=_pairwise(links.station, texts[best.head]))
+    return found
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The best of a field's settings.
+
+    Attributes:
+        score: logarithm of the likelihood, less half of that of the rows for each constant.
+        columns: (n, k) regressors.
+        slope: (k,) of them.
+    """
+
+    score: float
+    columns: np.ndarray
+    slope: np.ndarray
+
+    def offsets(self, links: LevelsAtPlaces) -> np.ndarray:
+        """Return what the regressors add (n,)."""
+        return self.columns @ self.slope
+
+
+def _fit(links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray] = ()) -> Fit:
+    """Fit a field and a constant for each of groups (n,), and slopes of columns over all of them."""
+    count, wide = len(links), float(np.ptp(links.place, axis=0).max())
+    table = np.column_stack([links.level, *columns])
+    parts = [np.flatnonzero(group == one) for one in np.unique(group)]
+    apart = [cdist(links.place[part], links.place[part]) for part in parts]
+    found = []
+    for reach in REACHES:
+        shapes = [np.exp(-one / max(reach * wide, 1e-9)) for one in apart]
+        for nugget in NUGGETS:
+            gram, logarithms = np.zeros((table.shape[1],) * 2), 0.0
+            for part, shape in zip(parts, shapes, strict=True):
+                root = cholesky(shape + nugget * np.eye(len(part)), lower=True, check_finite=False)
+                both = np.column_stack([np.ones(len(part)), table[part]])
+                white = solve_triangular(root, both, lower=True, check_finite=False)
+                own = white[:, 1:] - np.outer(white[:, 0], white[:, 0] @ white[:, 1:]) / (
+                    white[:, 0] @ white[:, 0]
+                )
+                gram += own.T @ own
+                logarithms += 2 * float(np.log(np.diag(root)).sum())
+            slope = np.linalg.pinv(gram[1:, 1:]) @ gram[1:, 0]
+            variance = max(float(gram[0, 0] - slope @ gram[1:, 0]) / count, 1e-6)
+            constants = len(parts) + len(slope)
+            score = -0.5 * (count * math.log(variance) + logarithms + constants * math.log(count))
+            found.append(Fit(score, table[:, 1:], slope))
+    return max(found, key=lambda one: one.score)
+
+
+def _devices(links: LevelsAtPlaces, code: np.ndarray) -> Fit:
+    return _fit(links, links.station, [(code == one).astype(float) for one in np.unique(code)[1:]])
+
+
+def _effect(
+    links: LevelsAtPlaces, plain: Fit, pairs: Sequence[np.ndarray], head: str, code: np.ndarray,
+    value: np.ndarray | None,
+) -> Effect | None:  # fmt: skip
+    """What one column explains; None: nothing, or it follows the level."""
+    fits: dict[Kind, tuple[Fit, float]] = {}
+    if 0 < code.max() < len(code) / REPEATED and (contrast := _contrast(links, pairs, code)) < 1:
+        fits["device"] = _devices(links, code), contrast
+        fits["transmitter"] = _fit(links, _pairwise(links.station, code)), contrast
+    if value is not None:
+        fit = _fit(links, links.station, [value])
+        exact = abs(fit.slope[0] / _power_of_ten(fit.slope[0]) - 1) < TOLERANCE and abs(fit.slope[0]) < 2
+        if exact and (contrast := _contrast(links, pairs, value, float(fit.slope[0]))) < LESS:
+            fits["number"] = fit, contrast
+    kind = max(fits, key=lambda one: fits[one][0].score, default=None)
+    if kind is None or (gain := fits[kind][0].score - plain.score) < RATIO:
+        return None
+    (best, contrast), share = fits[kind], 1 - math.exp(-2 * gain / len(links))
+    size = float(np.ptp([0.0, *best.slope])) if kind == "device" else 0.0
+    size = _power_of_ten(best.slope[0]) if kind == "number" else size
+    return Effect(head, kind, share, size, contrast)
+
+
+def _power_of_ten(slope: float) -> float:
+    return math.copysign(10.0 ** round(math.log10(max(abs(slope), 1e-9))), slope)
+
+
+def _contrast(
+    links: LevelsAtPlaces, pairs: Sequence[np.ndarray], code: np.ndarray, slope: float = 0.0
+) -> float:
+    """What a column leaves of differences of near rows over what it leaves of far ones; 1: it follows levels.
+
+    What a transmitter, a device or a number adds is a large part of what near rows differ by and a small one
+    between far rows, whose places count; a quality tells far rows at least as well.
+
+    Args:
+        links: as they are known so far.
+        pairs: (P, 2) of near rows, and of any rows of a station.
+        code: (n,) the column's values, or numbers.
+        slope: that multiplies numbers; 0: none.
+    """
+    level, stations = links.level, np.unique(links.station)
+    left = level - slope * code if slope else level
+    for own in (links.station == one for one in stations):
+        within = left[own] if slope else _centred(left[own], code[own])
+        if (
+            np.var(within) < (1 - COPY[len(stations) > 1]) * np.var(level[own])
+            and own.sum() >= LEAST_ROWS / 3
+        ):
+            return 1.0
+    rest = []
+    for first, second in (pair.T for pair in pairs):
+        change, step = level[first] - level[second], code[first] - code[second]
+        left = change - slope * step if slope else change[step == 0]
+        if min(len(left), (step != 0).sum()) < NEAR:
+            return 1.0
+        rest.append(float((left**2).mean() / max((change**2).mean(), 1e-12)))
+    contrast = rest[0] / max(rest[1], 1e-12)
+    if rest[1] > WEAK and contrast < 1 / LESS:  # it tells nothing of far rows
+        return min(contrast, LESS)
+    return contrast if contrast < LESS else 1.0
+
+
+def _centred(value: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Values (n,) less the mean of their group (n,)."""
+    which = np.unique(group, return_inverse=True)[1].reshape(-1)
+    return value - (np.bincount(which, value) / np.bincount(which))[which]
+
+
+def _near_pairs(links: LevelsAtPlaces) -> np.ndarray:
+    """Pairs (P, 2) of near rows of a station."""
+    pairs = [np.zeros((0, 2), np.int64)]
+    for one in np.unique(links.station):
+        own = np.flatnonzero(links.station == one)
+        count = min(NEAR + 1, len(own))
+        index = own[cKDTree(links.place[own]).query(links.place[own], k=count)[1].reshape(-1, count)]
+        both = np.sort(np.c_[np.repeat(own, count), index.ravel()], axis=1)
+        pairs.append(np.unique(both[both[:, 0] != both[:, 1]], axis=0))
+    return np.concatenate(pairs)
+
+
+def _far_pairs(links: LevelsAtPlaces, rng: np.random.Generator) -> np.ndarray:
+    """Pairs (P, 2) of any rows of a station."""
+    own = [np.flatnonzero(links.station == one) for one in np.unique(links.station)]
+    pairs = np.concatenate([rng.choice(part, (4 * NEAR * len(part), 2)) for part in own])
+    return pairs[pairs[:, 0] != pairs[:, 1]]
+
+
+def _pairwise(station: np.ndarray, code: np.ndarray) -> np.ndarray:
+    return np.unique(np.c_[station, code], axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _dense_rows(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Rows (m,) of places (n, d), at most `MOST_ROWS`, those about a few of them."""
+    if len(place) <= MOST_ROWS:
+        return np.arange(len(place))
+    centres = place[rng.choice(len(place), CENTRES, replace=False)]
+    return np.unique(cKDTree(place).query(centres, k=MOST_ROWS // CENTRES)[1])
+
+
+def _numbers(words: np.ndarray) -> np.ndarray | None:
+    """Numbers (n,) of text; None where one has none."""
+    values = pd.to_numeric(pd.Series(words), errors="coerce").to_numpy(float)
+    return values if np.isfinite(values).all() and np.ptp(values) > 0 else None
