@@ -152,7 +152,7 @@ def _content_digest(content: Mapping[str, Any]) -> str:
         if isinstance(value, Tensor):
             digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
             packed = torch.empty(value.numel(), dtype=value.dtype).copy_(value.detach().flatten())
-            digest.update(packed.view(torch.uint8).numpy())  # one number may have strides of 0
+            digest.update(packed.view(torch.uint8).numpy().tobytes())  # one number may have strides of 0
         elif isinstance(value, Mapping):
             digest.update(f"{len(value)} {list(value)}".encode())
             left += value.values()

@@ -93,20 +93,18 @@ def load_rfid(
     layout = {} if array is None else array
     places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
     suffix = ".png" if spectra.dtype == np.uint8 else ".npy"
-    # Of a receiver that moves neither array nor carrier are in the files.
-    known = (places, LIGHT / float(wavelength_m)) if moving == "tx" else (None, None)
+    name = STAND_IN if simulated else "rfid"
     site = Site(
-        STAND_IN if simulated else "rfid" if moving == "tx" else info.dataset, "spectrum",
-        "rx" if moving == "tx" else "tx", SphereGrid.hemisphere(HEIGHT, WIDTH), *known, None,
-        normalisation=str(normalisation), stand_in="rfid" if simulated else None,
+        name, "spectrum", "rx", SphereGrid.hemisphere(HEIGHT, WIDTH), places, LIGHT / float(wavelength_m),
+        None, normalisation=str(normalisation), stand_in="rfid" if simulated else None,
     )  # fmt: skip
-    still, turned = (
-        np.repeat(one[None], len(rows), axis=0)
-        for one in (info.position, info.rotation if moving == "tx" else np.eye(3))
-    )
-    ends = (positions[rows], still) if moving == "tx" else (still, positions[rows])
+    if moving == "rx":  # neither its array nor the carrier is in the files
+        site = replace(site, name=info.dataset, static_end="tx", array=None, carrier_hz=None)
+    turned = info.rotation if moving == "tx" else np.eye(3)
+    still, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, turned))
+    tx, rx = (positions[rows], still) if moving == "tx" else (still, positions[rows])
     return centre_positions(Measurements(
-        site, *ends, turned, spectra if listed is None else spectra[rows],
+        site, tx, rx, rotation, spectra if listed is None else spectra[rows],
         row_names=[f"spectrum/{i + 1:05d}{suffix}" for i in rows], release_split=release_split,
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
     ))  # fmt: skip
