@@ -50,6 +50,7 @@ class Densify(Checked, L.Callback):
             diagonal; null never does.
         max_gaussians: never more than this many.
         min_gaussians: pruning stops at this many, the most opaque stay.
+        part: what tells it from others of one training; "" of the only one.
     """
 
     edits_gaussians: ClassVar = True
@@ -66,6 +67,7 @@ class Densify(Checked, L.Callback):
     max_size_share: float | None = setting(None, or_null(POSITIVE))
     max_gaussians: int = setting(100_000, whole(1))
     min_gaussians: int = setting(16, whole(0))
+    part: str = ""
     statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
     _is_full: bool = field(default=False, init=False, repr=False)  # the last edit had more to add than room
@@ -73,8 +75,8 @@ class Densify(Checked, L.Callback):
 
     @property
     def state_key(self) -> str:
-        """What its state is stored under: two of them may follow one another."""
-        return f"{type(self).__qualname__} from {self.start}"
+        """What its state is stored under."""
+        return " ".join(filter(None, (type(self).__qualname__, self.part)))
 
     def _zero_statistics(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)

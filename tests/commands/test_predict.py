@@ -279,7 +279,7 @@ BAD_TABLES = {
     "no value": ("lat,lon,height\n47,,2\n", r"column 'lon', line 2: no value"),
     "no coordinates": ("time,speed\n1,2\n",
         r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat"),
-    "half": ("lat,height\n47,2\n", r"and none is longitude; say columns\.longitude=COLUMN"),
+    "half": ("lat,height\n47,2\n", r"and none is longitude; say columns\.lon=COLUMN"),
     "far": ("x,y,z\n1,1,2\n2e7,0,2\n", r"line 3: \(2e\+07, 0, 2\) is more than 10000 km"),
     "another end": ("tx_lat,tx_lon\n47,11\n", r"no coordinates of the receiver"),
     "no station": ("lat,lon,height,cell\n47,11,2,\n", r"column 'cell', line 2: no station"),

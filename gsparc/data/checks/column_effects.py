@@ -15,9 +15,11 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from scipy.linalg import cholesky, solve_triangular
+import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
+
+from gsparc.processes.factor import Factor
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
 CENTRES = 6  # about which those are chosen, so that they stay dense
@@ -138,14 +140,14 @@ def _fit(links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray]
         for nugget in NUGGETS:
             gram, logarithms = np.zeros((table.shape[1],) * 2), 0.0
             for part, shape in zip(parts, shapes, strict=True):
-                root = cholesky(shape + nugget * np.eye(len(part)), lower=True, check_finite=False)
+                factor = Factor.from_gram(torch.from_numpy(shape + nugget * np.eye(len(part))))
                 both = np.column_stack([np.ones(len(part)), table[part]])
-                white = solve_triangular(root, both, lower=True, check_finite=False)
+                white = factor.whiten(torch.from_numpy(both)).numpy()
                 own = white[:, 1:] - np.outer(white[:, 0], white[:, 0] @ white[:, 1:]) / (
                     white[:, 0] @ white[:, 0]
                 )
                 gram += own.T @ own
-                logarithms += 2 * float(np.log(np.diag(root)).sum())
+                logarithms += 2 * float(factor.lower.diagonal().log().sum())
             slope = np.linalg.pinv(gram[1:, 1:]) @ gram[1:, 0]
             variance = max(float(gram[0, 0] - slope @ gram[1:, 0]) / count, 1e-6)
             constants = len(parts) + len(slope)

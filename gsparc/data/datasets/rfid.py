@@ -79,7 +79,7 @@ def load_rfid(
     moving: End = "rx" if (root / "rx_pos.csv").exists() else "tx"
     positions = _read_positions(root / f"{moving}_pos.csv", problems)
     count = None if positions is None else len(positions)
-    spectra = _read_spectra(root / "spectrum", count, problems)
+    spectra = _read_spectra(root / "spectrum", f"{moving}_pos.csv", count, problems)
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
     if listed is not None and count is not None:
@@ -181,7 +181,7 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     return positions
 
 
-def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.ndarray | None:
+def _read_spectra(folder: Path, positions: str, count: int | None, problems: Problems) -> np.ndarray | None:
     """Images (S, 90, 360) uint8 or float32, in the order of their numbers; on disk where they are many."""
     if not folder.is_dir():
         return problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
@@ -192,8 +192,8 @@ def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.nda
     expected = [f"{i:05d}{suffix}" for i in range(1, count + 1)]
     missing = [name for name in expected if name not in there]
     extra = sorted(there - set(expected))
-    problems.add_rows(folder, missing, f"missing, but the positions have {count} rows")
-    problems.add_rows(folder, extra, f"no row for it in the positions, which have {count}")
+    problems.add_rows(folder, missing, f"missing, but {positions} has {count} rows")
+    problems.add_rows(folder, extra, f"no row for it in {positions}, which has {count} rows")
     if missing:
         return None
     # On disk where it is large: the release's 6,123 spectra are 200 MB.
