@@ -33,10 +33,12 @@ def pytest_collection_finish():
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Skipped tests by their reasons, without what is of one file or machine, in one line."""
+    """Skipped tests by their reasons, in one line; measured data that are not there are one reason."""
+    skipped = [report.longrepr[2] for report in terminalreporter.stats.get("skipped", [])]
+    absent = re.compile(r"shared/data|beside this checkout")
     reasons = Counter(
-        re.sub(r"\S*/(?=shared/data)|^Skipped: ", "", report.longrepr[2])
-        for report in terminalreporter.stats.get("skipped", [])
+        "measured data not beside this checkout" if absent.search(why) else why.removeprefix("Skipped: ")
+        for why in skipped
     )
     if reasons:
         counted = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common())
