@@ -71,7 +71,7 @@ class Densify(Checked, L.Callback):
     statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
     _is_full: bool = field(default=False, init=False, repr=False)  # the last edit had more to add than room
-    _said_full: bool = field(default=False, init=False, repr=False)
+    _full_is_logged: bool = field(default=False, init=False, repr=False)
 
     @property
     def state_key(self) -> str:
@@ -136,10 +136,10 @@ class Densify(Checked, L.Callback):
                 model.emission.bias2.copy_(solved.bias)
             self.statistics = self._zero_statistics(model)
         _log_edit(trainer, module, planned, before, step)
-        if self._is_full and not self._said_full:
+        if self._is_full and not self._full_is_logged:
             text = "no room for more Gaussians since step %d: callbacks.densify.max_gaussians=%d"
             log.warning(text, step, self.max_gaussians)
-            self._said_full = True
+            self._full_is_logged = True
 
     def plan(
         self, model: GaussianModel, generator: torch.Generator, in_place: bool = False, by_radius: bool = True

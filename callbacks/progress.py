@@ -16,7 +16,7 @@ SHOWN = {  # all of it fits a terminal of 80 columns
 }
 
 
-TIMED = 50  # steps, after the first, from which the seconds of all are told
+TIMED = 50  # steps, after the first, from which the minutes of the training are estimated
 LONG_S = 60.0  # trainings beyond are worth a line
 
 

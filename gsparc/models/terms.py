@@ -72,7 +72,9 @@ def resolve_terms(
     """
     site = data.site
     networks = f"emission.hidden={hidden}" if hidden else None
-    placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
+    placed = (
+        f"init={init.name}" if init.name in ("sphere", "uniform", "grid") and site.kind != "rssi" else None
+    )
     request = networks or placed  # asks for Gaussians that are rendered
     distance = falls and init.name != "vectors"
     obstacles = {

@@ -60,7 +60,9 @@ def said_in(file: Path) -> dict:
     """What a file says itself, on top of what the files of its own folder say that it builds on."""
     own = yaml.safe_load(file.read_text())
     below = [one for one in own.pop("defaults", []) if isinstance(one, str) and one != "_self_"]
-    under = OmegaConf.merge(*(said_in(file.parent / f"{one}.yaml") for one in below), own)
+    under = OmegaConf.merge(
+        *(said_in((CONF if one[0] == "/" else file.parent) / f"{one.lstrip('/')}.yaml") for one in below), own
+    )
     return OmegaConf.to_container(under)
 
 

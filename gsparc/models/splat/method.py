@@ -189,11 +189,11 @@ class LearnedField(Method):
         self._refuse_site(data.site)
         with heeded.set_apart():
             choices, _ = resolve_auto(self.settings, self.init.name, data.site)
-        asked = self.most_steps if steps is None else steps
+        count = self.most_steps if steps is None else steps
         if choices.closed_form:
             usual = f"at most {effort.steps_after_solving}"
-            return f"closed form, then {usual if asked is None else asked} gradient steps"
-        return f"{effort.steps if asked is None else asked} gradient steps from init={choices.init}"
+            return f"closed form, then {usual if count is None else count} gradient steps"
+        return f"{effort.steps if count is None else count} gradient steps from init={choices.init}"
 
     def _refuse_site(self, site: Site) -> None:
         """Raise `ValueError`, one line, where it has no such field."""

@@ -81,3 +81,13 @@ def test_the_console_says_how_a_fit_goes(tmp_path):
     assert method.describe_fit(data, Effort(), 5).endswith(
         "then 5 gradient steps; the paper's recipe: paper=gsparc"
     )
+
+
+def test_a_grid_of_gaussians_was_left_to_image_sources(tmp_path):
+    """`model=gsparc init=grid` on channels chose what has no grid."""
+    data = load_data({"name": "own", "file": str(channels(tmp_path / "own.npz"))})
+    for start in ("uniform", "grid"):
+        method = build(compose(*brief(tmp_path / "own.npz", f"init={start}")).model)
+        assert method.describe_fit(data, Effort(), 5).startswith(
+            f"image_process, 5 gradient steps from init={start}"
+        )
