@@ -14,11 +14,12 @@ from gsparc.data.public.fetch import MIRROR, PublicSet, fetch, public_sets
 
 def describe_set(one: PublicSet) -> str:
     """Say what a set is, its size and licence, how it is used and cited, and where it comes from."""
-    size = one.size_text if one.sources else "by hand"
+    size = one.size_text if one.sources else "size said first" if one.hub else "by hand"
     licence = one.licence or "no licence stated: ask its makers before you pass it on"
     use = f"dataset={one.dataset}" if one.dataset else "no loader of its own"
     first = one.sources[0] if one.sources else None
-    where = f"github.com/{first.repository} at {first.revision[:10]}" if first else one.by_hand
+    hub = f"huggingface.co/datasets/{one.hub}, folder {one.strip}" if one.hub else one.by_hand
+    where = f"github.com/{first.repository} at {first.revision[:10]}" if first else hub
     return f"{one.name}: {one.what}\n    {size}; {licence}; {use}\n    cite {one.cite}\n    from {where}"
 
 

@@ -18,6 +18,7 @@ from filelock import FileLock, Timeout
 
 from gsparc.data.errors import DataError, explain_error, suggest_name
 from gsparc.data.files import platform_cache, read_shipped_table
+from gsparc.data.public.hub import fetch_from_hub
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +56,7 @@ class PublicSet:
     cite: str
     dataset: str | None = None
     by_hand: str | None = None
+    hub: str | None = None
     strip: str = ""
     opens: str = ""
     sources: tuple[Source, ...] = ()
@@ -153,10 +155,9 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
             f"no public set is called {name!r}{suggest_name(name, known)}; `gsparc data` lists them"
         )
     wanted = known[name]
-    if not wanted.sources:
+    if not wanted.sources and wanted.hub is None:
         raise DataError(f"{name} is not fetched by this program; get it from {wanted.by_hand}")
-    missing = [path for path, source in wanted.files().items() if not _is_right(path, source)]
-    if not missing:
+    if wanted.sources and all(_is_right(path, source) for path, source in wanted.files().items()):
         return wanted.folder
     _licence(wanted, accept)
     try:
@@ -168,6 +169,8 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
             log.warning("%s: another process fetches it; waiting for it to end", wanted.name)
             held = lock.acquire()
         with held:
+            if wanted.hub is not None:
+                return fetch_from_hub(wanted.hub, wanted.strip, wanted.folder)
             # Of a fetch that was killed: nobody else holds the lock.
             for stray in {*wanted.folder.rglob("tmp*")} - wanted.files().keys():
                 stray.unlink()

@@ -242,7 +242,7 @@ def test_every_pinned_file_is_listed_as_it_was_published():
         assert (one.licence is None) == any(
             "see" in r["licence"] for r in rows if r["dataset"] == one.name
         ) or not one.sources
-        assert one.sources or one.by_hand
+        assert one.sources or one.by_hand or one.hub
         assert all(str(path).startswith(str(one.folder)) for path in one.files())
 
 
