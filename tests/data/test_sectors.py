@@ -83,7 +83,8 @@ def test_channels_and_bands():
     found = earfcn_hz(np.array([100.0, 1300, 6300, 38000, np.nan]))
     np.testing.assert_allclose(found[:4], [2120e6, 1815e6, 806e6, 2595e6])
     assert np.isnan(found[4])
-    np.testing.assert_allclose(band_hz(np.array([3.0, 20, 1800])), [1805e6, 791e6, 1800e6])
+    np.testing.assert_allclose(band_hz(np.array([3.0, 20, 1800, 3500])), [1805e6, 791e6, 1800e6, 3500e6])
+    assert np.isnan(band_hz(np.array([3000.0, 20e3, 0.003]))).all()  # bands by the thousand were believed
 
 
 def test_slots_of_neighbours_become_rows(tmp_path):

@@ -27,6 +27,7 @@ FIRST_NR = (
     100_000  # channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1)
 )
 MOST_BAND = 90  # numbers beyond are frequencies [MHz]
+NEAR_BAND = 0.05  # share by which 700, 1800 or 3500 MHz miss the lowest of the band that they name
 MHZ = 1e6
 
 
@@ -48,9 +49,11 @@ def earfcn_hz(channel: np.ndarray) -> np.ndarray:
 
 
 def band_hz(band: np.ndarray) -> np.ndarray:
-    """Return lowest downlink frequencies [Hz] of LTE bands (n,), or of [MHz] that name one."""
+    """Return lowest downlink frequencies [Hz] of LTE bands (n,), or of [MHz] that name one; NaN of none."""
     known = BANDS["lowest_mhz"].reindex(np.nan_to_num(band).astype(int)).to_numpy()
-    return np.where(band > MOST_BAND, band, known) * MHZ
+    lowest = BANDS["lowest_mhz"].to_numpy()
+    names = (abs(np.nan_to_num(band)[:, None] / lowest - 1) < NEAR_BAND).any(axis=1)
+    return np.where(band > MOST_BAND, np.where(names, band, np.nan), known) * MHZ
 
 
 def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], list[str]]:
