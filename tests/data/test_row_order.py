@@ -33,6 +33,9 @@ def rows_of(kind: str) -> dict[str, np.ndarray]:
                  "rssi_db": levels[np.arange(60), station]},
         "both": {"rx_position": places, "tx_position": places[::-1] + 9, "rssi_db": levels[:, 0]},
         "channels": {**one, "csi": waves, "_frequency_hz": 5e9 + 1e6 * np.arange(4)},
+        "runs": {**one, "csi": waves, "_frequency_hz": 5e9 + 1e6 * np.arange(4), "run": station},
+        "the strongest": {"rx_position": places, "_station_position": POSTS,
+                          "rssi_db": np.where(levels < np.sort(levels, 1)[:, 1:2], np.nan, levels)},
         "stations' channels": {"rx_position": places, "_station_position": POSTS,
                                "csi": rng.normal(size=(60, 3, 2, 4)) + 0j,
                                "_frequency_hz": 5e9 + np.arange(4)},
@@ -45,7 +48,10 @@ def measurements(arrays: dict[str, np.ndarray], order: np.ndarray):
     return from_arrays({name.lstrip("_"): a if name[0] == "_" else a[order] for name, a in arrays.items()})
 
 
-KINDS = ("powers", "wide", "long", "both", "channels", "stations' channels", "spectra")
+KINDS = (
+    *("powers", "wide", "long", "the strongest", "both"),
+    *("channels", "runs", "stations' channels", "spectra"),
+)
 
 
 @pytest.mark.parametrize("kind", KINDS)
