@@ -282,6 +282,7 @@ class Measurements:
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
         position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
             where positions count as exact.
+        sequence: (S,) int64, number of each row in the order in which they were taken; None: as they stand.
     """
 
     site: Site
@@ -301,6 +302,7 @@ class Measurements:
     censored: np.ndarray | None = None
     run: np.ndarray | None = None
     position_std: np.ndarray | None = None
+    sequence: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.target)
