@@ -60,7 +60,7 @@ def fit_baseline(
     """Fit the baseline `name` with its default settings on each fold, and score it.
 
     Args:
-        name: as in `gsparc.models.registry.known()`.
+        name: as in `gsparc.models.registry.all_methods()`.
         data: the dataset.
         split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
         eval_on: `train`, `val` or `test`.

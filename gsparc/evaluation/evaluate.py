@@ -72,7 +72,7 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.models.registry.known()`; None: all plain ones that serve these rows.
+        baselines: names in `gsparc.models.registry.all_methods()`; None: all plain that serve these rows.
         clock: how long to measure latencies.
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
         shared: the baseline that the methods are, which is then not fitted again.

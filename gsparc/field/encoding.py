@@ -33,7 +33,7 @@ class EncodingSettings(Checked):
 
 
 @dataclass(frozen=True)
-class Prior:
+class Smoothness:
     """How smoothly targets change with position: what leaving training data out found.
 
     Attributes:
@@ -70,7 +70,7 @@ class PositionEncoding(nn.Module):
     whitening: Tensor
     tells_share = False  # whether the squared length of the features is a share that is known
 
-    def __init__(self, settings: EncodingSettings, box: Tensor, prior: Prior | None = None) -> None:
+    def __init__(self, settings: EncodingSettings, box: Tensor, prior: Smoothness | None = None) -> None:
         super().__init__()
         box = torch.as_tensor(box, dtype=torch.float64)
         extent = (box[1] - box[0]).max().clamp_min(1e-6)  # one scale for all axes keeps distances true

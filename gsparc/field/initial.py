@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.data.limits import POSITIVE, Checked, choice, setting, whole
 from gsparc.data.schema import Measurements
-from gsparc.field.encoding import Prior
+from gsparc.field.encoding import Smoothness
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
 from gsparc.training.time_budget import TimeBudget
@@ -108,6 +108,6 @@ class Start:
         left_out: training targets that it predicted without their neighbours, for whoever asks; not stored.
     """
 
-    prior: Prior | None
+    prior: Smoothness | None
     solve: Callable[[GaussianModel], Any] | None = None
     left_out: Any = None

@@ -15,7 +15,7 @@ from gsparc.data.limits import POSITIVE, Checked, or_null, setting
 from gsparc.data.schema import Site
 from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel
 from gsparc.field.emission import Emission, EmissionSettings
-from gsparc.field.encoding import PositionEncoding, Prior, unknown_share
+from gsparc.field.encoding import PositionEncoding, Smoothness, unknown_share
 from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
 from gsparc.field.response import ArrayResponse, ChannelResponse, MeanResponse, ResponseSettings
 from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
@@ -115,7 +115,7 @@ class GaussianModel(nn.Module):
         site: Site,
         receiver: Pose | None = None,
         transmitter: Tensor | None = None,
-        prior: Prior | None = None,
+        prior: Smoothness | None = None,
         shape: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()

@@ -13,7 +13,7 @@ from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
-from gsparc.simulate.paths import ARRAYS, Paths, group_offsets
+from gsparc.simulate.paths import ARRAYS, TracedPaths, group_offsets
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import render_spectra
@@ -24,7 +24,7 @@ WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are n
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
 
 
-def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
+def shard_arrays(paths: TracedPaths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
     """Return what a shard keeps of some receivers."""
     frequency = campaign.scene.frequency_hz
     images, peak = render_spectra(paths, campaign.spectrum, frequency, wavelength)
@@ -96,7 +96,7 @@ class Rows(NamedTuple):
     """What all shards hold: arrays with a row for each of the survey's, by name, and their paths."""
 
     arrays: dict[str, np.ndarray]
-    paths: Paths
+    paths: TracedPaths
 
 
 def join_shards(shards: Shards, rows: int) -> Rows:
@@ -119,7 +119,7 @@ def join_shards(shards: Shards, rows: int) -> Rows:
             if name not in whole:
                 whole[name] = allocate((int(length), *values.shape[1:]), values.dtype)
             whole[name][at] = values
-    return Rows(whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS)))
+    return Rows(whole, TracedPaths(offsets, *(whole.pop(name) for name in ARRAYS)))
 
 
 def _arrays(campaign: Campaign, survey: Survey, rows: Rows) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
 
 SILENCE_DB = 99.0  # error of a receiver that loses everything
@@ -82,13 +82,13 @@ class Probe:
         nearest: paths of the nearest other receiver of each, (R receivers); needed for spectra only.
     """
 
-    paths: Paths
+    paths: TracedPaths
     effects: Effects
     frequency_hz: np.ndarray
     wavelength: float
     elements: np.ndarray
     spectrum: SpectrumSettings
-    nearest: Paths | None = None
+    nearest: TracedPaths | None = None
 
     @cached_property
     def _channels(self) -> np.ndarray:
@@ -107,7 +107,7 @@ class Probe:
         """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
-    def lost_power_shares(self, remaining: Effects | Paths) -> np.ndarray:
+    def lost_power_shares(self, remaining: Effects | TracedPaths) -> np.ndarray:
         """Return the share of each receiver's power that is lost (R,), negative where more arrives.
 
         Args:
@@ -116,7 +116,7 @@ class Probe:
         full = self.paths.received_power()
         return 1 - self._rest(remaining).received_power() / np.where(full > 0, full, 1)
 
-    def nmse(self, remaining: Effects | Paths) -> np.ndarray:
+    def nmse(self, remaining: Effects | TracedPaths) -> np.ndarray:
         """Return the NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
         full, rest = self._channels, self._responses(self._rest(remaining))
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
@@ -125,7 +125,7 @@ class Probe:
         energy = (np.abs(full) ** 2).sum((1, 2))
         return error / np.where(energy > 0, energy, 1)
 
-    def errors(self, remaining: Effects | Paths, deliverable: Deliverable) -> np.ndarray:
+    def errors(self, remaining: Effects | TracedPaths, deliverable: Deliverable) -> np.ndarray:
         """Return the deliverable's error at each receiver (R,), in the unit of its tolerance."""
         # Losing everything is infinite in decibels, and would spoil every quantile.
         least = 10 ** (-SILENCE_DB / 10)
@@ -139,14 +139,14 @@ class Probe:
         error, nearest = (((other - full) ** 2).mean((1, 2)) for other in (image, near))
         return error / np.maximum(nearest, 1e-12)
 
-    def _rest(self, remaining: Effects | Paths) -> Paths:
+    def _rest(self, remaining: Effects | TracedPaths) -> TracedPaths:
         # Nothing is traced again: without an effect the solver would draw other rays.
-        return remaining if isinstance(remaining, Paths) else self.paths.keep_effects(remaining)
+        return remaining if isinstance(remaining, TracedPaths) else self.paths.keep_effects(remaining)
 
-    def _responses(self, paths: Paths) -> np.ndarray:
+    def _responses(self, paths: TracedPaths) -> np.ndarray:
         return paths.responses(self.frequency_hz, self.elements, self.wavelength)
 
-    def _render(self, paths: Paths) -> np.ndarray:
+    def _render(self, paths: TracedPaths) -> np.ndarray:
         return render_spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
 
 

@@ -13,7 +13,7 @@ from scipy.stats import binom
 from gsparc.data.limits import SHARE, Checked, number, setting, whole
 from gsparc.simulate.attribution import Deliverable, Probe, list_effect_sets, list_removals
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 
 # Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
 # street canyon and in the conference room (docs/results/simulate.md).
@@ -173,7 +173,9 @@ def verify_choice(choice: Choice, settings: AutoSettings, errors: np.ndarray) ->
     return replace(choice, verdict=verdict)
 
 
-def choose_rays(choice: Choice, settings: AutoSettings, probe: Probe, traced: Paths, samples: int) -> Choice:
+def choose_rays(
+    choice: Choice, settings: AutoSettings, probe: Probe, traced: TracedPaths, samples: int
+) -> Choice:
     """Return the choice with so many `samples` where those are enough, or without; a row says which.
 
     Args:
@@ -231,7 +233,7 @@ def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effec
     return min(enough, key=lambda s: (len(s.enabled), s.polarisation, s.depth), default=full)
 
 
-def _row(name: str, probe: Probe, less: Effects | Paths, required: Deliverable) -> EffectRow:
+def _row(name: str, probe: Probe, less: Effects | TracedPaths, required: Deliverable) -> EffectRow:
     """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
     share, error = (
         part[probe.reached] for part in (np.abs(probe.lost_power_shares(less)), probe.errors(less, required))

@@ -61,7 +61,7 @@ GENERIC = Material(5.0, 0.05)  # between brick and concrete at a few GHz (ITU-R 
 
 
 @dataclass(frozen=True)
-class Calibration:
+class RoomCalibration:
     """What was learned.
 
     Attributes:
@@ -201,7 +201,7 @@ def _field_arguments(
 
 def calibrate(
     replay: Replay, start: Mapping[str, Material], traced: np.ndarray, measured_db: np.ndarray, steps: int
-) -> Calibration:
+) -> RoomCalibration:
     """Find materials, one gain and the residuals' scale of largest posterior.
 
     Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from the
@@ -218,7 +218,7 @@ def calibrate(
     reached = traced > 0
     gain, scale = fit_gain_and_scale(measured_db[reached] - 10 * np.log10(traced[reached]))
     if not steps:
-        return Calibration(dict(start), gain, scale, 0)
+        return RoomCalibration(dict(start), gain, scale, 0)
     centre = np.concatenate([one.logarithms() for one in start.values()])
     deviation = np.tile(PRIOR, len(start))
     best = (np.inf, centre, gain, scale)
@@ -252,7 +252,7 @@ def calibrate(
     _, x, gain, scale = best
     materials = {name: Material.from_logarithms(x) for name, x in zip(start, x.reshape(-1, 2), strict=True)}
     apply_materials(replay.tracer, materials)
-    return Calibration(materials, gain, scale, spent)
+    return RoomCalibration(materials, gain, scale, spent)
 
 
 def fit_gain_and_scale(missed: np.ndarray) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from gsparc.simulate import auto
 from gsparc.simulate.attribution import Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.scenes.receivers import nearest_rows
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.survey import Survey
@@ -116,7 +116,7 @@ class Decider:
         owner, place = np.divmod(rows, len(self.survey.places))
         return np.asarray(owner * len(self.survey.places) + nearest_rows(self.survey.places, place))
 
-    def _paths_of_rows(self, rows: np.ndarray) -> Paths:
+    def _paths_of_rows(self, rows: np.ndarray) -> TracedPaths:
         return self.paths.select_receivers(np.searchsorted(self.rows, rows))
 
     def _probe(self, rows: np.ndarray) -> Probe:
@@ -125,7 +125,7 @@ class Decider:
         array, tones = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
         return Probe(self._paths_of_rows(rows), self.full, tones, wavelength, array, campaign.spectrum, near)
 
-    def _verified(self, choice: Choice, less: Effects | Paths) -> tuple[Choice, Changed]:
+    def _verified(self, choice: Choice, less: Effects | TracedPaths) -> tuple[Choice, Changed]:
         held = self._probe(self.held_back)
         errors = held.errors(less, self.settings.required)
         verified = auto.verify_choice(choice, self.settings, errors[held.reached])

@@ -11,12 +11,12 @@ from gsparc.simulate.effects import Effects
 
 
 @dataclass(frozen=True)
-class Paths:
+class TracedPaths:
     """Paths of R receivers, sorted by receiver and then by delay; those of r are `offsets[r]:offsets[r+1]`.
 
     >>> receiver, delay, count = np.array([1, 0, 1]), np.array([2e-8, 1e-8, 1e-8]), np.zeros(3, np.uint8)
     >>> gain, direction = np.ones((3, 1), np.complex64), np.ones((3, 3))
-    >>> paths = Paths.from_unsorted(2, receiver, gain, delay, direction, count, count)
+    >>> paths = TracedPaths.from_unsorted(2, receiver, gain, delay, direction, count, count)
     >>> paths.offsets, paths.received_power()  # one path of the first receiver, two of the second
     (array([0, 1, 3]), array([1., 2.]))
 
@@ -40,12 +40,12 @@ class Paths:
     def from_unsorted(
         receivers: int, receiver_index: np.ndarray, gain: np.ndarray, delay: np.ndarray,
         direction: np.ndarray, mechanisms: np.ndarray, order: np.ndarray,
-    ) -> Paths:  # fmt: skip
+    ) -> TracedPaths:  # fmt: skip
         """Sort paths in any order; `receiver_index` (P,) says whose each is, the rest as of this class."""
         # The last key counts most: by receiver, then by delay.
         rank = np.lexsort((delay, receiver_index))
         offsets = group_offsets(np.bincount(receiver_index, minlength=receivers))
-        return Paths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
+        return TracedPaths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -60,20 +60,20 @@ class Paths:
         """|gain|^2 summed over the ports (P,)."""
         return (np.abs(self.gain.astype(np.complex128)) ** 2).sum(1)
 
-    def select_paths(self, selected: np.ndarray) -> Paths:
+    def select_paths(self, selected: np.ndarray) -> TracedPaths:
         """Return only the paths where `selected` (P,) bool is true; receivers stay."""
         counts = np.bincount(self.receiver_index[selected], minlength=len(self))
-        return Paths(group_offsets(counts), *(getattr(self, name)[selected] for name in ARRAYS))
+        return TracedPaths(group_offsets(counts), *(getattr(self, name)[selected] for name in ARRAYS))
 
-    def select_receivers(self, receivers: np.ndarray) -> Paths:
+    def select_receivers(self, receivers: np.ndarray) -> TracedPaths:
         """Return receivers (n,) alone, in this order."""
         counts = np.diff(self.offsets)[receivers]
         # Rows of all paths without a loop: where a group begins here, less where it will begin.
         first = np.repeat(self.offsets[receivers] - group_offsets(counts)[:-1], counts)
         rows = first + np.arange(counts.sum())
-        return Paths(group_offsets(counts), *(getattr(self, name)[rows] for name in ARRAYS))
+        return TracedPaths(group_offsets(counts), *(getattr(self, name)[rows] for name in ARRAYS))
 
-    def keep_effects(self, effects: Effects) -> Paths:
+    def keep_effects(self, effects: Effects) -> TracedPaths:
         """Return what remains of a full simulation under these switches."""
         selected = self.select_paths(effects.allows_paths(self.mechanisms, self.order))
         return selected if effects.polarisation else replace(selected, gain=selected.gain[:, :1])
@@ -126,9 +126,9 @@ def group_offsets(counts: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(counts)])
 
 
-def join_receivers(parts: Sequence[Paths]) -> Paths:
+def join_receivers(parts: Sequence[TracedPaths]) -> TracedPaths:
     """Return receivers of all parts, one after the other."""
     counts = np.concatenate([np.diff(part.offsets) for part in parts])
-    return Paths(
+    return TracedPaths(
         group_offsets(counts), *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
     )

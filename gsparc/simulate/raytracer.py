@@ -23,7 +23,7 @@ from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
-from gsparc.simulate.paths import Paths, join_receivers
+from gsparc.simulate.paths import TracedPaths, join_receivers
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
 from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
@@ -140,7 +140,7 @@ class RayTracer(Engine):
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
         """Trace paths to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
 
         Raises:
@@ -367,13 +367,13 @@ def divide_into_calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
 
 
-def _collect(solution: Any, receivers: int, ports: int) -> Paths:
+def _collect(solution: Any, receivers: int, ports: int) -> TracedPaths:
     """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest list."""
     buffer = solution._paths_buffer
     owner = buffer.target_indices.numpy().astype(np.int64)
     if not len(owner):  # nothing is heard anywhere: the solver has made no gains either
         nothing = np.zeros((0, ports), np.complex64), np.zeros(0), np.zeros((0, 3), np.float32)
-        return Paths.from_unsorted(receivers, owner, *nothing, *np.zeros((2, 0), np.uint8))
+        return TracedPaths.from_unsorted(receivers, owner, *nothing, *np.zeros((2, 0), np.uint8))
     gain = np.stack([one[0].numpy() for one in buffer.a], axis=1).astype(np.complex64)
     delay = buffer.tau.numpy().astype(np.float64)
     kinds = buffer.interaction_types.numpy().astype(np.uint8).reshape(len(owner), -1)
@@ -391,7 +391,7 @@ def _collect(solution: Any, receivers: int, ports: int) -> Paths:
     if len(sight) and sight.max() > 1:
         row = int(sight.argmax())
         raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
-    return Paths.from_unsorted(receivers, owner, gain, delay, direction, mechanisms, order)
+    return TracedPaths.from_unsorted(receivers, owner, gain, delay, direction, mechanisms, order)
 
 
 def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:

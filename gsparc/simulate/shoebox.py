@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.effects import SPECULAR, Effects
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.survey import Engine
 
 WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
@@ -255,7 +255,7 @@ class ShoeboxEngine(Engine):
             depth=effects.depth if effects.specular else 0,
         )
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
         """Trace paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = mirror_images(self.room, effects.depth)
         seen = visible_images(self.room, mirrored, self.transmitter[None], receivers)
@@ -267,7 +267,7 @@ class ShoeboxEngine(Engine):
         # Friis' amplitude between isotropic antennas, without the carrier's phase.
         gain = mirrored.gain[image] * self.wavelength / (4 * np.pi * distance)
         order = mirrored.order[image].astype(np.uint8)
-        return Paths.from_unsorted(
+        return TracedPaths.from_unsorted(
             len(receivers), owner, gain[:, None].astype(np.complex64), distance / LIGHT,
             (way / distance[:, None]).astype(np.float32), np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,

@@ -14,7 +14,7 @@ import torch
 
 from gsparc.data.limits import POSITIVE, Checked, setting, whole
 from gsparc.ops import SphereGrid
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 
 BLOCK = 64  # receivers at once
 
@@ -67,7 +67,7 @@ class SpectrumSettings(ArraySettings):
 
 
 def render_spectra(
-    paths: Paths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
+    paths: TracedPaths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return spectra (R, H, W) float32, and the largest amplitude of each (R,), which it was divided by.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.paths import Paths, join_receivers
+from gsparc.simulate.paths import TracedPaths, join_receivers
 from gsparc.simulate.scenes.receivers import farthest_points
 
 
@@ -68,7 +68,7 @@ class Survey:
         ]
         return np.concatenate(rounds)[:count]
 
-    def trace(self, rows: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, rows: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
         """Trace paths of rows (n,), in their order."""
         owner, place = np.divmod(rows, len(self.places))
         # Stable: rows of a transmitter stay in the order in which they are traced.
@@ -94,7 +94,7 @@ class Engine(Protocol):
     wavelength: float
     random: bool
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
         """Trace paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
     def materials(self) -> dict[str, dict[str, Any]]:

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior
+from gsparc.field.encoding import EncodingSettings, PositionEncoding, Smoothness
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 2.0, 1.0]])
 
@@ -13,8 +13,8 @@ def positions(count: int, seed: int = 0) -> torch.Tensor:
     return BOX[0] + (BOX[1] - BOX[0]) * torch.rand(count, 3, generator=draw)
 
 
-def prior(count: int = 20, length: float = 0.7) -> Prior:
-    return Prior(positions(count, 1), length, 0.01)
+def prior(count: int = 20, length: float = 0.7) -> Smoothness:
+    return Smoothness(positions(count, 1), length, 0.01)
 
 
 def test_raw_has_one_scale_for_all_axes():
@@ -44,7 +44,7 @@ def test_kernel_features_are_white_on_their_anchors():
 
 def test_repeated_anchors_stay_invertible():
     twice = positions(10, 1).repeat(2, 1)
-    encode = PositionEncoding(EncodingSettings("kernel"), BOX, Prior(twice, 0.7, 0.01))
+    encode = PositionEncoding(EncodingSettings("kernel"), BOX, Smoothness(twice, 0.7, 0.01))
     assert torch.isfinite(encode(positions(5))).all()
 
 

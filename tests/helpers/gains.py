@@ -8,13 +8,13 @@ import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import SourceScene
 from gsparc.training.context import FitContext, FitReport
 
 
-def gains(member: Posterior, places: torch.Tensor) -> torch.Tensor:
+def gains(member: GainPosterior, places: torch.Tensor) -> torch.Tensor:
     """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], attenuated by clutter."""
     both, m = torch.cat([places, member.rows.position]), len(places)
     kernel, scene = member.scene.visibility, member.scene
@@ -24,7 +24,7 @@ def gains(member: Posterior, places: torch.Tensor) -> torch.Tensor:
     return torch.stack(each, 1) * turn[:, :, None]
 
 
-def phased(scene: Scene, phase: torch.Tensor, quadrature: float = 0.2) -> Scene:
+def phased(scene: SourceScene, phase: torch.Tensor, quadrature: float = 0.2) -> SourceScene:
     """The scene with phases (K,) [rad] of its gains."""
     return replace(scene, phase=phase, quadrature=quadrature)
 

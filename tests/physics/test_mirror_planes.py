@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsparc.models.image_sources.reflection_orders import find_orthogonal_walls, find_walls, reassign_to_walls
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import SourceScene
 from gsparc.physics.mirror_planes import all_sequences, bisector, images, reflect
 
 WALLS = torch.tensor(
@@ -57,11 +57,13 @@ def test_walls_of_a_box_are_told_from_sources_spelled_badly():
     walls = torch.tensor([[1.0, 0, 0, 4], [0, 1, 0, 0], [0, 1, 0, 3], [0, 0, 1, 2.5]], dtype=torch.float64)
     transmitter = torch.tensor([0.0, 0.8, 1.9], dtype=torch.float64)
     sequences = ((), (0,), (1,), (2,), (3,), (0, 3), (1, 3), (0, 1))
-    good = Scene(transmitter, walls, sequences, torch.zeros(len(sequences)), 0.0)
+    good = SourceScene(transmitter, walls, sequences, torch.zeros(len(sequences)), 0.0)
     # the far wall's images hang on tilted planes of their own
     tilted = bisector(good.sources[3].expand(2, 3), good.sources[[1, 5]])
     planes = torch.cat([walls[1:], tilted])
-    bad = Scene(transmitter, planes, ((), (0,), (1,), (2,), (1, 3), (1, 4), (0, 2)), torch.zeros(7), 0.0)
+    bad = SourceScene(
+        transmitter, planes, ((), (0,), (1,), (2,), (1, 3), (1, 4), (0, 2)), torch.zeros(7), 0.0
+    )
     found = find_orthogonal_walls(bad)
     assert found is not None
     told = {(int(p[:3].abs().argmax()), round(float((p[3] * p[:3].sum()).abs()), 2)) for p in found}
@@ -71,5 +73,5 @@ def test_walls_of_a_box_are_told_from_sources_spelled_badly():
 
 def test_without_perpendicular_planes_there_is_no_box():
     plane = torch.tensor([[1.0, 0, 0, 4]], dtype=torch.float64)
-    scene = Scene(torch.zeros(3, dtype=torch.float64), plane, ((), (0,)), torch.zeros(2), 0.0)
+    scene = SourceScene(torch.zeros(3, dtype=torch.float64), plane, ((), (0,)), torch.zeros(2), 0.0)
     assert find_orthogonal_walls(scene) is None

@@ -5,7 +5,7 @@ import pytest
 import torch
 from sklearn.gaussian_process.kernels import Matern
 
-from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior, unknown_share
+from gsparc.field.encoding import EncodingSettings, PositionEncoding, Smoothness, unknown_share
 from gsparc.processes.features import correlation, pivoted_rows, place_features, whitened_features
 
 LENGTH, NOISE, NAME = 0.4, 0.01, "smooth_rough"
@@ -72,7 +72,7 @@ def test_there_are_never_more_places_than_allowed_and_never_twins():
 
 def test_the_unknown_share_is_1_far_away_and_small_at_data():
     features = whitened_features(rows(60), LENGTH, NOISE, NAME, 60)
-    prior = Prior(features.places.float(), LENGTH, NOISE, NAME, features.whitening.float())
+    prior = Smoothness(features.places.float(), LENGTH, NOISE, NAME, features.whitening.float())
     encode = PositionEncoding(EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior)
     assert encode.tells_share and encode.width == 60
     far = torch.tensor([[40.0, 0.0, 0.0], [1e4, -1e4, 3.0], [0.0, 0.0, -30.0]])
@@ -86,7 +86,7 @@ def test_features_far_from_the_middle_are_as_good_as_float64(extent, wavelength)
     known = (rows(40, extent=extent) - extent / 2).float()
     known = torch.cat([known, known + 0.3 * wavelength])
     features = whitened_features(known.double(), wavelength / 2, 1e-3, NAME, 80)
-    prior = Prior(known, wavelength / 2, 1e-3, NAME, features.whitening.float())
+    prior = Smoothness(known, wavelength / 2, 1e-3, NAME, features.whitening.float())
     encode = PositionEncoding(EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior)
     asked = known + 0.1 * wavelength * torch.randn(80, 3)
     wanted = correlation(asked.double(), features.places, wavelength / 2, NAME) @ features.whitening

@@ -12,7 +12,7 @@ from gsparc.simulate.attribution import Deliverable, Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.deciding import Decision
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings
 from gsparc.simulate.survey import Engine
 
@@ -34,7 +34,7 @@ class Invented(Engine):
         count, each = len(receivers), len(self.record)
         power = np.tile([p for _, _, p in self.record], count)
         direction = np.abs(rng.normal(size=(count * each, 3)))
-        whole = Paths(
+        whole = TracedPaths(
             np.arange(count + 1) * each, np.sqrt(power)[:, None].astype(np.complex64),
             rng.uniform(0, 1e-7, count * each),
             (direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32),
@@ -165,7 +165,7 @@ def test_spectra_are_judged_against_the_nearest_receiver():
 
 
 def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
-    paths = Paths(np.array([0, 2]), np.array([[1.0], [0.1]], np.complex64), np.array([0.0, 1e-8]),
+    paths = TracedPaths(np.array([0, 2]), np.array([[1.0], [0.1]], np.complex64), np.array([0.0, 1e-8]),
                   np.array([[0, 0, 1], [0, 0, 1]], np.float32), np.array([0, SPECULAR], np.uint8),
                   np.array([0, 1], np.uint8))  # fmt: skip
     probe, h = probe_of(paths), 1 + 0.1 * np.exp(-2j * np.pi * 24)

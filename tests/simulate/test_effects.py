@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, Effects, from_config
-from gsparc.simulate.paths import Paths, join_receivers
+from gsparc.simulate.paths import TracedPaths, join_receivers
 
 EVERYTHING = Effects(depth=3)
 
@@ -12,7 +12,7 @@ def paths_of(mechanisms, order, owner=None, ports=1):
     count = len(mechanisms)
     owner = np.zeros(count, int) if owner is None else np.array(owner)
     direction = np.tile(np.array([[1.0, 0, 0]], np.float32), (count, 1))
-    return Paths(
+    return TracedPaths(
         np.concatenate([[0], np.cumsum(np.bincount(owner))]), np.ones((count, ports), np.complex64),
         np.arange(count) * 1e-9, direction, np.array(mechanisms, np.uint8), np.array(order, np.uint8),
     )  # fmt: skip

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsparc.ops import SphereGrid
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
 
 WAVELENGTH = 0.125
@@ -15,7 +15,7 @@ def arriving(directions, powers, delays=None):
     unit = np.array(directions, float)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     delays = np.arange(count) * 1e-8 if delays is None else np.array(delays)
-    return Paths(np.array([0, count]), np.sqrt(np.array(powers))[:, None].astype(np.complex64), delays,
+    return TracedPaths(np.array([0, count]), np.sqrt(np.array(powers))[:, None].astype(np.complex64), delays,
                  unit.astype(np.float32), np.zeros(count, np.uint8), np.zeros(count, np.uint8))  # fmt: skip
 
 
@@ -63,7 +63,7 @@ def test_silence_is_black():
 
 def test_both_polarisations_add_their_powers():
     waves = random_waves(seed=2)
-    doubled = Paths(waves.offsets, np.repeat(waves.gain, 2, axis=1), waves.delay, waves.direction,
+    doubled = TracedPaths(waves.offsets, np.repeat(waves.gain, 2, axis=1), waves.delay, waves.direction,
                     waves.mechanisms, waves.order)  # fmt: skip
     (one, low), (two, high) = (
         render_spectra(w, SpectrumSettings(), TONES, WAVELENGTH) for w in (waves, doubled)

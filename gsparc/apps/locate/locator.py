@@ -16,9 +16,9 @@ import torch
 from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
 from gsparc.apps.locate.cells import Cells, beyond_box
 from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.posterior import Posterior, densest_cells
+from gsparc.apps.locate.posterior import PlacePosterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
-from gsparc.apps.locate.site_field import Moments, SiteField
+from gsparc.apps.locate.site_field import HeardMoments, SiteField
 from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
 from gsparc.data.executor import run_all, run_each
 from gsparc.prediction.predictor import Predictor
@@ -57,7 +57,7 @@ class Located:
     place: np.ndarray
     area: float
     modes: int
-    posterior: Posterior
+    posterior: PlacePosterior
     seconds: float
     doubt: str = ""
     inside: int | None = None
@@ -82,7 +82,7 @@ class Locator:
     trust: Trust
 
     @cached_property
-    def _coarse(self) -> Moments:
+    def _coarse(self) -> HeardMoments:
         """Computed once: most of the time of the first snapshot."""
         return self.field.moments_at(torch.from_numpy(self.cells.centre))
 

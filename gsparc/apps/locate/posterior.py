@@ -26,7 +26,7 @@ def densest_cells(log_density: np.ndarray, size: np.ndarray, share: float) -> np
 
 
 @dataclass(frozen=True)
-class Posterior:
+class PlacePosterior:
     """Masses of the cells in which something was heard.
 
     Places are recorded with errors, so that the density is that of the likelihood after a convolution with a

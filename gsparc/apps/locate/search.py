@@ -10,8 +10,8 @@ import torch
 from gsparc.apps.locate import likelihood
 from gsparc.apps.locate.cells import Cells
 from gsparc.apps.locate.likelihood import Misfit, Trust
-from gsparc.apps.locate.posterior import Posterior
-from gsparc.apps.locate.site_field import Moments
+from gsparc.apps.locate.posterior import PlacePosterior
+from gsparc.apps.locate.site_field import HeardMoments
 from gsparc.apps.locate.snapshots import Snapshots
 
 
@@ -44,12 +44,12 @@ class Search:
         """Return the squared error by the variance, a mean over the values, at the likeliest cell."""
         return float(self.misfit.squared[0, self.log_density(trust).argmax()] / self.misfit.count[0])
 
-    def posterior(self, trust: Trust) -> Posterior:
+    def posterior(self, trust: Trust) -> PlacePosterior:
         """Return what is known of the place."""
-        return Posterior(self.cells, self.log_density(trust), trust.spread)
+        return PlacePosterior(self.cells, self.log_density(trust), trust.spread)
 
 
-def compute_misfit(heard: Snapshots, there: Moments, unknown: Nuisances) -> Misfit:
+def compute_misfit(heard: Snapshots, there: HeardMoments, unknown: Nuisances) -> Misfit:
     """Return the misfit of snapshots at places; see `gsparc.apps.locate.likelihood`."""
     if heard.kind == "spectrum":
         return likelihood.spectrum_misfit(heard.values, there.mean, there.variance)

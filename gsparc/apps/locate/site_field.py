@@ -17,7 +17,7 @@ DB = 10 / np.log(10)
 
 
 @dataclass(frozen=True)
-class Moments:
+class HeardMoments:
     """What would be heard at G places.
 
     Attributes:
@@ -46,16 +46,16 @@ class SiteField:
         self.count = 1 if self.site.stations is None else len(self.site.stations)
 
     @torch.no_grad()
-    def moments_at(self, places: Tensor) -> Moments:
+    def moments_at(self, places: Tensor) -> HeardMoments:
         """Return what would be heard at places (G, 3) float64 [m, local].
 
         Raises:
             ValueError: the model states no variance.
         """
         parts = [self._chunk(chunk) for chunk in places.split(max(CHUNK // self.count, 1))]
-        return Moments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
+        return HeardMoments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
 
-    def _chunk(self, places: Tensor) -> Moments:
+    def _chunk(self, places: Tensor) -> HeardMoments:
         site = self.site
         station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
         query = Query.from_places(site, places.float().repeat_interleave(self.count, 0), station)
@@ -64,12 +64,12 @@ class SiteField:
             raise ValueError(f"locate: {self.predictor.method.name} states no variance of what is heard")
         mean, variance = flatten_targets(prediction.mean), prediction.variance.double()[:, None]
         if site.kind == "spectrum":
-            return Moments(mean.double(), variance)
+            return HeardMoments(mean.double(), variance)
         if site.kind == "rssi":
             power = mean.double().clamp_min(1e-30)
             return self._joined(10 * power.log10(), DB**2 * variance / power.square())
         return self._joined(mean.to(torch.complex128), variance.expand(mean.shape))
 
-    def _joined(self, mean: Tensor, variance: Tensor) -> Moments:
+    def _joined(self, mean: Tensor, variance: Tensor) -> HeardMoments:
         """Of rows by place and station (G T, p): (G, T p)."""
-        return Moments(*(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance)))
+        return HeardMoments(*(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance)))

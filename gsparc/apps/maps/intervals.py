@@ -27,7 +27,7 @@ TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.99
 
 
 @dataclass(frozen=True)
-class Evidence:
+class HeldOutLevels:
     """Rows predicted by models that did not learn from the block of places around them.
 
     Attributes:
@@ -50,9 +50,9 @@ class Evidence:
     def __len__(self) -> int:
         return len(self.level_db)
 
-    def subset(self, rows: np.ndarray) -> Evidence:
+    def subset(self, rows: np.ndarray) -> HeldOutLevels:
         """Return some of them."""
-        return Evidence(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return HeldOutLevels(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property
     def error(self) -> np.ndarray:
@@ -61,7 +61,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class IntervalScales:
     """What scales a prediction's own deviation.
 
     Attributes:
@@ -107,7 +107,7 @@ class Calibration:
         return np.where(np.isfinite(standard), chance, np.nan)
 
 
-def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
+def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     """Learn the scales; their intervals get no narrower with distance.
 
     Args:
@@ -144,10 +144,10 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     if heard.all():
         tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
     reach = float(np.quantile(used.distance, REACH))
-    return Calibration(share, middle, half, rms, tail, reach, station, least)
+    return IntervalScales(share, middle, half, rms, tail, reach, station, least)
 
 
-def error_distribution(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def error_distribution(evidence: HeldOutLevels) -> tuple[np.ndarray, np.ndarray]:
     """Return errors (m,) in deviations and their masses, those of censored rows spread over the errors they
     allow.
 
@@ -183,10 +183,10 @@ def weighted_quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.n
     return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])
 
 
-def _of_stations(used: Evidence, level: float) -> np.ndarray:
+def _of_stations(used: HeldOutLevels, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
 
-    def typical(part: Evidence) -> float:
+    def typical(part: HeldOutLevels) -> float:
         error, mass = error_distribution(part)
         return float(weighted_quantiles(np.abs(error), mass, level))
 
@@ -201,7 +201,7 @@ def _of_stations(used: Evidence, level: float) -> np.ndarray:
     return factors
 
 
-def interval_coverage(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+def interval_coverage(calibration: IntervalScales, evidence: HeldOutLevels) -> tuple[np.ndarray, np.ndarray]:
     """Tell whether measured levels (n,) lie in their intervals; widths (n,) [dB], NaN out of reach."""
     half = calibration.half_and_error(evidence.spread_db, evidence.distance, evidence.station)[0]
     return np.abs(evidence.level_db - evidence.mean_db) <= half, 2 * half
@@ -225,7 +225,7 @@ class Coverage:
     blocks: int
 
 
-def cross_validate(evidence: Evidence, share: float) -> Coverage:
+def cross_validate(evidence: HeldOutLevels, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
     part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS

@@ -14,7 +14,7 @@ from gsparc.apps.maps import field_map
 from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.field_map import FieldMap, best_server, server_chance, sinr
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.intervals import Calibration
+from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.apps.maps.levels import MAPPED, joint_levels, predicted_levels
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import sample_adaptively
@@ -152,10 +152,10 @@ def predict_map(
     ).to_unit(level.raised_db, level.name)  # fmt: skip
 
 
-def uncalibrated(share: float) -> Calibration:
+def uncalibrated(share: float) -> IntervalScales:
     """Return intervals and errors as the model states them, everywhere."""
     half = np.array([norm.ppf((1 + share) / 2)])
-    return Calibration(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
+    return IntervalScales(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
 
 
 def choose_stations(

@@ -13,7 +13,7 @@ from scipy.stats import t
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, shadowing, share_between
 from gsparc.apps.maps.geojson import draws_shapes
-from gsparc.apps.maps.intervals import Evidence, error_distribution
+from gsparc.apps.maps.intervals import HeldOutLevels, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise, held_out_evidence
@@ -88,7 +88,7 @@ class NewStationError:
     stations: int = 0
 
     @classmethod
-    def from_evidence(cls, parts: Sequence[Evidence]) -> NewStationError:
+    def from_evidence(cls, parts: Sequence[HeldOutLevels]) -> NewStationError:
         """Return what rows of sites tell, each of which was left out as a whole."""
         # With silent rows: of lists those alone that were heard are the strong ones.
         mean, square = np.array([[p @ e, p @ np.square(e)] for e, p in map(error_distribution, parts)]).T
@@ -233,7 +233,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
         return NewStationError()
     # By the seed of the training: the same sites are left out whenever it is asked again.
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
-    parts: list[Evidence] = []
+    parts: list[HeldOutLevels] = []
     # Without validation rows: the site left out is the test, all else is learned from.
     for one in chosen:
         own = site == one

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.apps.maps import intervals
-from gsparc.apps.maps.intervals import Calibration, Evidence, calibrate
+from gsparc.apps.maps.intervals import HeldOutLevels, IntervalScales, calibrate
 from gsparc.apps.maps.levels import measured_levels, predicted_levels
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_all
@@ -59,12 +59,12 @@ class Promise:
         block_m: side of the smaller blocks [m].
     """
 
-    evidence: Evidence
+    evidence: HeldOutLevels
     known: np.ndarray
     station: np.ndarray
     block_m: float
 
-    def calibration(self, share: float = 0.9) -> Calibration:
+    def calibration(self, share: float = 0.9) -> IntervalScales:
         """See `calibrate`."""
         return calibrate(self.evidence, share)
 
@@ -88,7 +88,7 @@ def read_promise(extra: Mapping[str, Any]) -> Promise | None:
     state = extra.get(KEY)
     if state is None:
         return None
-    evidence = Evidence(**{name: np.asarray(value) for name, value in state["evidence"].items()})
+    evidence = HeldOutLevels(**{name: np.asarray(value) for name, value in state["evidence"].items()})
     return Promise(evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"])
 
 
@@ -113,7 +113,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     if not side > 0:
         raise DataError("all rows are at one place: tested intervals need several; or promised=false")
 
-    def evidence_without(number: int) -> Evidence:
+    def evidence_without(number: int) -> HeldOutLevels:
         # Every second fold with sides twice as long, for evidence at larger distances.
         wide = side * SIDES[number % len(SIDES)]
         split = SplitSettings("blocks", side_m=wide, share=SHARE_OUT, val_fraction=0.1)
@@ -128,11 +128,13 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     parts = run_all(evidence_without, folds, "fits without blocks of places")
-    evidence = Evidence(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evidence)))
+    evidence = HeldOutLevels(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(HeldOutLevels))
+    )
     return Promise(evidence, places, station_numbers(data, learned.rows), side)
 
 
-def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> Evidence:
+def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> HeldOutLevels:
     """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together."""
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
@@ -140,7 +142,7 @@ def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.
     station = station_numbers(data, rows)
     before = data.moving[known], station_numbers(data, known)
     far = intervals.nearest_distances(*before, data.moving[rows], station)
-    evidence = Evidence(level, mean, spread, far, block, station, side)
+    evidence = HeldOutLevels(level, mean, spread, far, block, station, side)
     return evidence.subset(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
 
 

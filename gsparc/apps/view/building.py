@@ -12,7 +12,7 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
-from gsparc.apps.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet
+from gsparc.apps.view.scene import EXTENT, DrawingFrame, DrawnScene, Faces, Lines, Mark, Part, Points, Sheet
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import ENDS, LIGHT, Site
@@ -36,13 +36,15 @@ PATHS = Legend(
 VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
 
-def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None) -> Scene:
+def build_scene(
+    viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None
+) -> DrawnScene:
     """Build everything that stands still, with the measurements and the Gaussians of one station."""
     stands = {name: at for name in viewed.stations if (at := viewed.static_place(name)) is not None}
     points = [viewed.box(), *(at[None] for at in stands.values())]
     if viewed.site.static_end is None:
         points.append(viewed.site.box + viewed.site.origin)
-    frame = Frame.around(np.concatenate(points))
+    frame = DrawingFrame.around(np.concatenate(points))
     extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
@@ -79,7 +81,7 @@ def build_scene(viewed: Viewed, plan: FloorPlan | None, station: str | None, see
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     title += "" if station is None else f": {station}"
     beneath = ground - 2 * BENEATH * extent
-    return Scene(title, frame, tuple(parts), beneath, legends, viewed.notes)
+    return DrawnScene(title, frame, tuple(parts), beneath, legends, viewed.notes)
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:

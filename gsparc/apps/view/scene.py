@@ -16,7 +16,7 @@ EXTENT = 10.0  # of a site in drawn units: near and far planes, controls and cam
 
 
 @dataclass(frozen=True)
-class Frame:
+class DrawingFrame:
     """Between world metres and drawn units.
 
     Attributes:
@@ -28,7 +28,7 @@ class Frame:
     scale: float
 
     @classmethod
-    def around(cls, places: np.ndarray) -> Frame:
+    def around(cls, places: np.ndarray) -> DrawingFrame:
         """Return a frame in which places (n, 3) [m] are about `EXTENT` wide."""
         low, high = places.min(axis=0), places.max(axis=0)
         # 1 mm: a single place has a frame, too.
@@ -56,7 +56,7 @@ class Points:
     colours: np.ndarray
     size: float
 
-    def draw(self, api: Any, frame: Frame) -> Any:
+    def draw(self, api: Any, frame: DrawingFrame) -> Any:
         """Add it to a scene of viser under its name, in place of what had it; returns viser's handle."""
         return api.add_point_cloud(
             node_path(self.name), frame.to_drawn(self.places), self.colours, point_shape="circle",
@@ -72,7 +72,7 @@ class Lines:
     segments: np.ndarray
     colours: np.ndarray
 
-    def draw(self, api: Any, frame: Frame) -> Any:
+    def draw(self, api: Any, frame: DrawingFrame) -> Any:
         """See `Points.draw`."""
         places, colours = frame.to_drawn(self.segments), np.repeat(self.colours[:, None], 2, axis=1)
         how = {"thickness": THICKNESS, "thickness_units": "screen"}
@@ -88,7 +88,7 @@ class Faces:
     colour: tuple[int, int, int]
     opacity: float
 
-    def draw(self, api: Any, frame: Frame) -> Any:
+    def draw(self, api: Any, frame: DrawingFrame) -> Any:
         """See `Points.draw`."""
         corners = frame.to_drawn(self.triangles).reshape(-1, 3)
         return api.add_mesh_simple(
@@ -111,7 +111,7 @@ class Sheet:
     down: np.ndarray
     image: np.ndarray
 
-    def draw(self, api: Any, frame: Frame) -> Any:
+    def draw(self, api: Any, frame: DrawingFrame) -> Any:
         """See `Points.draw`."""
         wide, tall = np.linalg.norm(self.right), np.linalg.norm(self.down)
         # A picture's columns run along x of its node, its rows along y.
@@ -132,7 +132,7 @@ class Mark:
     place: np.ndarray
     text: str
 
-    def draw(self, api: Any, frame: Frame) -> Any:
+    def draw(self, api: Any, frame: DrawingFrame) -> Any:
         """See `Points.draw`."""
         name, where = node_path(self.name), frame.to_drawn(self.place)
         ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=where)
@@ -150,7 +150,7 @@ Part = Points | Lines | Faces | Sheet | Mark
 
 
 @dataclass(frozen=True)
-class Scene:
+class DrawnScene:
     """Everything that stands still.
 
     Attributes:
@@ -163,7 +163,7 @@ class Scene:
     """
 
     title: str
-    frame: Frame
+    frame: DrawingFrame
     parts: tuple[Part, ...]
     ground: float
     legends: dict[str, Legend] = field(default_factory=dict)

@@ -16,7 +16,7 @@ from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.building import VALUES, Sphere, build_scene, start_place
 from gsparc.apps.view.plane import Plane, refine_plane
-from gsparc.apps.view.scene import EXTENT, Points, Scene
+from gsparc.apps.view.scene import EXTENT, DrawnScene, Points
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly_spaced
 
@@ -32,7 +32,7 @@ class StationView:
         power: colours of powers: as those of the measured points, where there are any.
     """
 
-    scene: Scene
+    scene: DrawnScene
     measured: Measured | None
     tree: cKDTree | None
     power: Legend | None

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_level_and_power
-from gsparc.field.encoding import Prior
+from gsparc.field.encoding import Smoothness
 from gsparc.field.frozen import gaussian_vectors
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
@@ -53,7 +53,7 @@ class VectorProcess:
         left_out: training spectra predicted without their neighbours; None for too few.
     """
 
-    prior: Prior
+    prior: Smoothness
     weights: Tensor
     background: Tensor
     error: tuple[float, float]
@@ -126,7 +126,7 @@ def learn_vector_process(
         kernel.length, kernel.noise, len(features.places), len(rows),
     )  # fmt: skip
     return VectorProcess(
-        Prior(
+        Smoothness(
             features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),

@@ -99,7 +99,7 @@ class ChannelSettings:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class TermCandidate:
     """Terms with their powers, and how well they do.
 
     Attributes:
@@ -112,7 +112,7 @@ class Candidate:
     nll: float
     errors: np.ndarray
 
-    def beats(self, other: Candidate) -> bool:
+    def beats(self, other: TermCandidate) -> bool:
         """Tell whether likelihood and left-out places prefer this one."""
         ratio = self.errors / other.errors
         return self.nll < other.nll and bool(np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE)
@@ -224,11 +224,11 @@ class _Search:
     wavelength: float
     cache: Cache
 
-    def add_terms(self, steps: list[Candidate], notes: list[str]) -> None:
+    def add_terms(self, steps: list[TermCandidate], notes: list[str]) -> None:
         """Append what each further term makes of the last of `steps`."""
         wanted = self.settings
 
-        def append_better(after: Candidate, name: str) -> None:
+        def append_better(after: TermCandidate, name: str) -> None:
             steps.append(self._choose(steps[-1], after, name, notes))
 
         append_better(self._refit(steps[-1].prior), "powers by likelihood")
@@ -248,7 +248,9 @@ class _Search:
         if wanted.correlated:
             steps.append(self._add_drift(steps[-1], notes))
 
-    def _choose(self, before: Candidate, after: Candidate, name: str, notes: list[str]) -> Candidate:
+    def _choose(
+        self, before: TermCandidate, after: TermCandidate, name: str, notes: list[str]
+    ) -> TermCandidate:
         keep = after.beats(before)
         ratio = after.errors / before.errors
         gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
@@ -261,15 +263,15 @@ class _Search:
     def _compress(self, prior: ChannelPrior) -> tuple[BasisGroup, ...]:
         return compress_groups(self.groups, prior, self.cache)
 
-    def _measure(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> Candidate:
+    def _measure(self, prior: ChannelPrior, parts: tuple[BasisGroup, ...]) -> TermCandidate:
         """With what left-out rows say."""
         errors = np.mean([_left_out_squares(part, prior) for part in parts], axis=0)
         numbers = sum(2 * group.target.numel() for group in self.groups)
         # What the terms beside the isotropic field must gain [nats].
         worth = 0.5 * (sum(term.count_learned for term in prior.terms) - 2) * math.log(numbers)
-        return Candidate(prior, negative_log_evidence(parts, prior) + worth, errors)
+        return TermCandidate(prior, negative_log_evidence(parts, prior) + worth, errors)
 
-    def _refit(self, prior: ChannelPrior) -> Candidate:
+    def _refit(self, prior: ChannelPrior) -> TermCandidate:
         """With powers of largest evidence; measured."""
         parts = self._compress(prior)
         return self._measure(fit_powers(parts, prior, SHRINKAGE)[0], parts)
@@ -279,7 +281,7 @@ class _Search:
         """Whether one end stands."""
         return not has_both_ends(self.every[0].places)
 
-    def _add_leakage_and_direct(self, before: Candidate, direct: bool) -> Candidate:
+    def _add_leakage_and_direct(self, before: TermCandidate, direct: bool) -> TermCandidate:
         """With leakage and the direct wave; lengths by a short fit each, then powers."""
         prior, frame = before.prior, before.prior.frame
         level = NEW * prior[Isotropic].power
@@ -294,7 +296,7 @@ class _Search:
                 tried.append(fit_powers(self._compress(trial), trial, 0.0, SHORT))
         return self._move_static_ends(self._refit(min(tried, key=lambda each: each[1])[0]))
 
-    def _move_static_ends(self, candidate: Candidate) -> Candidate:
+    def _move_static_ends(self, candidate: TermCandidate) -> TermCandidate:
         """With static ends where they really are."""
         prior = candidate.prior
         if prior.find_term(Direct) is None or not self.has_static_end:
@@ -305,7 +307,7 @@ class _Search:
         moved = self._refit(prior.change_frame(offset=offset))
         return moved if moved.nll < candidate.nll else candidate
 
-    def _add_mirrors(self, before: Candidate) -> Candidate | None:
+    def _add_mirrors(self, before: TermCandidate) -> TermCandidate | None:
         """With images in planes that all ends share; None where none is found."""
         prior = before.prior
         rough = replace(self, groups=thin_groups(self.every, ROUGH_ENDS, ROUGH_ROWS))._compress(prior)
@@ -323,13 +325,13 @@ class _Search:
         kept = replace(images, power=images.power[heard.repeat(2)], planes=images.planes[heard])
         return self._refit(mirrored.prior.with_terms(kept))
 
-    def _add_directions(self, before: Candidate) -> Candidate:
+    def _add_directions(self, before: TermCandidate) -> TermCandidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
         prior = self._set_directions(before.prior, self.settings.angles, CONCENTRATION)
         prior, _ = fit_powers(self._compress(prior), prior, SHRINKAGE, 2 * SHORT)
         return self._refit(_drop_weak_directions(prior))
 
-    def _refit_on_all_ends(self, steps: list[Candidate], known: bool, notes: list[str]) -> None:
+    def _refit_on_all_ends(self, steps: list[TermCandidate], known: bool, notes: list[str]) -> None:
         """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
         wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
         steps.append(wide._refit(steps[-1].prior))
@@ -351,7 +353,7 @@ class _Search:
         fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
         return prior.with_terms(replace(isotropic, power=SHARED * level), fresh)
 
-    def _add_drift(self, before: Candidate, notes: list[str]) -> Candidate:
+    def _add_drift(self, before: TermCandidate, notes: list[str]) -> TermCandidate:
         groups = drift.sample_stretches(self.every)
         known = before.prior.signal_covariances(groups)
         prior, gain = drift.fit_drift(groups, known, before.prior)
@@ -363,6 +365,6 @@ class _Search:
                 left = [given.left_out_signal(other, rows)[0] for rows in _left_out_groupings(group.places)]
                 sums += [float(error.abs().square().mean()) / len(groups) for error in left]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
-        after = Candidate(prior, worth - gain, errors[1])
+        after = TermCandidate(prior, worth - gain, errors[1])
         start = replace(before, nll=0.0, errors=errors[0])
         return after if self._choose(start, after, "noise correlated over rows", notes) is after else before

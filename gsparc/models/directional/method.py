@@ -22,7 +22,7 @@ from gsparc.models.directional.position_refine import PositionRefinement, Uncert
 from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
-from gsparc.models.image_sources.frame import Frame, SourcePaths, SourcesInFrame, require_static_phase
+from gsparc.models.image_sources.frame import SourceFrame, SourcePaths, SourcesInFrame, require_static_phase
 from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import point_wave, wave_over_band
@@ -79,7 +79,7 @@ class DirectionalGP(SourcesInFrame):
         order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
         sources = sources[order[: SearchSettings.max_sources]]
         everything = draw_rows(data, known, self.row_limit, self.seed)
-        self.frame = Frame.from_rows(data.site, data.target.shape[1], everything)
+        self.frame = SourceFrame.from_rows(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         at = {int(row): k for k, row in enumerate(known)}
         seen = seen[:, sources] if self.visibility else torch.ones_like(seen[:, sources])
@@ -183,7 +183,7 @@ class DirectionalGP(SourcesInFrame):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.frame = site, Frame(site, **state["frame"])
+        self.site, self.frame = site, SourceFrame(site, **state["frame"])
         self.posterior = from_containers(SightedSources, state["posterior"]).precompute()
 
     @property

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.apart import keep_apart
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, spherical_waves
 from gsparc.physics.draws import draw_in_box
@@ -32,7 +32,7 @@ STEPS, STEP_M = 25, 0.02  # of the ascent
 ImagesOfAntennas = Callable[[Tensor], Tensor]
 
 
-def gains_and_amplitudes(posterior: Posterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
+def gains_and_amplitudes(posterior: GainPosterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
@@ -78,7 +78,7 @@ def rough_gains(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
 
 
 def find_sources_in_box(
-    posterior: Posterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
+    posterior: GainPosterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
     images: ImagesOfAntennas,
 ) -> list[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
     """Return the best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.

@@ -15,22 +15,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import SourceScene
 from gsparc.models.run_factors import best_run_factors, factor_matrix
 
 UNEXPLAINED = 0.5  # share of the power that is not the direct path's, before any search
 
 
-def direct_path_scene(rows: Rows, static: Tensor, noise_floor: float) -> Scene:
+def direct_path_scene(rows: Rows, static: Tensor, noise_floor: float) -> SourceScene:
     """Return the static end (3,) [m] alone, with its share of the power of unit rows."""
-    scene = Scene.from_static_end(static, torch.zeros(1), math.log(UNEXPLAINED))
+    scene = SourceScene.from_static_end(static, torch.zeros(1), math.log(UNEXPLAINED))
     power = (1 - UNEXPLAINED) / scene.waves(rows).abs().square().mean()
     return replace(scene, log_amplitude=power.sqrt().log().reshape(1), noise_floor=noise_floor)
 
 
-def find_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
+def find_element_factors(rows: Rows, scene: SourceScene) -> Tensor | None:
     """Return factors (E,) complex64 for channels of each antenna, the first 1; None: nothing gained.
 
     Args:
@@ -39,7 +39,7 @@ def find_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     """
     assert rows.array is not None and rows.element is not None
     scene = replace(scene, phase=None)
-    conditioned = Posterior(rows, scene).conditioned
+    conditioned = GainPosterior(rows, scene).conditioned
     known, run = np.unique(rows.element.numpy(), return_inverse=True)
     inverse = conditioned.factor.inverse.to(torch.complex128).numpy()
     quadratic = factor_matrix(inverse, rows.target.to(torch.complex128).numpy(), run)
@@ -49,7 +49,7 @@ def find_element_factors(rows: Rows, scene: Scene) -> Tensor | None:
     factors = torch.from_numpy(each.astype(np.complex64))
     target = rows.target * factors[rows.element, None]
     scale = target.abs().square().mean().sqrt()  # sources absorb a common factor
-    nll = Posterior(replace(rows, target=target / scale), scene).nll
+    nll = GainPosterior(replace(rows, target=target / scale), scene).nll
     jacobian = 2 * float((factors.abs().log()[rows.element] - scale.log()).double().sum())
     gain = conditioned.nll - (nll - jacobian)
     cost = (len(known) - 1) * math.log(len(rows))

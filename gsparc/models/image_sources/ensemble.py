@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.search import find_clutter
-from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
+from gsparc.models.image_sources.gp_likelihood import GainPosterior, estimate_phases
 from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
 from gsparc.processes.worker import Cancelled, cancel_when, end_when, step_limit
 from gsparc.training.time_budget import TimeBudget
@@ -25,11 +25,11 @@ from gsparc.training.time_budget import TimeBudget
 log = logging.getLogger(__name__)
 
 IN_VAIN = 0.9  # of the power left out: two such searches, and no others begin
-QUADRATURE = 0.4  # initial `Scene.quadrature`
+QUADRATURE = 0.4  # initial `SourceScene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
-Look = Callable[[Rows, Scene], None]  # of a search, with phases
+Look = Callable[[Rows, SourceScene], None]  # of a search, with phases
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
@@ -43,7 +43,7 @@ class Member:
         number: of the search, from 0.
     """
 
-    scene: Scene
+    scene: SourceScene
     left_out: float
     number: int = 0
 
@@ -142,9 +142,9 @@ def refine_member(rows: Rows, member: Member) -> Member:
     return Member(scene, left_out_nmse(rows, scene), member.number)
 
 
-def left_out_nmse(rows: Rows, scene: Scene) -> float:
+def left_out_nmse(rows: Rows, scene: SourceScene) -> float:
     """Return the NMSE of the rows, each receiver predicted from the others."""
-    error = rows.target - Posterior(rows, scene).predict_left_out()
+    error = rows.target - GainPosterior(rows, scene).predict_left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 

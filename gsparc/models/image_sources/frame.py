@@ -24,7 +24,7 @@ SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are 
 
 
 @dataclass(frozen=True)
-class Frame:
+class SourceFrame:
     """Offset and scale between local metres and stored units, and those of a fit.
 
     Attributes:
@@ -42,7 +42,7 @@ class Frame:
     carrier_hz: float
 
     @staticmethod
-    def from_rows(site: Site, antennas: int, rows: Rows) -> Frame:
+    def from_rows(site: Site, antennas: int, rows: Rows) -> SourceFrame:
         """Return that in which these rows have zero mean position and unit power.
 
         Raises:
@@ -53,7 +53,7 @@ class Frame:
         power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
         if not power > 0:
             raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
-        return Frame(site, antennas, rows.position.mean(0), math.sqrt(float(power)), carrier)
+        return SourceFrame(site, antennas, rows.position.mean(0), math.sqrt(float(power)), carrier)
 
     def normalise(self, rows: Rows) -> Rows:
         """Return rows in local metres and stored units, normalised."""
@@ -107,7 +107,7 @@ class SourcesInFrame(ClosedForm):
         factors: (A,) complex64, what each antenna's channels were multiplied by before the fit; (1,) of all.
     """
 
-    frame: Frame
+    frame: SourceFrame
     factors = torch.ones(1, dtype=torch.complex64)
     asks_visibility = True
 
@@ -157,7 +157,7 @@ class SourcesInFrame(ClosedForm):
         unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
         return merge_equal_paths(QueryPaths(gain, delay, unit, frame.carrier_hz))
 
-    def _fitted_frame(self) -> Frame:
+    def _fitted_frame(self) -> SourceFrame:
         return self.require_fitted(self.frame if self.site and self.count_components() else None)
 
 

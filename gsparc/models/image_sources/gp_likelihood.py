@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import JITTER, Scene
+from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.method import to_double
 from gsparc.processes.conditioned import Conditioned
 
@@ -140,17 +140,17 @@ class PhasedGains(CircularGains):
         return ((1 - share) * along + share * across) / 2
 
 
-class Posterior:
-    """Posterior of a scene's gains given rows, circular or of fixed phases (`Scene.phase`)."""
+class GainPosterior:
+    """Posterior of a scene's gains given rows, circular or of fixed phases (`SourceScene.phase`)."""
 
-    def __init__(self, rows: Rows, scene: Scene) -> None:
+    def __init__(self, rows: Rows, scene: SourceScene) -> None:
         self.rows, self.scene = rows, scene
 
     @cached_property
-    def in_float64(self) -> Posterior:
+    def in_float64(self) -> GainPosterior:
         """The same in float64: rows 30 dB above their noise lose three digits where they are factored."""
         _ = self.scene.unfolding, self.scene.obstacles  # which are doubled with the scene
-        return to_double(Posterior(self.rows, self.scene))
+        return to_double(GainPosterior(self.rows, self.scene))
 
     @cached_property
     def waves(self) -> Tensor:
@@ -227,9 +227,9 @@ class Posterior:
         return self.rows.target - torch.complex(error[:n], error[n:])
 
 
-def estimate_phases(rows: Rows, scene: Scene, quadrature: float, noise_floor: float) -> Scene:
+def estimate_phases(rows: Rows, scene: SourceScene, quadrature: float, noise_floor: float) -> SourceScene:
     """Return the scene with phases of mean gains under the circular process, and a noise floor."""
-    posterior = Posterior(rows, replace(scene, noise_floor=JITTER))
+    posterior = GainPosterior(rows, replace(scene, noise_floor=JITTER))
     # The mean gain but for its power and constant share, which are positive and do not turn it.
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
     one = rows.target.shape[1] == 1

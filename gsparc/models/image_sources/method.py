@@ -22,17 +22,17 @@ from gsparc.models.image_sources import ensemble
 from gsparc.models.image_sources.element_factors import direct_path_scene, find_element_factors
 from gsparc.models.image_sources.ensemble import Look, Member
 from gsparc.models.image_sources.frame import (
-    Frame,
+    SourceFrame,
     SourcePaths,
     SourcesInFrame,
     require_fixed_rotation,
     require_static_phase,
 )
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
 from gsparc.models.image_sources.refine import POLISHING_STEPS
 from gsparc.models.image_sources.rows import Rows, draw_rows, measured_places, ranges_at, static_array
-from gsparc.models.image_sources.scene import JITTER, Scene
+from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
@@ -67,7 +67,7 @@ class ImageSourceGP(SourcesInFrame):
     """
 
     name = "image_source_gp"
-    members: tuple[Posterior, ...] = ()
+    members: tuple[GainPosterior, ...] = ()
     _groups: tuple[np.ndarray, ...] = ()
     takes_budget = True
     start: Found | None = None
@@ -96,7 +96,9 @@ class ImageSourceGP(SourcesInFrame):
         budget, settings = replace(context, effort=effort).time_budget(), self.settings
         self.site, antennas = data.site, data.target.shape[1]
         # The frame is of rows of all searches: their scenes are averaged in it.
-        self.frame = Frame.from_rows(data.site, antennas, draw_rows(data, seen, settings.rows, settings.seed))
+        self.frame = SourceFrame.from_rows(
+            data.site, antennas, draw_rows(data, seen, settings.rows, settings.seed)
+        )
         noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[seen]))
         # Simulated channels may have no noise, and float32 needs some to factor.
         self.noise_floor = max(JITTER, noise / self.frame.scale**2)
@@ -134,9 +136,9 @@ class ImageSourceGP(SourcesInFrame):
         notes += self._describe_search(members, budget)
         return FitReport(budget.by_clock.wall, tuple(notes), budget.limited_by)
 
-    def _set_posteriors(self, rows: Rows, scenes: list[Scene]) -> None:
+    def _set_posteriors(self, rows: Rows, scenes: list[SourceScene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
-        self.members = tuple(Posterior(rows, scene) for scene in scenes)
+        self.members = tuple(GainPosterior(rows, scene) for scene in scenes)
         self.query = EnsembleMeans(self.members)
 
     def _set_members(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
@@ -165,7 +167,7 @@ class ImageSourceGP(SourcesInFrame):
             )
         return [f"{self.name}: {note}" for note in notes]
 
-    def _calibrate_antennas(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
+    def _calibrate_antennas(self, data: Measurements, rows: Rows, scene: SourceScene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
         factors = find_element_factors(rows, scene)
         if factors is None:
@@ -183,7 +185,7 @@ class ImageSourceGP(SourcesInFrame):
         return ensemble.run_searches(row_sets, still, settings, floor, budget, look, start)
 
     def _log_look(
-        self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: Scene
+        self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: SourceScene
     ) -> None:
         """Look at a search's scene by a batch of rows `group` (n,) that it left out; `Behind` ends it."""
         # On a copy: `predict` reads the method's own processes, which are not found yet.
@@ -232,19 +234,19 @@ class ImageSourceGP(SourcesInFrame):
 
     def _align_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        direct = Scene.from_static_end(self._transmitter_in_frame(), torch.zeros(1))
+        direct = SourceScene.from_static_end(self._transmitter_in_frame(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
             rows = self._draw_search_rows(aligned, known, 0)
             scene = self._run_searches([rows], few, budget)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
-                gains = Posterior(self._draw_search_rows(aligned, known, 0), scene).mean_gains
+                gains = GainPosterior(self._draw_search_rows(aligned, known, 0), scene).mean_gains
                 aligned = self._remove_offsets(data, known, scene, gains)
         return aligned
 
     def _remove_offsets(
-        self, data: Measurements, known: np.ndarray, scene: Scene, gains: Tensor
+        self, data: Measurements, known: np.ndarray, scene: SourceScene, gains: Tensor
     ) -> Measurements:
         """Targets of the known rows without their offsets against a scene's sources of constant gains."""
         frequency = data.site.tones()
@@ -313,10 +315,11 @@ class ImageSourceGP(SourcesInFrame):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.frame = site, Frame(site, **state["frame"])
+        self.site, self.frame = site, SourceFrame(site, **state["frame"])
         self.factors, self.weights = state["factors"], state["weights"]
         self._set_posteriors(
-            from_containers(Rows, state["rows"]), [from_containers(Scene, scene) for scene in state["scenes"]]
+            from_containers(Rows, state["rows"]),
+            [from_containers(SourceScene, scene) for scene in state["scenes"]],
         )
 
     @property

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.models.closed_form import Moments
-from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances
+from gsparc.models.image_sources.gp_likelihood import GainPosterior, quadrature_variances
 from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
 from gsparc.models.method import to_double
@@ -44,7 +44,7 @@ class EnsembleMeans:
         hiding: paths of each scene's sources and what occludes them; none where no scene has clutter.
     """
 
-    def __init__(self, members: Sequence[Posterior], variance_rows: int = VARIANCE_ROWS) -> None:
+    def __init__(self, members: Sequence[GainPosterior], variance_rows: int = VARIANCE_ROWS) -> None:
         exact = [member.in_float64 for member in members]
         rows, scenes = members[0].rows, [member.scene for member in members]
         self.places, place_of = torch.unique(rows.places, dim=0, return_inverse=True)
@@ -146,10 +146,10 @@ class RowVariance:
         count: of the rows used.
     """
 
-    def __init__(self, member: Posterior, place_of: Tensor, count: int) -> None:
+    def __init__(self, member: GainPosterior, place_of: Tensor, count: int) -> None:
         few = torch.linspace(0, len(member.rows) - 1, min(count, len(member.rows))).long()
         if len(few) < len(member.rows):
-            member = Posterior(member.rows.select_rows(few), member.scene)
+            member = GainPosterior(member.rows.select_rows(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility
         self.place_of, self.root = place_of[few], member.conditioned.factor.root.T.float().contiguous()
         self.phasor, self.power = (

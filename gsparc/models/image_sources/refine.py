@@ -9,9 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import PhasedGains, Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior, PhasedGains
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import BETAS, KernelVisibility, Scene
+from gsparc.models.image_sources.scene import BETAS, KernelVisibility, SourceScene
 from gsparc.processes.worker import out_of_time
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
@@ -24,10 +24,10 @@ NORMAL_STEP, OFFSET_STEP = 0.0012, 0.004  # of a plane's unit normal, and along 
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
-Cost = Callable[[Scene], Tensor]  # negative log prior [nats] of a scene
+Cost = Callable[[SourceScene], Tensor]  # negative log prior [nats] of a scene
 
 
-def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None) -> Scene:
+def refine_scene(rows: Rows, scene: SourceScene, steps: int, cost: Cost | None = None) -> SourceScene:
     """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `out_of_time`.
 
     Args:
@@ -63,7 +63,7 @@ def refine_scene(rows: Rows, scene: Scene, steps: int, cost: Cost | None = None)
     return best
 
 
-def _scene_at(scene: Scene, values: list[Tensor]) -> Scene:
+def _scene_at(scene: SourceScene, values: list[Tensor]) -> SourceScene:
     """The scene of other transmitter, normals, offsets, log amplitudes, log noise and phases, if any."""
     transmitter, normal, offset, log_amplitude, log_noise, *phase = values
     return replace(
@@ -73,14 +73,14 @@ def _scene_at(scene: Scene, values: list[Tensor]) -> Scene:
 
 
 def _cost_and_gradient(
-    rows: Rows, scene: Scene, values: list[Tensor], correlation: Tensor, cost: Cost | None = None
+    rows: Rows, scene: SourceScene, values: list[Tensor], correlation: Tensor, cost: Cost | None = None
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and prior, and derivatives by the values: `d nll = trace(G dK)`."""
     leaves = [v.detach().requires_grad_() for v in values]
     moved = _scene_at(scene, leaves)
     waves = moved.unobstructed_waves(rows) * scene.visible_share(rows.position)
     amplitude, noise = moved.log_amplitude.detach().exp(), math.exp(moved.log_noise)
-    scaled, gains = waves.detach() * amplitude, Posterior(rows, scene).empty_covariance()
+    scaled, gains = waves.detach() * amplitude, GainPosterior(rows, scene).empty_covariance()
     for k, one in enumerate(correlation):
         gains.add_source(scaled[:, k], one)
     conditioned = gains.add_noise_and_condition(noise + scene.noise_floor)
@@ -98,8 +98,8 @@ def _cost_and_gradient(
 
 
 def learn_visibility(
-    rows: Rows, scene: Scene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
-) -> Scene:
+    rows: Rows, scene: SourceScene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
+) -> SourceScene:
     """Fit the visibility kernel by likelihood until `out_of_time`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
@@ -116,7 +116,7 @@ def learn_visibility(
     width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * wide
     optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=BETAS)
 
-    def current_scene() -> Scene:
+    def current_scene() -> SourceScene:
         trial = replace(scene, visibility=KernelVisibility.from_parameters(value.detach()).to_floats())
         if scene.quadrature == 1:
             return trial
@@ -125,7 +125,7 @@ def learn_visibility(
     for _ in range(steps):
         if out_of_time():
             break
-        posterior = Posterior(rows, current_scene())
+        posterior = GainPosterior(rows, current_scene())
         slope, gains = posterior.conditioned.nll_gradient, posterior.empty_covariance()
         if isinstance(gains, PhasedGains) and gains.quadrature < 1:
             gains.quadrature = torch.sigmoid(value[-1])

@@ -12,10 +12,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.refine import ROUND_STEPS, refine_scene
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import SourceScene
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, hesse_form, images, reflect
 from gsparc.processes.worker import out_of_time
 
@@ -29,21 +29,21 @@ MOST_WALLS = 10
 MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
-def drop_planes(rows: Rows, scene: Scene, tolerance: float) -> Scene:
+def drop_planes(rows: Rows, scene: SourceScene, tolerance: float) -> SourceScene:
     """Try to remove planes until `out_of_time`: sequences become the nearest over others [tolerance: m]."""
     index = 0
     while index < len(scene.planes) and not out_of_time():
         shorter = _remove_plane(scene, index, tolerance)
         if shorter is not None:
             shorter = refine_scene(rows, shorter, ROUND_STEPS)
-            if Posterior(rows, shorter).nll < Posterior(rows, scene).nll + ALLOWANCE:
+            if GainPosterior(rows, shorter).nll < GainPosterior(rows, scene).nll + ALLOWANCE:
                 scene = shorter
                 continue
         index += 1
     return scene
 
 
-def _remove_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
+def _remove_plane(scene: SourceScene, index: int, tolerance: float) -> SourceScene | None:
     """The scene without one plane; None when its strongest source has no other sequence."""
     users = [i for i, sequence in enumerate(scene.sequences) if index in sequence]
     rest = {sequence for i, sequence in enumerate(scene.sequences) if i not in users}
@@ -69,7 +69,7 @@ def _remove_plane(scene: Scene, index: int, tolerance: float) -> Scene | None:
     return replace(scene, sequences=tuple(sequences)).select_sources(sorted(numbers))
 
 
-def _penalised_distances(scene: Scene, sequences: list[Reflections], places: Tensor) -> Tensor:
+def _penalised_distances(scene: SourceScene, sequences: list[Reflections], places: Tensor) -> Tensor:
     """Distances (places, sequences) [m], plus a penalty on the order."""
     position = images(scene.transmitter, scene.planes, sequences)
     order = torch.tensor([len(sequence) for sequence in sequences])
@@ -106,7 +106,7 @@ def _wall_tolerance(sources: Tensor) -> Tensor:
     return WALL_TOLERANCE * (sources - sources[0]).norm(dim=1) + LEAST_M
 
 
-def find_orthogonal_walls(scene: Scene) -> Tensor | None:
+def find_orthogonal_walls(scene: SourceScene) -> Tensor | None:
     """Return the fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
 
     Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
@@ -140,7 +140,7 @@ def find_orthogonal_walls(scene: Scene) -> Tensor | None:
     return chosen if len(chosen) else None
 
 
-def _wall_axes(scene: Scene) -> Tensor | None:
+def _wall_axes(scene: SourceScene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
     used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
     normals, _ = hesse_form(scene.planes)
@@ -153,7 +153,7 @@ def _wall_axes(scene: Scene) -> Tensor | None:
     return torch.stack([normals[i], second, torch.linalg.cross(normals[i], second)])
 
 
-def _count_explained(scene: Scene, planes: Tensor, tolerance: Tensor) -> float:
+def _count_explained(scene: SourceScene, planes: Tensor, tolerance: Tensor) -> float:
     """Number of sources with a sequence over the planes, weighted by distance and order."""
     sequences: list[Reflections] = [(), *all_sequences(list(range(len(planes))), 2)]
     position = images(scene.transmitter, planes, sequences)
@@ -164,7 +164,7 @@ def _count_explained(scene: Scene, planes: Tensor, tolerance: Tensor) -> float:
     return float(worth.amax(1).sum())
 
 
-def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
+def reassign_to_walls(scene: SourceScene, walls: Tensor) -> SourceScene:
     """Return new sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
     sources = scene.sources
     tolerance = 2.5 * _wall_tolerance(sources)
@@ -190,9 +190,9 @@ def reassign_to_walls(scene: Scene, walls: Tensor) -> Scene:
     return explained.select_sources(list(range(len(ids))))
 
 
-def prune_sources(rows: Rows, scene: Scene, min_gain: float) -> Scene:
+def prune_sources(rows: Rows, scene: SourceScene, min_gain: float) -> SourceScene:
     """Drop sources that gain under `min_gain` nats, twice with a plane of their own, or `out_of_time`."""
-    posterior, kept = Posterior(rows, scene), list(range(len(scene.sequences)))
+    posterior, kept = GainPosterior(rows, scene), list(range(len(scene.sequences)))
     for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):
         if out_of_time():
             break
@@ -200,5 +200,5 @@ def prune_sources(rows: Rows, scene: Scene, min_gain: float) -> Scene:
         lost = posterior.nll_without_source(kept.index(i)) - posterior.nll
         if lost < (2 * min_gain if sole_user else min_gain):
             kept.remove(i)
-            posterior = Posterior(rows, scene.select_sources(kept))
+            posterior = GainPosterior(rows, scene.select_sources(kept))
     return scene.select_sources(kept)

@@ -71,7 +71,7 @@ class KernelVisibility:
 
 @final
 @dataclass(frozen=True)
-class Scene:
+class SourceScene:
     """Image sources with amplitudes, visibility, clutter and noise.
 
     Attributes:
@@ -100,9 +100,9 @@ class Scene:
     noise_floor: float = JITTER
 
     @staticmethod
-    def from_static_end(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> Scene:
+    def from_static_end(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> SourceScene:
         """Return the static end (3,) [m] alone, of log amplitude (1,)."""
-        return Scene(transmitter, NO_PLANES, ((),), log_amplitude, log_noise)
+        return SourceScene(transmitter, NO_PLANES, ((),), log_amplitude, log_noise)
 
     @cached_property
     def sources(self) -> Tensor:
@@ -157,13 +157,13 @@ class Scene:
         known = set(self.sequences)
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
 
-    def replace_sequences(self, sequences: Iterable[Reflections]) -> Scene:
+    def replace_sequences(self, sequences: Iterable[Reflections]) -> SourceScene:
         """Return other sequences over the same planes, of gains that are not known."""
         return replace(self, sequences=tuple(sequences), phase=None)
 
     def add_sequences(
         self, sequences: list[Reflections], amplitude: Tensor, phase: Tensor | None = None
-    ) -> Scene:
+    ) -> SourceScene:
         """Return more sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
         log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
         if phase is not None and self.phase is not None:
@@ -172,7 +172,7 @@ class Scene:
             self, sequences=(*self.sequences, *sequences), log_amplitude=log_amplitude, phase=phase
         )
 
-    def select_sources(self, indices: list[int], planes: Iterable[int] = ()) -> Scene:
+    def select_sources(self, indices: list[int], planes: Iterable[int] = ()) -> SourceScene:
         """Return the sources of these indices, and the planes that they use, or that are named."""
         sequences = [self.sequences[i] for i in indices]
         used = sorted({index for sequence in sequences for index in sequence}.union(planes))

@@ -21,7 +21,7 @@ from gsparc.models.image_sources.backprojection import (
     gains_and_amplitudes,
     select_separated,
 )
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.refine import (
     POLISHING_STEPS,
     ROUND_STEPS,
@@ -30,7 +30,7 @@ from gsparc.models.image_sources.refine import (
     refine_scene,
 )
 from gsparc.models.image_sources.rows import LEAST_ROWS, Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import out_of_time
@@ -99,7 +99,7 @@ class Search:
         measured = torch.cat([rows.position, transmitter[None]])
         self.box = torch.stack([measured.amin(0) - settings.margin, measured.amax(0) + settings.margin])
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
-        self.scene = Scene.from_static_end(transmitter, loudness, math.log(NOISE))
+        self.scene = SourceScene.from_static_end(transmitter, loudness, math.log(NOISE))
         if found is not None and settings.order:
             places, amplitude = (each[: settings.max_sources - 1] for each in found)
             images = (places - transmitter).norm(dim=1) > 2 * orders.MIN_IMAGE_SHIFT_M
@@ -107,7 +107,7 @@ class Search:
             words: list[Reflections] = [(i,) for i in range(len(planes))]
             self.scene = replace(self.scene, planes=planes).add_sequences(words, amplitude[images])
 
-    def run(self) -> Scene:
+    def run(self) -> SourceScene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
         self._refine(ROUND_STEPS)
@@ -128,7 +128,7 @@ class Search:
                 self.scene = orders.prune_sources(self.rows, self.scene, PRUNE)
             if number % REARRANGED_EVERY == 2:
                 self._learn_visibility(6)
-            nll = Posterior(self.rows, self.scene).nll
+            nll = GainPosterior(self.rows, self.scene).nll
             log.debug(
                 "round %d: %d sources, %d planes, nll %.1f, %s",
                 number, len(self.scene.sequences), len(self.scene.planes), nll, self.scene.visibility,
@@ -140,7 +140,7 @@ class Search:
                 break
         return self._finish_scene()
 
-    def _finish_scene(self) -> Scene:
+    def _finish_scene(self) -> SourceScene:
         self._refine(POLISHING_STEPS)
         self._try_paired_walls()
         self._try_walls(orders.find_orthogonal_walls(self.scene))
@@ -166,7 +166,7 @@ class Search:
         more = scene.replace_sequences(scene.longer_sequences(self.settings.order))
         if not more.sequences:
             return 0
-        scores, amplitude = gains_and_amplitudes(Posterior(self.rows, scene), more.images(self.rows))
+        scores, amplitude = gains_and_amplitudes(GainPosterior(self.rows, scene), more.images(self.rows))
         apart = 0.5 * self.wavelength
         chosen = select_separated(more.sources, scores, apart, limit, SEQUENCE_SCORE, scene.sources)
         if chosen:
@@ -178,7 +178,7 @@ class Search:
 
         Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
         """
-        posterior = Posterior(self.rows, self.scene)
+        posterior = GainPosterior(self.rows, self.scene)
         parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for number, parent in enumerate(parents):
             if number and out_of_time():
@@ -197,7 +197,7 @@ class Search:
                 return len(found)
         return 0
 
-    def _reflectable(self, scene: Scene) -> list[int]:
+    def _reflectable(self, scene: SourceScene) -> list[int]:
         """Sources that may be reflected once more."""
         return [i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order]
 
@@ -214,7 +214,9 @@ class Search:
         scene = self.scene.replace_sequences((parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
-    def _best_parent_and_plane(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
+    def _best_parent_and_plane(
+        self, position: Tensor, posterior: GainPosterior
+    ) -> tuple[Reflections, Tensor]:
         """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
         scene, able = posterior.scene, self._reflectable(posterior.scene)
         planes = bisector(scene.sources[able], position)
@@ -248,6 +250,6 @@ class Search:
             if self._add_sequences(6):
                 self._refine(ROUND_STEPS)
         saved = len(before.planes) - len(self.scene.planes)
-        allowed = Posterior(self.rows, before).nll + 4 * saved
-        if Posterior(self.rows, self.scene).nll >= allowed:
+        allowed = GainPosterior(self.rows, before).nll + 4 * saved
+        if GainPosterior(self.rows, self.scene).nll >= allowed:
             self.scene = before

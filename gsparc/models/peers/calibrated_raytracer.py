@@ -22,15 +22,15 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import heard_rows, to_real
 from gsparc.simulate.calibration import (
     GENERIC,
-    Calibration,
     Material,
     Replay,
+    RoomCalibration,
     apply_materials,
     calibrate,
     used_materials,
 )
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import from_config, known_scene, load_tracer
 from gsparc.training.context import FitContext, FitReport
@@ -62,7 +62,7 @@ class CalibratedRayTracer(Checked, Method):
     diffraction: bool = True
     samples: int = setting(100_000, whole(1))
     batch: int = setting(400, whole(1))
-    learned: Calibration | None = field(default=None, init=False)
+    learned: RoomCalibration | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,12 +153,12 @@ class CalibratedRayTracer(Checked, Method):
             level = np.where(power > 0, 10 * np.log10(power) + learned.gain_db, self._silent_db)
         return Prediction(torch.from_numpy(10 ** (level / 10))[:, None].float())
 
-    def _channels(self, paths: Paths) -> np.ndarray:
+    def _channels(self, paths: TracedPaths) -> np.ndarray:
         """(B, 1, K) without the factor."""
         assert self.site is not None and self.site.wavelength is not None
         return paths.responses(self.site.tones(), np.zeros((1, 3)), self.site.wavelength)[:, :1]
 
-    def _trace(self, places: np.ndarray) -> Paths:
+    def _trace(self, places: np.ndarray) -> TracedPaths:
         """Paths to places (B, 3) [m], local."""
         return self._loaded_tracer().trace(places + self.fitted_site.origin, self._effects())
 
@@ -193,7 +193,7 @@ class CalibratedRayTracer(Checked, Method):
         self.site, self._scene_json, self._tracer = site, str(state["scene"]), None
         stored = state["learned"]
         materials = {name: Material(**one) for name, one in stored["materials"].items()}
-        self.learned = Calibration(**{**stored, "materials": materials})
+        self.learned = RoomCalibration(**{**stored, "materials": materials})
         self._silent_db, self._factor = float(state["silent_db"]), complex(*state["factor"])
 
 

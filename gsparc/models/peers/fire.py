@@ -18,7 +18,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
-from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
+from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer, perceptron
 from gsparc.models.uplink.interface import UplinkMethod, root_mean_power
 from gsparc.training.context import FitContext, FitReport
 
@@ -26,7 +26,7 @@ from gsparc.training.context import FitContext, FitReport
 class Coder(Network):
     """Complex (B, L) -> complex (B, K) through a Gaussian code, the same of all antennas."""
 
-    def __init__(self, scene: Scene, settings: Fire) -> None:
+    def __init__(self, scene: KnownSite, settings: Fire) -> None:
         super().__init__(scene)
         assert scene.site.uplink_hz is not None
         self.antennas = torch.from_numpy(np.asarray(scene.site.antennas))

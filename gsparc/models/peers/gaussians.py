@@ -13,7 +13,7 @@ from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
 from gsparc.field.model import FULL_SPHERE_ROWS, RasterSettings
-from gsparc.models.peers.trained import Network, Scene, TrainedPeer, perceptron
+from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer, perceptron
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
 
 SHIFT = 0.1  # [m], of directions [rad], that a place moves by per unit of the network's output
@@ -68,7 +68,7 @@ class GaussianNetwork(Network):
         return self.field.to_cloud(strengths, "emission of a Gaussian")
 
 
-def initial_gaussians(scene: Scene, count: int) -> GaussianField:
+def initial_gaussians(scene: KnownSite, count: int) -> GaussianField:
     """Draw them where `FieldSettings` says: around a static receiver, else in and about the box."""
     static = scene.receiver
     place, turn = (None, None) if static is None else (static.position, static.rotation)
@@ -76,7 +76,7 @@ def initial_gaussians(scene: Scene, count: int) -> GaussianField:
     return create_field(FieldSettings(count, init), scene.box, place, turn)
 
 
-def rendering_options(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
+def rendering_options(scene: KnownSite) -> tuple[SphereGrid, dict[str, Any]]:
     """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
     least = RasterSettings().relative_cutoff

@@ -33,14 +33,14 @@ from gsparc.models.peers.gaussians import (
     initial_gaussians,
     rendering_options,
 )
-from gsparc.models.peers.trained import Scene, smooth_root
+from gsparc.models.peers.trained import KnownSite, smooth_root
 from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
 
 
 class ComplexGaussians(GaussianNetwork):
     """N Gaussians, each with K complex coefficients."""
 
-    def __init__(self, scene: Scene, settings: GSRF) -> None:
+    def __init__(self, scene: KnownSite, settings: GSRF) -> None:
         super().__init__(scene, settings.count)
         count, self.degree, self.order = settings.count, settings.degree, settings.order
         self.fourier_weight = settings.fourier_weight

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch
 from gsparc.data.schema import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron, smooth_root
+from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron, smooth_root
 from gsparc.ops import Pose
 
 REFERENCE = 0.025  # [m] at which a signal has unit gain: 1/d without its constant
@@ -36,7 +36,7 @@ class MarchedField(Network):
 
     directions: Tensor
 
-    def __init__(self, scene: Scene, settings: NeRF2) -> None:
+    def __init__(self, scene: KnownSite, settings: NeRF2) -> None:
         super().__init__(scene)
         assert scene.site.grid is not None
         self.samples, self.rays = settings.samples, settings.rays

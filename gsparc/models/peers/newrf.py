@@ -27,7 +27,7 @@ from gsparc.data.query import Batch
 from gsparc.data.schema import Kind, Measurements
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.directional.triangulation import Rays, triangulate
-from gsparc.models.peers.trained import DIRECTIONS, Network, Scene, TrainedPeer, perceptron
+from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron
 from gsparc.ops import Pose
 
 NEAR = 0.1  # [m] from the receiver, where rays begin
@@ -38,7 +38,7 @@ LEAST = 5  # receivers of a virtual transmitter: rays of fewer meet by chance
 class DirectedRays(Network):
     """The network and the march."""
 
-    def __init__(self, scene: Scene, settings: NeWRF) -> None:
+    def __init__(self, scene: KnownSite, settings: NeWRF) -> None:
         precomputed = settings.precomputed
         super().__init__(scene, len(precomputed["virtual"]))
         assert scene.site.wavelength is not None

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Kind
-from gsparc.models.peers.trained import Network, Scene, TrainedPeer
+from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer
 from gsparc.ops import Pose
 from gsparc.physics.array_response import bartlett_spectrum, normalise_spectrum, steering_matrix
 from gsparc.physics.waves import LIGHT
@@ -35,7 +35,7 @@ class Radiators(Network):
     wavenumbers: Tensor
     steering: Tensor | None
 
-    def __init__(self, scene: Scene, settings: NGRF) -> None:
+    def __init__(self, scene: KnownSite, settings: NGRF) -> None:
         super().__init__(scene, settings.count)
         site, count, name, spectrum = scene.site, self.count, settings.name, scene.site.kind == "spectrum"
         if site.subcarriers_hz is None and site.carrier_hz is None:

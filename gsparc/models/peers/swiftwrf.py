@@ -31,7 +31,7 @@ from gsparc.models.peers.gaussians import (
     GaussianNetwork,
     render_each,
 )
-from gsparc.models.peers.trained import DIRECTIONS, Scene
+from gsparc.models.peers.trained import DIRECTIONS, KnownSite
 from gsparc.ops import Cutoff, Pose, SphereGrid
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
@@ -47,7 +47,7 @@ class PlanarGaussians(GaussianNetwork):
     axes: Tensor
     frames: Tensor
 
-    def __init__(self, scene: Scene, settings: DeformedPeer) -> None:
+    def __init__(self, scene: KnownSite, settings: DeformedPeer) -> None:
         super().__init__(scene, settings.count)
         assert scene.site.grid is not None
         self.grid, count = scene.site.grid, settings.count

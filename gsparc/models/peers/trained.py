@@ -36,7 +36,7 @@ LEAST_POWER = 1e-8  # under the root of a magnitude, whose slope at zero is infi
 
 
 @dataclass(frozen=True)
-class Scene:
+class KnownSite:
     """What a network may know of a site before it is trained.
 
     Attributes:
@@ -73,7 +73,7 @@ class Network(nn.Module):
 
     losses = LossSettings()
 
-    def __init__(self, scene: Scene, count: int = 0) -> None:
+    def __init__(self, scene: KnownSite, count: int = 0) -> None:
         super().__init__()
         self.scene, self.count = scene, count
 
@@ -224,14 +224,14 @@ class TrainedPeer(Method):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, scene = site, Scene(site, tuple(state["shape"]), state["box"])
+        self.site, scene = site, KnownSite(site, tuple(state["shape"]), state["box"])
         self.precomputed, self.steps = dict(state["found"]), int(state["steps"])
         self.network = self.makes(scene, self)
         self.network.load_state_dict(state["network"])
         self.network.eval()
 
 
-def _make_scene(data: Measurements, rows: np.ndarray) -> Scene:
+def _make_scene(data: Measurements, rows: np.ndarray) -> KnownSite:
     moving = data.moving[rows]
     box = torch.from_numpy(np.stack([moving.min(0), moving.max(0)])).float()
-    return Scene(data.site, tuple(data.target.shape[1:]), box)
+    return KnownSite(data.site, tuple(data.target.shape[1:]), box)

@@ -28,7 +28,7 @@ from gsparc.models.peers.gaussians import (
     render_each,
     rendering_options,
 )
-from gsparc.models.peers.trained import Scene
+from gsparc.models.peers.trained import KnownSite
 from gsparc.ops import Pose
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
@@ -37,7 +37,7 @@ CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
 class DeformedGaussians(GaussianNetwork):
     """Static Gaussians and the network that deforms them."""
 
-    def __init__(self, scene: Scene, settings: DeformedPeer) -> None:
+    def __init__(self, scene: KnownSite, settings: DeformedPeer) -> None:
         super().__init__(scene, settings.count)
         self.grid, self.options = rendering_options(scene)
         self.field = initial_gaussians(scene, self.count)

@@ -82,7 +82,7 @@ class MeanLaw(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Candidate:
+class KernelCandidate:
     """A prior, its log likelihood less `cost` for fitted parameters, and what must be said of it."""
 
     score: float
@@ -106,7 +106,7 @@ class Candidate:
 
 def candidate_priors(
     rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
-) -> list[Candidate]:
+) -> list[KernelCandidate]:
     """Return the likeliest settings of each mean law, the best first, then one for gaps.
 
     That is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or very
@@ -129,7 +129,7 @@ def candidate_priors(
 
 
 def mix_candidates(
-    rows: PowerRows, candidates: list[Candidate], seed: int, max_rows: int
+    rows: PowerRows, candidates: list[KernelCandidate], seed: int, max_rows: int
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Return candidates with their shares in a mean, the largest first, and what must be said of them.
 
@@ -168,7 +168,7 @@ def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
     return residual[posterior.extra == 0, 0].numpy()
 
 
-def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
+def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> KernelCandidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel."""
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     best = _choose_on_part(rows, trends, seed, min(max_rows, COMPARED_ON) if many else max_rows)
@@ -181,7 +181,7 @@ def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
-def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> Candidate:
+def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> KernelCandidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows.heard_rows.draw_subset(max_rows, seed)
     few = loud.draw_subset(COMPARED_ON, seed)
@@ -230,20 +230,24 @@ def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw
 def _fit_one_length(
     rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...],
     shape: type[Shadowing | ExponentialShadowing] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
-) -> Candidate:  # fmt: skip
+) -> KernelCandidate:  # fmt: skip
     distance, terms, values = rows.distances_terms_values(trend)
     scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
     if len(values) < 3 or not values.any() or not distance.any():
         amplitude = max(float(values.square().mean()), 1e-12)
-        return Candidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
+        return KernelCandidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
     starts = [Kernel.from_length(scale * share, 0.1, 1.0, shape) for share in SHARES]
     value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values, partitions=squares)
-    return Candidate(-value - cost, trend, kernel, cost, notes)
+    return KernelCandidate(-value - cost, trend, kernel, cost, notes)
 
 
 def _search_kernel(
-    rows: PowerRows, base: Candidate, starts: list[Kernel], cost: float = 0.0, limit: int = density.LOOKS
-) -> Candidate:
+    rows: PowerRows,
+    base: KernelCandidate,
+    starts: list[Kernel],
+    cost: float = 0.0,
+    limit: int = density.LOOKS,
+) -> KernelCandidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
     known = rows.distances_terms_values(base.trend, starts[0])
     value, kernel = density.fit_kernel_by_left_out(starts, *known, looks=limit)
@@ -272,7 +276,7 @@ def _end_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
     return starts
 
 
-def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
+def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
     distance, terms, values = rows.distances_terms_values(base.trend, base.kernel)
     gram = base.kernel.amplitude * density.covariance_of(base.kernel, distance, terms)
@@ -284,7 +288,7 @@ def _select_doubtful(rows: PowerRows, base: Candidate) -> PowerRows:
     return rows.subset(np.flatnonzero(used))
 
 
-def _fit_by_evidence(rows: PowerRows, base: Candidate, limit: int) -> Candidate:
+def _fit_by_evidence(rows: PowerRows, base: KernelCandidate, limit: int) -> KernelCandidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
     value, kernel = fit_kernel_by_evidence([rows], base.trend, base.kernel, limit)
     return replace(base, score=-value * len(rows.places) - base.cost, kernel=kernel)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field.confidence import fit_level_and_power
-from gsparc.field.encoding import Prior
+from gsparc.field.encoding import Smoothness
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
@@ -42,10 +42,10 @@ PIXELS, CENTRES = 600, 160  # of the images, and rows, that are predicted so
 LEAST_NOISE = 1e-6  # of the kernel's variance
 
 
-def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
+def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Smoothness:
     """Return smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
     chosen, kernel = _fit_kernel(data, rows, anchors, seed)
-    return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
+    return Smoothness(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Process:
         features: with what maps values at the rows to weights.
     """
 
-    prior: Prior
+    prior: Smoothness
     features: Features
 
 
@@ -67,7 +67,7 @@ def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
     features = whitened_features(places, kernel.length, noise, "matern32", anchors)
-    prior = Prior(features.places.float(), kernel.length, noise, "matern32", features.whitening.float())
+    prior = Smoothness(features.places.float(), kernel.length, noise, "matern32", features.whitening.float())
     return Process(prior, features)
 
 

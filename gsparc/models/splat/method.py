@@ -24,7 +24,7 @@ from gsparc.data.splits import Fold
 from gsparc.field import edit, gradient_stage
 from gsparc.field.confidence import ConfidenceSettings, fit_level_and_power
 from gsparc.field.emission import EmissionSettings
-from gsparc.field.encoding import Prior
+from gsparc.field.encoding import Smoothness
 from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings, InitTask
@@ -139,7 +139,7 @@ class LearnedField(Method):
         self.choices: Choices | None = None
         self._ends: dict[str, Tensor] = {}
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
-        self._prior: Prior | None = None
+        self._prior: Smoothness | None = None
         self._paying: int | None = None  # position in the schedule after which steps did not pay
         self.steps = self.steps_taken = 0  # of gradient: kept in the last stage, and taken in the first
         self.init_s: float | None = None  # of all initialisers; None of a model read back
@@ -504,7 +504,7 @@ class LearnedField(Method):
         self.steps, self.steps_taken = state.get("steps", (0, 0))
         self._ends = dict(state["ends"])
         self._shape = None if state["shape"] is None else tuple(state["shape"])
-        self._prior = None if state["prior"] is None else Prior(**state["prior"])
+        self._prior = None if state["prior"] is None else Smoothness(**state["prior"])
         self.model = self._new_model(site)
         edit.resize_gaussians(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])

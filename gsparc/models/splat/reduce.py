@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.encoding import PositionEncoding, Prior
+from gsparc.field.encoding import PositionEncoding, Smoothness
 from gsparc.field.frozen import FrozenArray, freeze_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.field.response import ArrayResponse
@@ -114,7 +114,7 @@ def distil_features(model: GaussianModel, share: float) -> None:
     chosen = pivoted_rows(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
     features = place_features(places[chosen], places, length, noise, old.kernel)
     result = features.weigh @ (own @ (old.whitening.double() @ weights))
-    prior = Prior(features.places.float(), length, noise, old.kernel, features.whitening.float())
+    prior = Smoothness(features.places.float(), length, noise, old.kernel, features.whitening.float())
     few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)
     emission.encoding = few.to(old.anchors.device)
     emission.weight2 = torch.nn.Parameter(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsparc.apps.locate.cells import cover_box
-from gsparc.apps.locate.posterior import Posterior, densest_cells
+from gsparc.apps.locate.posterior import PlacePosterior, densest_cells
 
 PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
 
@@ -12,7 +12,7 @@ PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0
 def gaussians(cells, middles, width=0.2):
     apart = np.linalg.norm(cells.centre[:, None, :2] - np.asarray(middles, float), axis=2)
     density = np.log(np.exp(-0.5 * (apart / width) ** 2).sum(1) + 1e-30)
-    return Posterior(cells, density - np.log((np.exp(density) * cells.volume).sum()))
+    return PlacePosterior(cells, density - np.log((np.exp(density) * cells.volume).sum()))
 
 
 def test_cells_cover_the_plane_that_was_walked():
@@ -48,7 +48,7 @@ def test_cells_where_a_plan_is_open():
 def test_peak_is_between_middles_of_cells():
     cells = cover_box(PLACES, 400, False)
     truth = np.array([2.037, 1.021])
-    found = Posterior(cells, gaussians(cells, [truth], 0.3).sharp, 0.15)
+    found = PlacePosterior(cells, gaussians(cells, [truth], 0.3).sharp, 0.15)
     cell = cells.centre[found.log_density.argmax()]
     assert np.linalg.norm(found.peak()[:2] - truth) < 0.3 * np.linalg.norm(cell[:2] - truth)
     assert found.peak()[2] == 1.5
@@ -58,7 +58,7 @@ def test_peak_is_between_middles_of_cells():
 def test_errors_of_recorded_places_widen_an_area():
     cells = cover_box(PLACES, 8_000, False)
     sharp = gaussians(cells, [[2.0, 1.0]])
-    wide = Posterior(cells, sharp.sharp, 0.3)
+    wide = PlacePosterior(cells, sharp.sharp, 0.3)
     area = cells.volume[densest_cells(wide.log_density, cells.volume, 0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
     place = np.array([2.3, 1.1, 1.5])

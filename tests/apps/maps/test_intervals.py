@@ -7,7 +7,7 @@ import pytest
 
 from gsparc.apps.maps.intervals import (
     LEAST_ROWS,
-    Evidence,
+    HeldOutLevels,
     calibrate,
     cross_validate,
     interval_coverage,
@@ -25,7 +25,7 @@ def evidence(count=3000, seed=0, heavy=False, stations=1):
     draw = rng.standard_t(4, count) / np.sqrt(2) if heavy else rng.normal(size=count)
     station = rng.integers(0, stations, count)
     error = (2 + 0.2 * distance) * (0.6 * shared + 0.8 * draw) * (1 + station)
-    return Evidence(
+    return HeldOutLevels(
         -70 + error, np.full(count, -70.0), spread, distance, block, station, np.zeros(count, bool)
     )
 
@@ -49,7 +49,7 @@ def test_width_rises_with_distance_and_ends():
 
 def test_the_model_without_any_sense_of_distance_still_gets_wider():
     known = evidence()
-    flat = Evidence(**{**vars(known), "spread_db": np.ones(len(known))})
+    flat = HeldOutLevels(**{**vars(known), "spread_db": np.ones(len(known))})
     half = calibrate(flat).half
     assert (np.diff(half) >= -1e-12).all() and half[-1] > 1.3 * half[0]
 
@@ -78,7 +78,7 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
     bound = known.mean_db + np.random.default_rng(2).normal(0, 3, len(known))
     hidden = side * (bound - known.level_db) > 0
     parts = {"level_db": np.where(hidden, bound, known.level_db), "side": (side * hidden).astype(np.int8)}
-    censored = Evidence(**{**vars(known), **parts})
+    censored = HeldOutLevels(**{**vars(known), **parts})
     found, whole = calibrate(censored), calibrate(known)
     assert found.tail is None and found.half.mean() == pytest.approx(whole.half.mean(), rel=0.1)
     inside, width = interval_coverage(found, fresh)

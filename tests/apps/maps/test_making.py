@@ -19,7 +19,7 @@ from gsparc.apps.maps.field_map import (
     server_chance,
     sinr,
 )
-from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.making import _hearing_floors, choose_stations, predict_map
 from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
 from gsparc.apps.maps.promise import Promise
@@ -191,7 +191,7 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
 
 def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
     level, row = np.append(np.linspace(-100, -50, 101), [-90.0, -70.0]), np.arange(103)
-    evidence = Evidence(level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100)
+    evidence = HeldOutLevels(level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100)
     promise = Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0)
     assert _hearing_floors(promise, [0, 1], None) == pytest.approx([-99.5, -90])
     assert _hearing_floors(None, [0, 1], -95.0).tolist() == [-95, -95]
@@ -201,7 +201,7 @@ def test_a_threshold_below_all_that_was_measured_was_said_to_be_met_everywhere(p
     """100.0% of a city (100.0% to 100.0%) had -100 dBm or more, where the weakest measured was -100.6."""
     level, row = np.linspace(-100.6, -50, 400), np.arange(400)
     place = np.random.default_rng(0).uniform(0, 60, (400, 3))
-    evidence = Evidence(level, level, np.ones(400), np.linspace(0, 90, 400), row // 10, row * 0, row % 2)
+    evidence = HeldOutLevels(level, level, np.ones(400), np.linspace(0, 90, 400), row // 10, row * 0, row % 2)
     promise = Promise(evidence, place, row % 2, 5.0)
     for threshold, said in ((-100, 1), (-90, 0)):
         found = predict_map(predictor, step_m=20.0, threshold_db=threshold, promise=promise)
@@ -245,7 +245,7 @@ def test_channels_have_a_power(tmp_path):
 
 
 def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
-    nothing = Evidence(*(np.zeros(0) for _ in range(7)))
+    nothing = HeldOutLevels(*(np.zeros(0) for _ in range(7)))
     promise = Promise(nothing, np.zeros((4, 3)), np.zeros(4, np.int64), 1.0)
     names, notes = choose_stations(predictor, None, promise)
     assert names == ["west"] and "east was never heard" in notes[0]

@@ -11,7 +11,7 @@ from towns import MASTS, town_file, town_model
 import gsparc
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.geojson import draws_shapes
-from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import (
     Antenna,
@@ -110,7 +110,7 @@ def test_sectors_left_out_one_by_one_were_told_by_others_of_their_site(together,
         error, nothing = rng.normal(0, 6, 2000), np.zeros(2000)
         heard = error > 3  # the others are below a level that a list ends with
         side, level = (~heard).astype(np.int8), np.where(heard, error, 3.0)
-        return Evidence(level, nothing, nothing + 6, nothing, nothing, nothing, side)
+        return HeldOutLevels(level, nothing, nothing + 6, nothing, nothing, nothing, side)
 
     monkeypatch.setattr("gsparc.apps.maps.placing.held_out_evidence", evidence)
     monkeypatch.setattr("gsparc.apps.maps.placing.LEAST_STATIONS", 2)

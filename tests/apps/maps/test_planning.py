@@ -9,7 +9,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances
-from gsparc.apps.maps.intervals import Evidence
+from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import Streets, Tour, Ways
@@ -71,7 +71,7 @@ def test_it_stops_where_a_place_gains_too_little(predictor):
 def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predictor):
     rng = np.random.default_rng(0)
     level, spread, row = rng.normal(size=60), np.ones(60), np.arange(60)
-    evidence = Evidence(level, 0 * level, spread, row / 10, row, row % 2, row < 0)
+    evidence = HeldOutLevels(level, 0 * level, spread, row / 10, row, row % 2, row < 0)
     known = np.column_stack([rng.uniform(0, [40, 60], (120, 2)), np.full(120, 1.5)]) - predictor.site.origin
     promise = Promise(evidence, known, np.arange(120) % 2, 5.0)
     found = plan_measurements(predictor, 6, promise=promise)
@@ -85,7 +85,7 @@ def promised(predictor, count, stations):
     """Evidence of rows that list so many of the two stations at each of `count` places."""
     rng, rows = np.random.default_rng(0), np.arange(count * stations)
     level = rng.normal(size=len(rows))
-    evidence = Evidence(level, 0 * level, 1 + 0 * level, rows / 10, rows, rows % 2, rows < 0)
+    evidence = HeldOutLevels(level, 0 * level, 1 + 0 * level, rows / 10, rows, rows % 2, rows < 0)
     known = np.column_stack([rng.uniform(0, [40, 60], (count, 2)), np.full(count, 1.5)])
     known = np.repeat(known - predictor.site.origin, stations, 0)
     return Promise(evidence, known, rows % 2, 5.0)

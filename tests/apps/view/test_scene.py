@@ -5,12 +5,12 @@ import numpy as np
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.building import build_scene
-from gsparc.apps.view.scene import EXTENT, Frame
+from gsparc.apps.view.scene import EXTENT, DrawingFrame
 
 
 def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
     places = np.array([[4.5e6, 5.1e5, 0], [4.5e6 + 2000, 5.1e5 + 900, 30]])
-    frame = Frame.around(places)
+    frame = DrawingFrame.around(places)
     drawn = frame.to_drawn(places)
     assert drawn.dtype == np.float32 and np.ptp(drawn, axis=0).max() == EXTENT
     np.testing.assert_allclose(frame.to_world(drawn), places, atol=1e-3)

@@ -17,11 +17,11 @@ from gsparc.models.image_sources.clutter.finite_mirrors import find_patch, find_
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.known.method import ReflectionPhasePrior
 from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.physics.mirror_planes import all_sequences
 from gsparc.processes.worker import Cancelled, cancel_when, end_when
 
@@ -41,9 +41,9 @@ def _sequences(order: int) -> tuple:
     return ((), *kept)
 
 
-def _scene(clutter: Clutter, order: int = 1) -> Scene:
+def _scene(clutter: Clutter, order: int = 1) -> SourceScene:
     sequences, law = _sequences(order), KernelVisibility(0.95, 0.6, 1.5)
-    return Scene(TRANSMITTER, WALLS, sequences, torch.zeros(len(sequences)), -4.0, law, clutter)
+    return SourceScene(TRANSMITTER, WALLS, sequences, torch.zeros(len(sequences)), -4.0, law, clutter)
 
 
 def _rows(count: int, seed: int = 0) -> Rows:
@@ -92,7 +92,7 @@ def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
     torch.testing.assert_close(paths.end[:, :, -1], TRANSMITTER.float().expand(2, 20, 3))
     torch.testing.assert_close(paths.end[:, :, :-1], paths.start[:, :, 1:])
     assert paths.valid.all()
-    scene = Scene(TRANSMITTER, WALLS, ((0, 2), (2,)), torch.zeros(2), 0.0)
+    scene = SourceScene(TRANSMITTER, WALLS, ((0, 2), (2,)), torch.zeros(2), 0.0)
     straight = torch.cdist(scene.sources, places)
     length = (paths.end - paths.start).norm(dim=-1).sum(-1)
     torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
@@ -102,7 +102,7 @@ def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
 
 def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     planes, clutter = _table()
-    scene = Scene(TRANSMITTER, planes, ((), (6,)), torch.zeros(2), 0.0, clutter=clutter)
+    scene = SourceScene(TRANSMITTER, planes, ((), (6,)), torch.zeros(2), 0.0, clutter=clutter)
     above_middle = [2.5, 1.9, 1.0]
     above_beside = [3.9, 2.9, 0.8]  # the reflection would lie beyond the edge
     under = [2.4, 1.8, 0.2]
@@ -114,7 +114,7 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
 def test_batched_queries_and_variance_include_clutter():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
     scenes = [_scene(_boxed(_box())), _scene(Clutter.empty())]
-    members = [Posterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
+    members = [GainPosterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
     queries = _rows(6, seed=5).position
     tone = torch.tensor([2.4e9], dtype=torch.float64)
     means, variance, _ = EnsembleMeans(members).predict(queries, tone)
@@ -132,7 +132,7 @@ def test_residual_is_the_same_likelihood():
     residual = ClutterLikelihood(rows, phased(_scene(_boxed(_box())), torch.arange(7.0)))
     scene = residual.scene
     seen = scene.visible_share(rows.position).T
-    expected = Posterior(rows, residual.scene).nll
+    expected = GainPosterior(rows, residual.scene).nll
     assert residual.nll(seen, scene.log_amplitude).item() == pytest.approx(expected, rel=1e-4)
 
 
@@ -144,11 +144,11 @@ def test_score_is_what_the_best_multiple_gains():
     score, multiple = scorer.gains_and_multiples(change)
     best = int(score.argmax())
     moved = replace(rows, target=rows.target - (multiple[best] * change[:, best])[:, None])
-    gain = Posterior(rows, scene).nll - Posterior(moved, scene).nll
+    gain = GainPosterior(rows, scene).nll - GainPosterior(moved, scene).nll
     assert score[best].item() == pytest.approx(gain, rel=0.02)
 
 
-def _truth(scene: Scene, rows: Rows, noise: float = 0.02) -> Rows:
+def _truth(scene: SourceScene, rows: Rows, noise: float = 0.02) -> Rows:
     """What such a scene would be measured as, in unit power."""
     torch.manual_seed(0)
     target = scene.waves(rows).sum(1, keepdim=True)
@@ -164,12 +164,12 @@ def test_the_pillar_is_found_by_its_shadow():
     torch.testing.assert_close(middle, torch.tensor([1.8, 1.4]), atol=0.25, rtol=0)
 
 
-def _bare(sources: int = 7) -> Scene:
+def _bare(sources: int = 7) -> SourceScene:
     """A shoebox of known phases without clutter."""
     return phased(_scene(Clutter.empty()), torch.zeros(sources))
 
 
-def _unexplained(rows: Rows, start: Scene) -> UnexplainedRows:
+def _unexplained(rows: Rows, start: SourceScene) -> UnexplainedRows:
     """What is left of rows by a scene without clutter, with its noise."""
     residual = ClutterLikelihood(rows, start)
     scene, paths = residual.scene, start.unfolding.paths(rows.position)
@@ -182,7 +182,7 @@ def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
     """What walls leave unexplained of rows in a room with a table, and the table."""
     planes, clutter = _table()
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
-    true = Scene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
+    true = SourceScene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
     rows = _truth(true, _rows(count))
     return _unexplained(rows, _bare()), clutter
 
@@ -255,7 +255,7 @@ def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
     late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
     with end_when(late):
         found = find_clutter(rows, start, torch.Generator().manual_seed(0))
-    assert isinstance(found, Scene) and len(looks) < 60
+    assert isinstance(found, SourceScene) and len(looks) < 60
     with cancel_when(lambda: True), pytest.raises(Cancelled):
         find_clutter(rows, start, torch.Generator().manual_seed(0))
 
@@ -263,7 +263,7 @@ def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
 def test_an_infinite_mirror_becomes_finite():
     planes, clutter = _table()
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
-    true = Scene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
+    true = SourceScene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
     rows = _truth(true, _rows(250))
     start = phased(replace(true, clutter=Clutter.empty()), torch.zeros(10))
     left = _unexplained(rows, start)
@@ -286,7 +286,7 @@ def test_a_pillar_is_clutter_and_an_empty_room_has_none(monkeypatch):
         start = _bare()
         found = find_clutter(rows, start, generator)
         assert bool(len(found.clutter.boxes)) == boxes
-        bare, learned = (Posterior(rows, each).nll for each in (start, found))
+        bare, learned = (GainPosterior(rows, each).nll for each in (start, found))
         assert learned <= bare
     assert not len(found.clutter)
 

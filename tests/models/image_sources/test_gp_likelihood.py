@@ -7,10 +7,10 @@ import torch
 from gains import gains, phased
 
 from gsparc.models.image_sources import refine
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, spherical_waves
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
 from gsparc.processes.kernel import matern32_of_squares
 
 COUNT = 24
@@ -28,8 +28,8 @@ def _rows(outputs: int = 1) -> Rows:
     return Rows(position, frequency, target, receiver)
 
 
-def _scene() -> Scene:
-    return Scene(
+def _scene() -> SourceScene:
+    return SourceScene(
         transmitter=torch.tensor([4.0, 1.0, 1.0], dtype=torch.float64),
         planes=torch.tensor([[1.0, 0, 0, -1], [0, 1, 0.1, 4]], dtype=torch.float64),
         sequences=((), (0,), (0, 1)),
@@ -39,7 +39,7 @@ def _scene() -> Scene:
     )
 
 
-def _phased(quadrature: float = 0.2) -> Scene:
+def _phased(quadrature: float = 0.2) -> SourceScene:
     return phased(_scene(), torch.tensor([0.3, -1.0, 2.0]), quadrature)
 
 
@@ -51,13 +51,13 @@ def test_covariance_by_the_formula():
         correlation = scene.visibility.correlation(rows.position, source)
         wave = waves[:, k] * scene.log_amplitude[k].exp()
         expected = expected + wave[:, None] * wave.conj() * correlation
-    torch.testing.assert_close(Posterior(rows, scene).covariance, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(GainPosterior(rows, scene).covariance, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_without_a_source_is_the_scene_less_that_source_and_its_plane():
     rows, less = _rows(), _scene().select_sources([0, 1])
-    assert Posterior(rows, _scene()).nll_without_source(2) == pytest.approx(
-        Posterior(rows, less).nll, rel=1e-5
+    assert GainPosterior(rows, _scene()).nll_without_source(2) == pytest.approx(
+        GainPosterior(rows, less).nll, rel=1e-5
     )
     assert less.sequences == ((), (0,)) and len(less.planes) == 1
 
@@ -69,17 +69,17 @@ def test_quadrature_one_is_the_circular_process():
     for noise in (-1.0, 0.5):
         circular = replace(scene, log_noise=noise)
         turned = replace(_phased(quadrature=1.0), log_noise=noise)
-        differences.append(Posterior(rows, circular).nll - Posterior(rows, turned).nll)
+        differences.append(GainPosterior(rows, circular).nll - GainPosterior(rows, turned).nll)
     assert differences[0] == pytest.approx(differences[1], abs=1e-2)
 
 
 @pytest.mark.parametrize("quadrature", [0.1, 1.0])
 def test_left_out_by_refitting_without_the_receiver(quadrature):
     rows, scene = _rows(), _phased(quadrature)
-    left_out = Posterior(rows, scene).predict_left_out()
+    left_out = GainPosterior(rows, scene).predict_left_out()
     for receiver in (0, 5):  # the first has two rows
         mine = rows.receiver == receiver
-        rest = Posterior(rows.select_rows(torch.nonzero(~mine)[:, 0]), scene)
+        rest = GainPosterior(rows.select_rows(torch.nonzero(~mine)[:, 0]), scene)
         held = rows.select_rows(torch.nonzero(mine)[:, 0])
         waves = spherical_waves(held, scene.sources)
         predicted = (waves[:, :, None] * gains(rest, held.position)).sum(1)
@@ -94,7 +94,7 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
     values += [torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
     nll, gradient = refine._cost_and_gradient(rows, scene, values, seen)
-    assert nll == pytest.approx(Posterior(rows, scene).nll, rel=1e-5)
+    assert nll == pytest.approx(GainPosterior(rows, scene).nll, rel=1e-5)
     for i, value in enumerate(values):
         step = 3e-4 if i < 3 else 2e-2
         for j in range(min(value.numel(), 4)):
@@ -105,11 +105,11 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
                 ends.append(refine._cost_and_gradient(rows, scene, moved, seen)[0])
             numeric = (ends[0] - ends[1]) / (2 * step)
             assert gradient[i].reshape(-1)[j].item() == pytest.approx(numeric, rel=0.05, abs=0.15), (i, j)
-    assert Posterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
+    assert GainPosterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
 
 
 def test_packed_queries_equal_the_processes():
-    members = [Posterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
+    members = [GainPosterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
     tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
     queries = torch.rand(7, 3, dtype=torch.float64) * 3
     means, _, _ = EnsembleMeans(members).predict(queries, tones)
@@ -128,14 +128,14 @@ def test_variance_is_that_of_the_joint_gaussian():
     rows, scene = _rows(), _phased()
     query = torch.tensor([[1.0, 1.2, 0.4]], dtype=torch.float64)
     tone = torch.tensor([2.4e9], dtype=torch.float64)
-    _, variance, _ = EnsembleMeans([Posterior(rows, scene)]).predict(query, tone)
+    _, variance, _ = EnsembleMeans([GainPosterior(rows, scene)]).predict(query, tone)
     both = Rows(
         torch.cat([rows.position, query]),
         torch.cat([rows.frequency, tone]),
         torch.cat([rows.target, torch.zeros(1, 1, dtype=torch.complex64)]),
         torch.arange(COUNT + 1),
     )
-    inverse = Posterior(both, scene).conditioned.factor.inverse
+    inverse = GainPosterior(both, scene).conditioned.factor.inverse
     block = inverse[[COUNT, 2 * COUNT + 1]][:, [COUNT, 2 * COUNT + 1]]
     assert variance.item() == pytest.approx(torch.linalg.inv(block).trace().item(), rel=1e-3)
 
@@ -143,13 +143,13 @@ def test_variance_is_that_of_the_joint_gaussian():
 def test_variances_of_many_queries_are_those_of_each_alone():
     tones = torch.tensor([2.4e9], dtype=torch.float64)
     queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
-    query = EnsembleMeans([Posterior(_rows(), _phased()), Posterior(_rows(), _phased(0.7))], 10)
+    query = EnsembleMeans([GainPosterior(_rows(), _phased()), GainPosterior(_rows(), _phased(0.7))], 10)
     _, variance, prior = query.predict(queries, tones)
     alone = [query.predict(one[None], tones)[1:] for one in queries]
     torch.testing.assert_close(
         torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
     )
-    whole = EnsembleMeans([Posterior(_rows(), _phased())]).predict(queries, tones)[1]
+    whole = EnsembleMeans([GainPosterior(_rows(), _phased())]).predict(queries, tones)[1]
     assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
     assert bool((variance <= prior).all())
 

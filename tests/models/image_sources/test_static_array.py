@@ -14,11 +14,11 @@ from scenes import error, fold_of
 from gsparc.data.own import from_arrays
 from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
-from gsparc.models.image_sources.gp_likelihood import Posterior, estimate_phases
+from gsparc.models.image_sources.gp_likelihood import GainPosterior, estimate_phases
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
 from gsparc.models.image_sources.rows import draw_rows, static_array
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, spherical_waves
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
 from gsparc.physics.mirror_planes import bisector, image_rotations, images, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext
@@ -124,7 +124,7 @@ def _rows_and_scene():
     rows = draw_rows(data, fold.train, 100, 0)
     static = torch.from_numpy(data.site.static_position)
     planes = torch.tensor([[1.0, 0, 0, -data.site.origin[0]]]).double()
-    scene = Scene(static, planes, ((), (0,)), torch.zeros(2), -5.0)
+    scene = SourceScene(static, planes, ((), (0,)), torch.zeros(2), -5.0)
     return rows, scene
 
 
@@ -132,8 +132,8 @@ def test_gradient_by_planes_and_position_is_that_of_the_likelihood():
     rows, scene = _rows_and_scene()
     assert len(rows) <= 100 and len(rows.element.unique()) == 4
     moved = replace(scene, planes=scene.planes + torch.tensor([0, 0, 0, 0.004]).double())
-    before = Posterior(rows, moved).nll
-    assert Posterior(rows, refine_scene(rows, moved, 10)).nll < before - 1
+    before = GainPosterior(rows, moved).nll
+    assert GainPosterior(rows, refine_scene(rows, moved, 10)).nll < before - 1
 
 
 def test_quick_scores_of_an_array_are_those_without_a_covariance():
@@ -143,7 +143,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
     waves = spherical_waves(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
     torch.testing.assert_close(rough_gains(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert gains_and_amplitudes(Posterior(rows, scene), spread)[0].shape == (300,)
+    assert gains_and_amplitudes(GainPosterior(rows, scene), spread)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
         spherical_waves(rows, points)
 
@@ -220,6 +220,6 @@ def test_one_antenna_is_a_case_of_several():
     rows, scene = _rows_and_scene()
     mine = rows.select_rows(torch.nonzero(rows.element == 0).flatten())
     alone = replace(mine, array=None, element=None)
-    assert Posterior(mine, scene).nll == pytest.approx(Posterior(alone, scene).nll, rel=1e-4)
-    one, other = (Posterior(each, estimate_phases(each, scene, 0.4, 1e-5)).nll for each in (mine, alone))
+    assert GainPosterior(mine, scene).nll == pytest.approx(GainPosterior(alone, scene).nll, rel=1e-4)
+    one, other = (GainPosterior(each, estimate_phases(each, scene, 0.4, 1e-5)).nll for each in (mine, alone))
     assert one == pytest.approx(other, rel=1e-4)

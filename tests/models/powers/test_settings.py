@@ -12,7 +12,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
-from gsparc.models.powers.settings import LEAST_SILENT, Candidate, _select_doubtful, process_and_notes
+from gsparc.models.powers.settings import LEAST_SILENT, KernelCandidate, _select_doubtful, process_and_notes
 from gsparc.models.reduced import with_reduction
 from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
@@ -51,7 +51,9 @@ def test_of_silent_rows_those_in_doubt_are_weighed():
     side = np.repeat([0, 1], [40, 101]).astype(np.int8)
     places = np.pad(np.r_[heard, silent][:, None], ((0, 0), (0, 2)))
     rows = PowerRows(places, np.where(side, -70.0, -60.0), side)
-    few = _select_doubtful(rows, Candidate(0.0, Trend(-60.0), Kernel.from_length(100.0, 0.1, 16.0), 0.0))
+    few = _select_doubtful(
+        rows, KernelCandidate(0.0, Trend(-60.0), Kernel.from_length(100.0, 0.1, 16.0), 0.0)
+    )
     assert (few.side == 0).sum() == 40 and few.silent.sum() == LEAST_SILENT
     # Beside strong ones a silent row contradicts what is known; 2 km away it says little.
     assert (few.places[few.silent, 0] <= 400).sum() == (silent <= 400).sum()

@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.apps.view.scene import EXTENT, Scene
+from gsparc.apps.view.scene import EXTENT, DrawnScene
 
 ABOVE = (0.15, -0.95, 0.8)  # where a camera first stands, in widths of the site
 ASIDE = 0.15  # how far east of the site it looks, where a panel covers what lies there
 
 
-def draw_scene(api: Any, scene: Scene, before: Mapping[str, Any]) -> dict[str, Any]:
+def draw_scene(api: Any, scene: DrawnScene, before: Mapping[str, Any]) -> dict[str, Any]:
     """Draw everything, in place of the nodes `before`; returns the nodes by name."""
     for node in before.values():
         node.remove()
     return {part.name: part.draw(api, scene.frame) for part in scene.parts}
 
 
-def draw_floor(api: Any, scene: Scene) -> float:
+def draw_floor(api: Any, scene: DrawnScene) -> float:
     """Draw a grid beneath the scene; returns the side of its cells [m]."""
     frame = scene.frame
     wide = EXTENT / frame.scale

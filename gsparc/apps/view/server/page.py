@@ -17,7 +17,7 @@ from gsparc.apps.view.building import PATHS, SPHERE, draw_rays
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import plane_sheet
 from gsparc.apps.view.reasons import legend_html, summarise_answer
-from gsparc.apps.view.scene import EXTENT, Part, Points, Scene, Sheet
+from gsparc.apps.view.scene import EXTENT, DrawnScene, Part, Points, Sheet
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView, walk_places
 from gsparc.data.schema import ENDS
@@ -118,7 +118,7 @@ def _upright(image: np.ndarray, middle: np.ndarray, extent: float) -> Sheet:
     return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
-def _side_panel(scene: Scene, notes: list[str], legends: list[Legend]) -> str:
+def _side_panel(scene: DrawnScene, notes: list[str], legends: list[Legend]) -> str:
     title = html.escape(scene.title)
     lines = "".join(f"<p style='margin:.3em .6em'>{html.escape(line)}</p>" for line in notes)
     return (

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsparc.models.image_sources.clutter.unfold import EDGE, Paths
+from gsparc.models.image_sources.clutter.unfold import EDGE, Legs
 from gsparc.physics.mirror_planes import hesse_form
 
 MARGIN = 0.03  # [m], chord that is not blocked: legs end on the faces that reflect them
@@ -64,7 +64,7 @@ class Clutter:
         return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
 
 
-def visible_share(paths: Paths, clutter: Clutter, planes: Tensor) -> Tensor:
+def visible_share(paths: Legs, clutter: Clutter, planes: Tensor) -> Tensor:
     """Return the visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
     return Obstacles(clutter, planes).visible_share(paths)
 
@@ -90,7 +90,7 @@ class Obstacles:
         self.plane, self.offset = plane.view(-1, 1, 1, 1), offset.view(-1, 1, 1, 1)
         self.axes = torch.cat([normal[None], plane_tangents(used)])
 
-    def visible_share(self, paths: Paths) -> Tensor:
+    def visible_share(self, paths: Legs) -> Tensor:
         """Return the visible share (K, n) in [0, 1] of each source."""
         seen = torch.ones(paths.valid.shape)
         if len(self.boxes):
@@ -99,7 +99,7 @@ class Obstacles:
             seen = seen * self._share_past_patches(paths)
         return seen
 
-    def _share_past_patches(self, paths: Paths) -> Tensor:
+    def _share_past_patches(self, paths: Legs) -> Tensor:
         turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
         height, *place = turned.unflatten(0, self.axes.shape[:2])  # each (Q, K, n, L + 1)
         height = height - self.offset
@@ -117,7 +117,7 @@ class Obstacles:
         return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
 
 
-def share_past_boxes(paths: Paths, boxes: Tensor) -> Tensor:
+def share_past_boxes(paths: Legs, boxes: Tensor) -> Tensor:
     """Return the share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
     along = paths.end - paths.start
     along = torch.where(along.abs() < EDGE, EDGE, along)

@@ -12,9 +12,9 @@ import torch
 
 from gsparc.models.image_sources.clutter.blocking import SOFT, Clutter, visible_share
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood
-from gsparc.models.image_sources.clutter.unfold import Paths
+from gsparc.models.image_sources.clutter.unfold import Legs
 from gsparc.models.image_sources.refine import STEP
-from gsparc.models.image_sources.scene import BETAS, Scene, spherical_waves
+from gsparc.models.image_sources.scene import BETAS, SourceScene, spherical_waves
 from gsparc.physics.mirror_planes import images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
@@ -23,7 +23,9 @@ STEPS = (SOFT, SOFT, 0.003, 0.03, STEP)
 STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
 
-def refine_with_clutter(residual: ClutterLikelihood, scene: Scene, paths: Paths, steps: int) -> Scene:
+def refine_with_clutter(
+    residual: ClutterLikelihood, scene: SourceScene, paths: Legs, steps: int
+) -> SourceScene:
     """Return the most likely scene of `steps` steps; paths are those of the start."""
     assert scene.phase is not None
     rows, old = residual.rows, scene.clutter

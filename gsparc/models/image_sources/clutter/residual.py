@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.unfold import Paths
-from gsparc.models.image_sources.gp_likelihood import Posterior, quadrature_variances, stack_real_imag
+from gsparc.models.image_sources.clutter.unfold import Legs
+from gsparc.models.image_sources.gp_likelihood import GainPosterior, quadrature_variances, stack_real_imag
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import Scene
+from gsparc.models.image_sources.scene import SourceScene
 from gsparc.processes.factor import Factor
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -40,7 +40,7 @@ class ClutterLikelihood:
         scene: as given, constant share and noise chosen by likelihood.
     """
 
-    def __init__(self, rows: Rows, scene: Scene) -> None:
+    def __init__(self, rows: Rows, scene: SourceScene) -> None:
         self.rows, self.noise_floor = rows, scene.noise_floor
         self.target = stack_real_imag(rows.target)[0][:, 0]
         self.waves = scene.unobstructed_waves(rows)
@@ -54,14 +54,14 @@ class ClutterLikelihood:
         # Two matrices (2 n, 2 n) go; the root is all that is asked from here on.
         del self._cached, self._own
 
-    def _gain_covariances(self, scene: Scene) -> tuple[Tensor, Tensor]:
+    def _gain_covariances(self, scene: SourceScene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
-        varying = Posterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
+        varying = GainPosterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
         across = stack_real_imag(scaled)[1]
         return varying.source_gram.matrix, quadrature_variances(scene.quadrature)[1] * (across @ across.T)
 
-    def _tune_share_and_noise(self, scene: Scene) -> Scene:
+    def _tune_share_and_noise(self, scene: SourceScene) -> SourceScene:
         """Constant share and noise by likelihood, in turn on a grid."""
         columns = stack_real_imag(scene.waves(self.rows) * scene.log_amplitude.exp())[0]
         kernel, noise = scene.visibility, scene.log_noise
@@ -199,9 +199,9 @@ class UnexplainedRows:
     """
 
     rows: Rows
-    scene: Scene
+    scene: SourceScene
     scorer: CandidateScorer
-    paths: Paths
+    paths: Legs
     waves: Tensor
     room: Tensor
     generator: torch.Generator

@@ -16,11 +16,11 @@ from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_occluding
 from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_patch, find_small_mirrors
 from gsparc.models.image_sources.clutter.refine import refine_with_clutter
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
-from gsparc.models.image_sources.gp_likelihood import Posterior
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.refine import refine_scene
 from gsparc.models.image_sources.reflection_orders import ORDER
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import Cancelled, cancel_when, out_of_time, raise_if_cancelled
@@ -37,7 +37,7 @@ BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 
 
-def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
+def find_clutter(rows: Rows, scene: SourceScene, generator: torch.Generator) -> SourceScene:
     """Return the scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
@@ -52,12 +52,12 @@ def find_clutter(rows: Rows, scene: Scene, generator: torch.Generator) -> Scene:
     # The kernel learned without clutter explains it: reset
     fresh = replace(scene, visibility=INITIAL_KERNEL, quadrature=min(scene.quadrature, QUADRATURE))
     trial = _ClutterSearcher(rows, fresh, generator).run()
-    before, after = (Posterior(rows, each).nll for each in (scene, trial))
+    before, after = (GainPosterior(rows, each).nll for each in (scene, trial))
     return trial if after < before - PROGRESS else scene
 
 
 class _ClutterSearcher:
-    def __init__(self, rows: Rows, scene: Scene, generator: torch.Generator) -> None:
+    def __init__(self, rows: Rows, scene: SourceScene, generator: torch.Generator) -> None:
         self.rows, self.generator = rows, generator
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
@@ -66,12 +66,12 @@ class _ClutterSearcher:
         self._refactor(scene)
 
     # ---- state ----
-    def _refactor(self, scene: Scene) -> None:
+    def _refactor(self, scene: SourceScene) -> None:
         """Factor the residual's covariance at a scene."""
         self.residual = ClutterLikelihood(self.rows, scene)
         self._set_scene(self.residual.scene)
 
-    def _set_scene(self, scene: Scene) -> None:
+    def _set_scene(self, scene: SourceScene) -> None:
         """Set the scene, with the varying part still that of the residual."""
         self.scene, self.paths = scene, scene.unfolding.paths(self.rows.position)
         self.waves = scene.unobstructed_waves(self.rows)
@@ -84,7 +84,7 @@ class _ClutterSearcher:
         waves = self.waves * self.visible.T
         return UnexplainedRows(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
 
-    def _try_scene(self, scene: Scene, parameters: int, refactor: bool = False) -> bool:
+    def _try_scene(self, scene: SourceScene, parameters: int, refactor: bool = False) -> bool:
         """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
 
         Varying part and noise are those last factored; with `refactor` they are the new scene's, since the
@@ -116,7 +116,7 @@ class _ClutterSearcher:
         self._set_scene(replace(scene, clutter=replace(scene.clutter, boxes=boxes)))
 
     # ---- the loop ----
-    def run(self) -> Scene:
+    def run(self) -> SourceScene:
         start = self.nll
         best = self.whole = start, self.scene
         try:
@@ -171,7 +171,7 @@ class _ClutterSearcher:
         return self._add_sequences(trial, sequences, 1.5, MIRROR, len(sequences))
 
     def _add_sequences(
-        self, scene: Scene, sequences: list[Reflections], min_score: float, parameters: int, limit: int
+        self, scene: SourceScene, sequences: list[Reflections], min_score: float, parameters: int, limit: int
     ) -> bool:
         """Try sequences of at least `min_score` nats, on a scene of so many more parameters of planes."""
         # new patches occlude present sequences, too

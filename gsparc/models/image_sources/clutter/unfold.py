@@ -21,7 +21,7 @@ PARALLEL = 1e-9  # [m], difference of heights over a plane that legs along it ar
 
 
 @dataclass(frozen=True)
-class Paths:
+class Legs:
     """Legs of K sequences from n places.
 
     Attributes:
@@ -45,9 +45,9 @@ class Paths:
         """(K, n, L, 3) of each leg [m]."""
         return self.points[:, :, 1:]
 
-    def select_sequences(self, sequences: Tensor | list[int]) -> Paths:
+    def select_sequences(self, sequences: Tensor | list[int]) -> Legs:
         """Return the paths of some sequences."""
-        return Paths(self.points[sequences], self.plane[sequences], self.valid[sequences])
+        return Legs(self.points[sequences], self.plane[sequences], self.valid[sequences])
 
 
 class Unfolding:
@@ -89,7 +89,7 @@ class Unfolding:
         self.height = torch.where(exists, height, -1.0)
         self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).movedim(0, -1)
 
-    def paths(self, places: Tensor) -> Paths:
+    def paths(self, places: Tensor) -> Legs:
         """Return the paths from places (n, 3) [m]."""
         shape = (*self.present.shape[:2], len(places))
         here, valid = places.to(self.chain.dtype).expand(*shape, 3), self.present.expand(shape)
@@ -104,7 +104,7 @@ class Unfolding:
         points.append(self.chain[0].expand_as(here))
         chosen = valid.int().argmax(1)  # the first valid variant, else the first
         plane = _select_variants(self.plane.expand(*shape, -1), chosen)
-        return Paths(_select_variants(torch.stack(points, -2), chosen), plane, valid.any(1))
+        return Legs(_select_variants(torch.stack(points, -2), chosen), plane, valid.any(1))
 
 
 def _select_variants(values: Tensor, variants: Tensor) -> Tensor:

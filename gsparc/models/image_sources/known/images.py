@@ -16,7 +16,7 @@ from torch import Tensor
 from gsparc.data.walls import SceneWalls, box_faces, polygon_area, polygon_normal
 from gsparc.models.apart import keep_apart
 from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
-from gsparc.models.image_sources.clutter.unfold import SAME_M, Paths, Unfolding
+from gsparc.models.image_sources.clutter.unfold import SAME_M, Legs, Unfolding
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, hesse_form, images
 from gsparc.processes.trend import Walls
 
@@ -87,7 +87,7 @@ class Mirrors:
                 size[plane] = size.get(plane, 0.0) + one * other
         return sorted(size, key=lambda plane: -size[plane])
 
-    def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Paths:
+    def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Legs:
         """Return the paths from places (n, 3) to the transmitter (3,) float64 [m]."""
         return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
 
@@ -156,7 +156,7 @@ class Mirrors:
             power = power * self._are_reflected(self.paths(sequences, transmitter, places))
         return power.mean(1) * REFLECTED ** (2 * order)
 
-    def _are_reflected(self, paths: Paths) -> Tensor:
+    def _are_reflected(self, paths: Legs) -> Tensor:
         """Whether (W, n) every leg of a sequence ends on a rectangle of its plane, as 0 and 1."""
         inside = paths.plane < 0
         for patch, plane in zip(self.clutter.patches, self.clutter.plane, strict=True):

@@ -19,7 +19,7 @@ from gsparc.models.image_sources.known import images
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
-from gsparc.models.image_sources.scene import KernelVisibility, Scene, direct_amplitude
+from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, direct_amplitude
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections, hesse_form
 from gsparc.physics.waves import LIGHT
@@ -65,7 +65,7 @@ class KnownWallsGP(ImageSourceGP):
         rows = row_sets[0]
         given = self._initial_scene(rows, settings)
 
-        def negative_log_prior(scene: Scene) -> Tensor:
+        def negative_log_prior(scene: SourceScene) -> Tensor:
             assert scene.phase is not None
             near = walls_prior_cost(given.planes, given.sequences, scene.planes, scene.log_amplitude)
             return near + prior.negative_log_density(scene.phase, given.sequences)
@@ -82,7 +82,7 @@ class KnownWallsGP(ImageSourceGP):
         )  # fmt: skip
         return [Member(scene, error)]
 
-    def _initial_scene(self, rows: Rows, settings: SearchSettings) -> Scene:
+    def _initial_scene(self, rows: Rows, settings: SearchSettings) -> SourceScene:
         """The static end and its images that some receiver sees, with amplitudes to start from."""
         transmitter = self._transmitter_in_frame()
         mirrors = images.Mirrors.from_walls(self.walls, self.fitted_site.origin + self.frame.middle.numpy())
@@ -99,7 +99,7 @@ class KnownWallsGP(ImageSourceGP):
         sequences = mirrors.visible_sequences(indices, *ends, order, settings.max_sources, hidden)
         obstacles = mirrors.obstacles_of(sequences, *ends) if hidden else Clutter.empty()
         direct = float(direct_amplitude(rows, transmitter))
-        bare = Scene(
+        bare = SourceScene(
             transmitter, mirrors.planes, sequences, images.starting_log_amplitudes(sequences, direct),
             math.log(NOISE), self.kernel, noise_floor=self.noise_floor,
         )  # fmt: skip
@@ -125,7 +125,7 @@ class ReflectionPhasePrior:
     concentration: float
 
     @staticmethod
-    def from_scene(scene: Scene) -> ReflectionPhasePrior:
+    def from_scene(scene: SourceScene) -> ReflectionPhasePrior:
         """Estimate from a scene's phases, weighted by power."""
         assert scene.phase is not None
         order, phase = torch.tensor([len(sequence) for sequence in scene.sequences]), scene.phase
