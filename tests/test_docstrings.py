@@ -17,6 +17,8 @@ PLACES = np.c_[RNG.uniform(0, 9, (60, 2)), np.full(60, 1.5)]
 ENDS = np.array([[4.0, 4.0, 2.6], [9.0, 9.0, 2.6]])
 POWERS = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + RNG.normal(size=(60, 2))
 ROOT = Path(__file__).parents[1]
+DESCRIBED = ast.Module, ast.ClassDef, ast.FunctionDef
+OTHERS = {"yield", "vjp", "jacrev", "jacfwd", "tx_x_mm"}  # of Python, of torch.func, and of a user's table
 PACKAGES = {"gsparc": "gsparc", "ops": "gsparc.ops", "callbacks": "gsparc.callbacks"}  # by folder
 # They ask for Sionna's solver, or for a cloud of a trained field.
 ELSEWHERE = ("gsparc.apps.view.ply",)
@@ -45,6 +47,39 @@ def checkpoints(tmp_path_factory):
     names = {"station_name": np.array(["roof-2", "roof-3"])}
     gsparc.fit(**degrees, **ends, **names, rssi=POWERS, model="gp", save=folder / "city.ckpt")
     return folder
+
+
+def words_of_code(tree: ast.AST) -> set[str]:
+    """Names, attributes, modules and texts of a file, but for its docstrings."""
+    described = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, DESCRIBED) and ast.get_docstring(node) is not None
+    }
+    words = []
+    for node in ast.walk(tree):
+        words += [
+            getattr(node, part, None) or "" for part in ("name", "arg", "id", "attr", "module", "asname")
+        ]
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in described:
+            words.append(node.value)
+    return set(re.findall(r"[A-Za-z_]\w*", " ".join(words)))
+
+
+def test_docstrings_named_functions_that_are_gone():
+    """`fit_factors`, `Behind` and `rows_of` were looked for in vain."""
+    files = [file for folder in PACKAGES for file in sorted((ROOT / folder).rglob("*.py"))]
+    trees = {file: ast.parse(file.read_text()) for file in files}
+    known = {file.stem for file in files}.union(*map(words_of_code, trees.values()))
+    for kind in ("conf/**/*.yaml", "gsparc/**/*.yaml", "gsparc/**/*.csv", "ops/**/*.h", "docs/**/*.md"):
+        known.update(*(re.findall(r"[A-Za-z_]\w*", file.read_text()) for file in ROOT.glob(kind)))
+    gone = []
+    for file, tree in trees.items():
+        for node in (one for one in ast.walk(tree) if isinstance(one, DESCRIBED)):
+            said = re.findall(r"`((?:[A-Za-z_]+\.)*[A-Za-z_]+)(?:\(\))?`", ast.get_docstring(node) or "")
+            ours = {name for name in said if not name.startswith("sionna.")} - OTHERS
+            gone += [f"{file.name}: {name}" for name in ours if not known.issuperset(name.split("."))]
+    assert not gone
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ class EffectRow:
     """One row of the table: errors when one effect is left out.
 
     Attributes:
-        effect: as in `removals`, or `rays > N`.
+        effect: as in `list_removals`, or `rays > N`.
         share: mean share of a receiver's power.
         share_p95: its 95th percentile over the receivers.
         error, error_p95: of the deliverable, median and 95th percentile.

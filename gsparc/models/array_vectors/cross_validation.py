@@ -58,7 +58,7 @@ def choose_kernel(
         images: (n, P) in [0, 1].
         matrix: (M, P) steering.
         wavelength: [m].
-        partner: of `mirror_elements`.
+        partner: of `index_mirror_elements`.
         seed: of the neighbourhood, the predicted samples and the pixels.
     """
     rng = np.random.default_rng([seed, 3])

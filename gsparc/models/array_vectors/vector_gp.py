@@ -100,7 +100,7 @@ def align_by_likelihood(
     Args:
         vectors: (n, M) complex, phases and twins unknown.
         positions: (n, 3) [m].
-        partner: of `mirror_elements`.
+        partner: of `index_mirror_elements`.
         kernel: length and noise.
     """
     inverse = Factor.from_gram(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
@@ -116,7 +116,7 @@ def align_to_nearest(
     Args:
         vectors, positions: (m, M) complex and (m, 3) [m], phases and twins unknown.
         known, places: (n, M) complex128 and (n, 3) [m], aligned.
-        partner: of `mirror_elements`.
+        partner: of `index_mirror_elements`.
     """
     near = known[cKDTree(places).query(positions)[1]]
     return np.stack([match_phase_and_twin(*pair, partner) for pair in zip(vectors, near, strict=True)])

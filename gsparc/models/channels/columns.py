@@ -302,7 +302,7 @@ def fit_run_factors(
 
 
 def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Return the negative log likelihood [nats] of what `fit_factors` says, scales profiled out."""
+    """Return the negative log likelihood [nats] of what `fit_run_factors` says, scales profiled out."""
     nll = 0.0
     for group, given in known:
         count, outputs = given.values.shape

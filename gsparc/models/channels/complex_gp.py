@@ -197,7 +197,7 @@ def _mean_square(channels: np.ndarray) -> np.ndarray:
 
 
 def _fit_factors(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """See `columns.fit_factors`; of a kernel of unit power."""
+    """See `fit_run_factors`; of a kernel of unit power."""
     gram = kernel.correlations(rows.places, rows.places)
     gram.diagonal().add_(kernel.noise)
     return fit_run_factors((rows,), [gram], runs)

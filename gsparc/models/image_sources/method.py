@@ -187,7 +187,7 @@ class ImageSourceGP(SourcesInFrame):
     def _log_look(
         self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: SourceScene
     ) -> None:
-        """Look at a search's scene by a batch of rows `group` (n,) that it left out; `Behind` ends it."""
+        """Look at a search's scene by a batch of rows `group` (n,) that it left out; `FellBehind` ends it."""
         # On a copy: `predict` reads the method's own processes, which are not found yet.
         mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.

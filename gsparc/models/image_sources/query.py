@@ -130,7 +130,7 @@ class EnsembleMeans:
         return torch.cat([self._gains_and_shares(part)[0] for part in queries.split(CHUNK)], 1)
 
     def _gains_and_shares(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Gains (K, m, R), see `Means.varying_correlations`, and visible shares (K, m)."""
+        """Gains (K, m, R), see `varying_correlations`, and visible shares (K, m)."""
         varying, seen = self.varying_correlations(part), self.visible_share(part)
         real = torch.baddbmm(self.level, varying, self.weights)
         gains = torch.view_as_complex(real.unflatten(2, (-1, 2)))
@@ -164,7 +164,7 @@ class RowVariance:
         self.across = across * torch.tensor([[1.0, -1.0], [-1.0, 1.0]])[..., None]
 
     def __call__(self, arriving: Tensor, varying: Tensor) -> tuple[Tensor, Tensor]:
-        """Variance and prior (m,) of visible waves (m, K) before phases; see `Means.varying_correlations`."""
+        """Variance and prior (m,) of visible waves (m, K) before phases; see `varying_correlations`."""
         here = torch.view_as_real(arriving * self.phasor)  # (m, K, 2)
         there = torch.addcmul(self.level, varying[:, :, None, self.place_of], self.there)  # (K, m, 2, n)
         # Real and imaginary parts of queries with those of rows, (m, 2, 2, n); those in quadrature are the

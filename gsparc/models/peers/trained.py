@@ -146,7 +146,7 @@ class TrainedPeer(Method):
         return max(round(own), 1)
 
     def describe_time_limit(self, site: Site, budget_s: float | None) -> str:
-        """See `MethodFactory.time_limit`; steps stand for the seconds."""
+        """See `MethodFactory.describe_time_limit`; steps stand for the seconds."""
         told = self.max_steps is None and site.kind in self.step_s
         steps = f"{self._steps_in_budget(site.kind)} steps, " if told else ""
         return f"{steps}about {self.budget_s:g} s of an idle processor"

@@ -35,7 +35,7 @@ class Form:
 
 
 def pack_form(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:
-    """Return the file's bytes; places are from `origin` (3,) [m], errors are those of `Compiled`."""
+    """Return the file's bytes; places are from `origin` (3,) [m], errors are those of `CompiledForm`."""
     numbers = np.array([form.kind, error, worst, *origin, *form.numbers], np.float64)
     arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
     at = HEAD.size + SECTION.size * len(arrays)
