@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
-from releases import real
+from releases import release
 
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.plausibility import find_level_steps, link_levels
@@ -124,7 +124,7 @@ def test_other_kinds_are_drawn_too(campaign, figures):
 
 @pytest.mark.parametrize("name", REAL)
 def test_real_campaigns_become_pictures(name, tmp_path):
-    data = load({"name": name, "file": str(real(f"real/{REAL[name]}.npz")), "max_rows": 400})
+    data = load({"name": name, "file": str(release(f"real/{REAL[name]}.npz")), "max_rows": 400})
     draw_site(data, tmp_path / "map.png", link_levels(data))
     with Image.open(tmp_path / "map.png") as picture:
         assert min(picture.size) > 300

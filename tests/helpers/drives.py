@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from releases import real
+from releases import release
 
 from gsparc.data.datasets.powder import read_powder
 
-STATIONS = ("ebc-nuc1-b210", "law73-nuc2-b210")
+STATIONS = ("ebc-nuc1-b210", "madsen-nuc2-b210")
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ def write_table(path: Path, heads: Iterable[str], rows: Iterable[Iterable[object
 
 
 def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
-    """Rows of the measured city at two stations; `held` of them are left for asking."""
-    arrays = read_powder(real("real/powder-rss-462mhz.npz")).arrays
+    """Rows of the city at two stations; `held` of them are left for asking."""
+    arrays = read_powder(release("real/powder-rss-462mhz.npz")).arrays
     names = list(map(str, arrays["station_name"]))
     chosen = [names.index(station) for station in STATIONS]
     level = arrays["rssi_db"][:, chosen].astype(np.float64)

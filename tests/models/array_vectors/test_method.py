@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
+from releases import real, release
 from torch.utils.benchmark import Timer
 
 from gsparc.data.datasets.rfid import planar_array
@@ -160,9 +161,9 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
 
 
 @pytest.mark.slow
-def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
+def test_level_with_the_gp_on_random_and_ahead_on_grouped(tmp_path):
     """Real spectra: paired differences to the image GP."""
-    data = load({"name": "rfid", "root": str(real_rfid)})
+    data = load({"name": "rfid", "root": str(real("rfid-s23-160"))})
     ahead = {}
     for name in ("random", "grouped"):
         split = split_for({"name": name}, data)
@@ -180,8 +181,8 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
-    data = load({"name": "rfid", "root": str(real_rfid)})
+def test_a_query_is_a_fraction_of_a_millisecond(tmp_path):
+    data = load({"name": "rfid", "root": str(release("rfid-s23-160"))})
     method = ArrayField()
     method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
     batch = data.batch(np.array([0]))

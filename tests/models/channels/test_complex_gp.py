@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from releases import REAL
+from releases import real
 from rooms import nmse, shoebox
 from scenes import error
 
@@ -16,8 +16,6 @@ from gsparc.models.run_factors import best_run_factors, factor_matrix
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
-
-CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 
 def _dense():
@@ -186,10 +184,9 @@ def test_channels_without_noise():
     assert error(method, data, rows[-1:]) < 0.1
 
 
-@pytest.mark.skipif(not CHANNELS.is_file(), reason="measured channels are not beside this checkout")
 def test_two_measured_runs_differ_by_one_phase():
     """Antenna 0: with its own factor the other run helps; without, it harms."""
-    with np.load(CHANNELS) as stored:
+    with np.load(real("real/techtile-csi-920mhz.npz")) as stored:
         used = np.flatnonzero(stored["mask"][:, 0])
         places, csi = stored["tx_position"][used], stored["csi"][used, 0]
         run = (stored["run"][used] == "EXP006").astype(np.int64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from closed import conditioned, fitted_to
-from releases import REAL
+from releases import real
 from rooms import WAVELENGTH, shoebox
 from scenes import answer_error, fold_of
 
@@ -303,12 +303,8 @@ def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
     assert ends.station.tolist() == [1, 0, NOBODY]
 
 
-CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
-
-
-@pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
 def test_measured_channels_in_squares():
-    data = Techtile(CHANNELS, runs=["EXP006"], stations=[5]).load()
+    data = Techtile(real("real/techtile-csi-920mhz.npz"), runs=["EXP006"], stations=[5]).load()
     fold = fold_of(data, name="blocks", side_m=0.6)
     field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
     plain = ComplexGP()

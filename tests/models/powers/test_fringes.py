@@ -5,7 +5,7 @@ import pytest
 import torch
 from closed import fitted_to, read_back
 from interference import WAVELENGTH, plane
-from releases import REAL
+from releases import real
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
@@ -13,8 +13,6 @@ from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.fringes import Blend, nearest_distances, resolves_wavelength
 from gsparc.models.powers.waves import field_db, fit_wave_weights, make_basis
 from gsparc.ops import Pose
-
-PLANE = REAL / "real" / "techtile-power-reci-rf-1.npz"
 
 
 def db(power: torch.Tensor) -> np.ndarray:
@@ -128,9 +126,7 @@ def test_a_blend_goes_from_rows_to_groups_to_nothing():
 
 @pytest.mark.slow
 def test_a_measured_plane():
-    if not PLANE.exists():
-        pytest.skip(f"{PLANE} is not there")
-    file = np.load(PLANE)
+    file = np.load(real("real/techtile-power-reci-rf-1.npz"))
     loud = np.flatnonzero(file["rssi_db"] > -75)
     chosen = np.random.default_rng(0).permutation(loud)[:1800]
     data = from_arrays(
