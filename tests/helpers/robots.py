@@ -36,7 +36,7 @@ def records(csi, tick, time, number, sender) -> bytes:
     rows["order"], rows["gain"], rows["rssi"] = (
         0b100100,
         40,
-        np.clip(np.round(84 - gain)[:, None] + [0, -40, -40], 0, 255),
+        np.clip(np.round(84 - gain)[:, None] + [0, -40, -40], 1, 255),  # 0 is no antenna,
     )
     scaled = csi / np.abs(csi).max(axis=1, keepdims=True) * 90
     parts = np.zeros((len(csi), 30, 6), np.int8)

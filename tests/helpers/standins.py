@@ -43,7 +43,7 @@ def _plane() -> dict[str, np.ndarray]:
 
 
 def _robot_runs() -> dict[str, np.ndarray]:
-    """Squares of channels of three transmitters and their roots, in five runs of 1 m in each of five patches."""
+    """Squared channels of three transmitters and their roots: five runs of 1 m in each of five patches."""
     rng, posts = np.random.default_rng(0), np.array([*LOS_SET_A.values()])
     starts = rng.uniform(-0.8, 0.8, (5, 1, 1, 2)) + rng.normal(0, 0.004, (5, 5, 1, 2))
     turned = rng.uniform(0, 2 * np.pi, (5, 1, 1)) + rng.normal(0, 0.005, (5, 5, 1))
@@ -61,7 +61,7 @@ def _robot_runs() -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-# A packet of a 43455c0 before its channel: Ethernet, IP, UDP, then Nexmon's mark and sender, channel 48, chip.
+# What precedes the channel in a packet of a 43455c0: Ethernet, IP, UDP, mark, sender, channel 48, chip.
 PACKET = (
     "ffffffffffff4e45584d4f4e08004500012e000100000111a4ab0a0a0a0affffffff"
     "157c157c011a000011111111{}c0a5000030d06500"
