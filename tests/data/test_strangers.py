@@ -138,8 +138,6 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_a_table_of_a_stranger(write, name):
     content, settings, says, silent = CASES[name]
-    if "stations_file" in settings:
-        settings = {"stations_file": write(settings["stations_file"], "sites.csv")}
     found = said(write(content), **settings)
     assert says in found and (not silent or silent not in found), found
 

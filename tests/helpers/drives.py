@@ -19,7 +19,6 @@ class Drive:
 
     Attributes:
         rows, sites, places: tables of measurements, of stations, and of places that are in no row.
-        degrees: (n, 2) latitude and longitude of `places` [deg].
         level_db: (n, T) measured there [dB].
         learned_db: (m, T) measured in `rows`.
     """
@@ -27,7 +26,6 @@ class Drive:
     rows: Path
     sites: Path
     places: Path
-    degrees: np.ndarray
     level_db: np.ndarray
     learned_db: np.ndarray
 
@@ -64,5 +62,5 @@ def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
         write_table(folder / "drive.csv", heads, table[~asked]),
         write_table(folder / "sites.csv", ["name", "lat", "lon", "height"], sites),
         write_table(folder / "places.csv", heads[:2], table[asked, :2]),
-        degrees[asked], level[asked], level[~asked],
+        level[asked], level[~asked],
     )  # fmt: skip

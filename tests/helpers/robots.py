@@ -7,6 +7,7 @@ import numpy as np
 
 from gsparc.data.datasets.wsr import CARRIER_HZ, LOS_SET_A, RECORD, SPACING_HZ, TONES, remove_delay_slope
 
+RUN = "2021-06-27_202550"  # of the release, of which pieces are beside this checkout
 FREQUENCY = CARRIER_HZ + SPACING_HZ * TONES
 WALL = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1]])  # the transmitter, and its images in two walls
 GAIN = np.array([1, 0.5, 0.35])

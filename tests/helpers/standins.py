@@ -5,20 +5,10 @@ from pathlib import Path
 
 import numpy as np
 from measured import CAMPUS, DEGREES, ble_arrays, powder_arrays, techtile_arrays
-from robots import FREQUENCY, drive, true_root
+from robots import FREQUENCY, RUN, drive, true_root
 
 from gsparc.data.datasets.wsr import LOS_SET_A
 from gsparc.simulate.rfid_sim import write_rfid_sim
-
-ROBOT = "2021-06-27_202550"
-
-
-def make(path: Path, name: str) -> Path:
-    """The stand-in of a release called `name`, at `path`."""
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        MAKERS[name](path)
-    return path
 
 
 def _city() -> dict[str, np.ndarray]:
@@ -89,7 +79,7 @@ def _corridor(folder: Path) -> None:
 MAKERS = {
     "rfid-s23-160": lambda path: write_rfid_sim(path, 160, seed=0),
     "nexmon": _corridor,
-    f"releases/wsr/csi_rx_{ROBOT}.dat": lambda path: drive(path.parent, ROBOT, packets=150),
+    f"releases/wsr/csi_rx_{RUN}.dat": lambda path: drive(path.parent, RUN, packets=150),
     "ofdm/wsr-los-a.npz": lambda path: np.savez(path, **_robot_runs()),
     "ofdm/wsr-nlos-a.npz": lambda path: np.savez(path, **_robot_runs()),
     "real/techtile-csi-920mhz.npz": lambda path: np.savez(path, **techtile_arrays()),

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from releases import release
+from robots import RUN
 
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.wifi_csi import read_wifi_csi
@@ -14,7 +15,6 @@ from gsparc.data.datasets.wsr import RECORD, SPACING_HZ, TONES, read_log
 from gsparc.data.load import load
 
 csiread = pytest.importorskip("csiread")
-RUN = "2021-06-27_202550"
 CARRIER = 5.54e9
 
 

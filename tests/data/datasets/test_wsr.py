@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from releases import real, release
-from robots import drive, true_root
+from robots import RUN, drive, true_root
 
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.wsr import (
@@ -16,8 +16,6 @@ from gsparc.data.datasets.wsr import (
     read_wsr,
 )
 from gsparc.data.load import load
-
-RUN = "2021-06-27_202550"
 
 
 def unexplained(found: np.ndarray, truth: np.ndarray) -> float:

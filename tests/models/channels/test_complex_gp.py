@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from releases import real
 from rooms import nmse, shoebox
 from scenes import error
 
@@ -182,18 +181,3 @@ def test_channels_without_noise():
     rows = np.arange(120)
     method, _ = _fit(data, Fold(rows[:-1], rows[:0], rows[-1:]))
     assert error(method, data, rows[-1:]) < 0.1
-
-
-def test_two_measured_runs_differ_by_one_phase():
-    """Antenna 0: with its own factor the other run helps; without, it harms."""
-    with np.load(real("real/techtile-csi-920mhz.npz")) as stored:
-        used = np.flatnonzero(stored["mask"][:, 0])
-        places, csi = stored["tx_position"][used], stored["csi"][used, 0]
-        run = (stored["run"][used] == "EXP006").astype(np.int64)
-        still, tone = stored["rx_antenna_position"][0], stored["frequency_hz"].reshape(1)
-    arrays = {"tx_position": places, "rx_position": still, "csi": csi, "frequency_hz": tone}
-    data = from_arrays(arrays, {"name": "ceiling"})
-    drawn = np.random.default_rng(0).permutation(np.flatnonzero(run == 0))
-    fold = Fold(np.setdiff1d(np.arange(len(run)), drawn[:150]), drawn[:0], drawn[:150])
-    errors = [error(_fit(replace(data, run=known), fold)[0], data, fold.test) for known in (run, None)]
-    assert errors[0] < 0.35 and errors[0] < 0.95 * errors[1], errors
