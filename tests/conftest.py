@@ -9,6 +9,7 @@ import gc
 import os
 import re
 import shutil
+import signal
 from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -47,6 +48,7 @@ def _short_trainings_end_at_once(tmp_path_factory):
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1, "blas")  # as every command has it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's job in the background ignores it
     if kernels := os.environ.get("GSPARC_TEST_KERNELS"):
         from gsparc.ops import _native
 

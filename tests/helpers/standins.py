@@ -86,5 +86,4 @@ MAKERS = {
     "real/techtile-power-reci-rf-1.npz": lambda path: np.savez(path, **_plane()),
     "real/powder-rss-462mhz.npz": lambda path: np.savez(path, **_city()),
     "real/ble-hall-1.npz": lambda path: np.savez(path, **ble_arrays()),
-    "real/ble-hall-2.npz": lambda path: np.savez(path, **ble_arrays()),
 }

@@ -218,7 +218,7 @@ def test_powder_is_links_on_the_earth(tmp_path, form):
 
 
 MEASURED = {
-    "techtile-csi-920mhz": "techtile", "ble-hall-1": "ble", "ble-hall-2": "ble", "techtile-power-reci-rf-1": None,
+    "techtile-csi-920mhz": "techtile", "ble-hall-1": "ble", "techtile-power-reci-rf-1": None,
 }  # fmt: skip
 
 
@@ -242,7 +242,7 @@ def test_own_names_the_campaign_of_a_file(tmp_path):
 
 def test_units_of_a_converted_file_were_not_looked_at(tmp_path, refused):
     """Under their names in the file, which are not the schema's."""
-    with np.load(release("real/ble-hall-2.npz")) as stored:
+    with np.load(release("real/ble-hall-1.npz")) as stored:
         write_raw(tmp_path / "hall.npz", Raw(dict(stored), {}, {"mobile_position": "mm"}))
     refused(
         "tx_position: units are 'mm'; expected 'm'", lambda path: read_any(path).data, tmp_path / "hall.npz"
