@@ -9,9 +9,9 @@ import gc
 import os
 import re
 import shutil
+import signal
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -34,23 +34,21 @@ def pytest_collection_finish():
 
 def pytest_terminal_summary(terminalreporter):
     """Skipped tests by their reasons, in one line; measured data that are not there are one reason."""
+    own = r"^Skipped: |(?<=measured data not beside this checkout).*"
     skipped = [report.longrepr[2] for report in terminalreporter.stats.get("skipped", [])]
-    absent = re.compile(r"shared/data|beside this checkout")
-    reasons = Counter(
-        "measured data not beside this checkout" if absent.search(why) else why.removeprefix("Skipped: ")
-        for why in skipped
-    )
+    reasons = Counter(re.sub(own, "", why) for why in skipped)
     if reasons:
         counted = "; ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         terminalreporter.write_line(f"{reasons.total()} skipped: {counted}")
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _short_trainings_end_at_once():
+def _short_trainings_end_at_once(tmp_path_factory):
     import quick
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1, "blas")  # as every command has it
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's job in the background ignores it
     if kernels := os.environ.get("GSPARC_TEST_KERNELS"):
         from gsparc.ops import _native
 
@@ -58,23 +56,8 @@ def _short_trainings_end_at_once():
     with pytest.MonkeyPatch.context() as patch:
         for one in (quick.compose_once, quick.look_once, quick.time_and_draw_less):
             one(patch)
+        patch.setenv("GSPARC_STAND_INS", str(tmp_path_factory.mktemp("stand-ins")))
         yield
-
-
-@pytest.fixture(scope="session")
-def real_rfid() -> Path:
-    """Folder of the real subset."""
-    from releases import real
-
-    return real("rfid-s23-160")
-
-
-@pytest.fixture(scope="session")
-def real_newrf() -> Path:
-    """File of the conference room."""
-    from releases import real
-
-    return real("newrf-conference.npz")
 
 
 @pytest.fixture(scope="session")

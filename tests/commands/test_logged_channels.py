@@ -8,8 +8,6 @@ import pytest
 import gsparc
 from gsparc.commands.train import train
 
-pytestmark = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")
-
 
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory):

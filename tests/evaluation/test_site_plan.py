@@ -3,20 +3,12 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
-from releases import real
 
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.plausibility import find_level_steps, link_levels
-from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan
 from gsparc.evaluation.site_plan import draw_site, find_spots
-
-REAL = {
-    "techtile": "techtile-csi-920mhz", "powder": "powder-rss-462mhz", "ble": "ble-hall-1",
-    "own": "techtile-power-reci-rf-1",
-}  # fmt: skip
 
 
 def scattered(count=80):
@@ -120,11 +112,3 @@ def test_other_kinds_are_drawn_too(campaign, figures):
     assert "transmitter" in said and "receiver" in said and "mean channel power [dB]" in said
     line = {"rx_position": np.arange(30.0)[:, None] * [1, 0, 0], "rssi_db": np.arange(30.0)}
     assert "30 powers at 30 places" in shown(from_arrays(line), figures)[1]
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_real_campaigns_become_pictures(name, tmp_path):
-    data = load({"name": name, "file": str(real(f"real/{REAL[name]}.npz")), "max_rows": 400})
-    draw_site(data, tmp_path / "map.png", link_levels(data))
-    with Image.open(tmp_path / "map.png") as picture:
-        assert min(picture.size) > 300

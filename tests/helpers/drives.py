@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from releases import real
+from releases import release
 
 from gsparc.data.datasets.powder import read_powder
 
-STATIONS = ("ebc-nuc1-b210", "law73-nuc2-b210")
+STATIONS = ("ebc-nuc1-b210", "madsen-nuc2-b210")
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,6 @@ class Drive:
 
     Attributes:
         rows, sites, places: tables of measurements, of stations, and of places that are in no row.
-        degrees: (n, 2) latitude and longitude of `places` [deg].
         level_db: (n, T) measured there [dB].
         learned_db: (m, T) measured in `rows`.
     """
@@ -27,7 +26,6 @@ class Drive:
     rows: Path
     sites: Path
     places: Path
-    degrees: np.ndarray
     level_db: np.ndarray
     learned_db: np.ndarray
 
@@ -42,8 +40,8 @@ def write_table(path: Path, heads: Iterable[str], rows: Iterable[Iterable[object
 
 
 def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
-    """Rows of the measured city at two stations; `held` of them are left for asking."""
-    arrays = read_powder(real("real/powder-rss-462mhz.npz")).arrays
+    """Rows of the city at two stations; `held` of them are left for asking."""
+    arrays = read_powder(release("real/powder-rss-462mhz.npz")).arrays
     names = list(map(str, arrays["station_name"]))
     chosen = [names.index(station) for station in STATIONS]
     level = arrays["rssi_db"][:, chosen].astype(np.float64)
@@ -64,5 +62,5 @@ def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
         write_table(folder / "drive.csv", heads, table[~asked]),
         write_table(folder / "sites.csv", ["name", "lat", "lon", "height"], sites),
         write_table(folder / "places.csv", heads[:2], table[asked, :2]),
-        degrees[asked], level[asked], level[~asked],
+        level[asked], level[~asked],
     )  # fmt: skip

@@ -99,10 +99,10 @@ def metres_of(degrees: np.ndarray) -> np.ndarray:
     return np.stack([84_313.2 * east, 110_574.0 * north], axis=-1)
 
 
-def powder_arrays() -> dict[str, np.ndarray]:
-    """A walk of twenty places heard by three stations, as in the npz; two links were not heard."""
-    rng = np.random.default_rng(0)
-    walk = CAMPUS + np.cumsum(rng.normal(0, 3e-4, (20, 2)), axis=0)
+def powder_arrays(walk: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """A walk (of twenty places) heard by three stations, as in the npz; two links were not heard."""
+    if walk is None:
+        walk = CAMPUS + np.cumsum(np.random.default_rng(0).normal(0, 3e-4, (20, 2)), axis=0)
     distance = np.linalg.norm(metres_of(walk)[:, None] - metres_of(DEGREES), axis=-1)
     rssi = (-20 - 25 * np.log10(distance)).astype(np.float32)
     rssi[[3, 7], [0, 2]] = np.nan

@@ -1,15 +1,13 @@
-"""Channels as Wi-Fi cards log them: measured ones of a robot's runs, each row with factors of its own."""
-
-from pathlib import Path
+"""Channels as Wi-Fi cards log them: those of a robot's runs, each row with factors of its own."""
 
 import numpy as np
+from releases import release
 
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 
-FOLDER = Path(__file__).parents[3] / "shared/data/ofdm"
 RUNS = 5
 
 
@@ -17,7 +15,7 @@ def robot(
     transmitter: int = 0, first: int = 0, layout: str = "los"
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Places (n, 3) [m], frequencies, the transmitter's place; channels (n, 30), coherent within runs."""
-    released = np.load(FOLDER / f"wsr-{layout}-a.npz")
+    released = np.load(release(f"ofdm/wsr-{layout}-a.npz"))
     channel = released["root_sign"] * np.sqrt(released["h2"])
     good = released["good"] & (released["tx_index"] == transmitter) & (channel != 0).all(1)
     runs = np.unique(released["run"][good])[first : first + RUNS]

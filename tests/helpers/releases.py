@@ -2,6 +2,7 @@
 # ruff: noqa: E501 (a case is a row of a table)
 
 import io
+import os
 import shutil
 from pathlib import Path
 
@@ -11,14 +12,27 @@ from PIL import Image
 
 from gsparc.data.datasets.rfid import HEIGHT, WIDTH
 
-REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
+REAL = Path(os.environ.get("GSPARC_MEASURED", Path(__file__).resolve().parents[3] / "shared" / "data"))
 
 
 def real(name: str) -> Path:
-    """A file or folder of real data; the test is skipped, loudly, where it is not."""
+    """A measured file or folder, of which a test claims a figure; it is skipped, loudly, where there is none."""
     path = REAL / name
     if not path.exists():
-        pytest.skip(f"real data not found at {path}")
+        pytest.skip(f"measured data not beside this checkout: {path}")
+    return path
+
+
+def release(name: str) -> Path:
+    """A measured file or folder, or a simulated one of the same layout where there is none."""
+    if (path := REAL / name).exists():
+        return path
+    from standins import MAKERS  # here, as it imports simulators
+
+    path = Path(os.environ["GSPARC_STAND_INS"]) / name
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        MAKERS[name](path)
     return path
 
 

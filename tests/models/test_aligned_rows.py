@@ -17,8 +17,6 @@ from gsparc.physics import row_factors
 from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext
 
-pytestmark = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")
-
 
 @pytest.fixture(scope="module")
 def logged():

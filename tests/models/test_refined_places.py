@@ -7,18 +7,15 @@ import numpy as np
 import pytest
 import torch
 from kinds import KINDS
-from releases import real
 from scenes import fold_of
 
-from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.own import from_arrays
-from gsparc.data.row_order import content_order, order_rows
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import wrap_per_station
-from gsparc.models.refined_places import Linearised, estimate_place_errors, move_rows, refine_places
+from gsparc.models.refined_places import Linearised, estimate_place_errors, move_rows
 from gsparc.training.context import FitContext
 
 BRIEF = FitContext(effort=0.1)
@@ -140,18 +137,3 @@ def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):
 def test_a_setting_that_is_no_length_is_refused(wrong):
     with pytest.raises(ValueError, match=r"position_std=.*a number of at least 0, or null is needed"):
         Gsparc(position_std=wrong)
-
-
-def test_places_come_nearer_to_the_truth_in_techtile():
-    """Three centimetres of 326 mm, one antenna of 42: rows left out say where some of it is."""
-    data = Techtile(real("real/techtile-csi-920mhz.npz"), stations=[0], runs=["EXP005"]).load()
-    rows = np.arange(0, len(data), 4)
-    error = np.random.default_rng(0).normal(scale=0.03, size=(len(rows), 3))
-    every = np.zeros((len(data), 3))
-    every[rows] = error
-    order = content_order(moved := move_rows(data, rows, error))
-    ordered, fold = order_rows(moved, Fold(rows[:-20], rows[-20:], rows[:0]))  # as a method gets them
-    method, _ = _fitted(ordered, fold)
-    found, by, said = refine_places(method, ordered, np.full(len(data), 0.03))
-    assert np.array_equal(np.sort(order[found]), rows) and "refined by" in said
-    assert np.square(every[order[found]] + by)[:, :2].mean() < 0.9 * np.square(error)[:, :2].mean()

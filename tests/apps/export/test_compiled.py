@@ -17,6 +17,7 @@ import field_files
 import numpy as np
 import pytest
 import torch
+from releases import release
 
 import gsparc
 from gsparc.apps.export.compiled import make
@@ -71,12 +72,12 @@ def of_images(model, **settings):
     return gsparc.fit(rx=rx, tx=tx, spectrum=lobes, model=model, settings=settings)
 
 
-def of_a_real_array(real, folder):
-    """The release's 160 spectra; with the averaged process the form is distilled."""
+def of_an_array(folder):
+    """Spectra of the release; with the averaged process the form is distilled."""
     settings = (
         "model.effects.residual=false",
         "dataset=rfid",
-        f"dataset.root={real}",
+        f"dataset.root={release('rfid-s23-160')}",
         "model=gsparc",
         "baselines=[]",
         "logger=none",
@@ -159,12 +160,11 @@ MODELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
-def test_the_library_answers_as_the_model(name, library, example, tmp_path, monkeypatch, request):
+def test_the_library_answers_as_the_model(name, library, example, tmp_path, monkeypatch):
     """At random places to 1e-5 of the scale, with variance and unknown share where these are exact."""
     monkeypatch.setattr(powers, "MOST_ROWS", 500 if name == "powers, the nearest" else 6000)
     torch.set_num_threads(1)
-    real = None if MODELS[name] else request.getfixturevalue("real_rfid")
-    predictor = MODELS[name]() if MODELS[name] else of_a_real_array(real, tmp_path)
+    predictor = MODELS[name]() if MODELS[name] else of_an_array(tmp_path)
     site, found = predictor.site, make.compile_model(predictor)
     assert (found.error > 0) == ("distilled" in name), found.summary
     path = tmp_path / "field.gsparc"

@@ -12,10 +12,7 @@ from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 
-measured = pytest.mark.skipif(not packets.FOLDER.exists(), reason="../shared/data is not here")
 
-
-@measured
 @pytest.mark.parametrize("layout", ["los", "nlos"])
 @pytest.mark.parametrize("labelled", [True, False])
 def test_packets_of_a_robot_are_told_with_and_without_its_runs(layout, labelled):

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from releases import real
 
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 
-DATA = Path(__file__).parents[4] / "shared" / "data"
 LIGHT = 299_792_458.0
 ROWS = 200
 
@@ -156,17 +156,11 @@ def test_offsets_beside_a_carrier_were_refused():
         from_arrays(clean | {"frequency_hz": clean["frequency_hz"] / 1e6, "carrier_hz": np.array(2.44e9)})
 
 
-@pytest.mark.skipif(not (DATA / "real").is_dir(), reason="no shared/data/real")
-def test_real_channels_are_sound_and_conjugated_ones_are_not():
-    path = DATA / "real" / "techtile-csi-920mhz.npz"
-    assert convention_warnings(read_any(path).data) == []
+def test_real_files_are_sound_and_conjugated_channels_are_not():
+    path = real("real/techtile-csi-920mhz.npz")
+    for each in (path, real("newrf-conference.npz"), real("rfid-s23-160")):
+        assert convention_warnings(read_any(each).data) == []
     arrays = dict(np.load(path))
     arrays["station_position"] = arrays.pop("rx_antenna_position")
     wrong = from_arrays(arrays | {"csi": arrays["csi"].conj()})
     assert settings(convention_warnings(wrong)) == ["conjugate"]
-
-
-@pytest.mark.skipif(not (DATA / "rfid-s23-160").is_dir(), reason="no shared/data/rfid-s23-160")
-def test_real_spectra_are_sound():
-    assert convention_warnings(read_any(DATA / "rfid-s23-160").data) == []
-    assert convention_warnings(read_any(DATA / "newrf-conference.npz").data) == []

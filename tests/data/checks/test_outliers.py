@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
-from releases import real
+from releases import release
 
 from gsparc.commands.check import main as check
 from gsparc.data.checks.outliers import find_outliers, find_strong_outliers, too_far
@@ -128,5 +128,5 @@ def test_a_robot_that_waits_makes_no_outliers():
 
 def test_passing_a_station_is_no_outlier():
     """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
-    for column in arrays_of(real("real/powder-rss-462mhz.npz"))["rssi_db"].T:
+    for column in arrays_of(release("real/powder-rss-462mhz.npz"))["rssi_db"].T:
         assert not find_strong_outliers(10 ** (column[np.isfinite(column)] / 20)).any()

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from releases import real
 
 from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
 from gsparc.data.errors import DataError
@@ -106,18 +105,6 @@ def test_columns_are_those_of_another_campaign():
     assert np.isnan(rows.level[:, 1]).all() and rows.level.dtype == np.float32
     with pytest.raises(DataError, match="no access point of"):
         rows.select_access_points(np.array(["y"]))
-
-
-@pytest.mark.parametrize(
-    ("name", "how", "count"),
-    [("locate/rss-lib1.npz", "released", 3120), ("locate/wifine-floor4.npz", "walks", 520),
-     ("change/library-months.npz", "later", 5656), ("change/garage-rounds.npz", "later", 6800)],
-)  # fmt: skip
-def test_files_of_the_campaigns(name, how, count):
-    rows = read_fingerprints(real(name))
-    train, test = split_fingerprints(rows, how)
-    assert np.isfinite(rows.level).any(1).mean() > 0.99
-    assert len(train) + len(test) == len(rows.level) and len(test) == count
 
 
 def test_unknown_places_are_read_where_allowed(tmp_path):

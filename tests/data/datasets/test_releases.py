@@ -23,8 +23,8 @@ from gsparc.data.pickles import FRAMES, read_pickle
 ROOM = "releases/newrf/dataset_conference_ch1_rt_image_fc.pkl"
 
 
-def test_newrf_room_is_what_was_converted_from_it(real_newrf):
-    released, converted = read_newrf(real(ROOM)).arrays, read_newrf(real_newrf).arrays
+def test_newrf_room_is_what_was_converted_from_it():
+    released, converted = read_newrf(real(ROOM)).arrays, read_newrf(real("newrf-conference.npz")).arrays
     assert len(released["csi"]) == 433
     for name in set(converted) - {"split_train", "split_test"}:
         assert np.abs(released[name].astype(complex) - converted[name]).max() <= 1e-6, name
@@ -236,23 +236,24 @@ def test_techtile_power_of_other_objects(tmp_path, refused):
     refused("expected one \\*_positions.npy", read_techtile_power, tmp_path)
 
 
-def test_rfid_list_of_our_tables_is_out_of_the_200(real_rfid, tmp_path):
+def test_rfid_list_of_our_tables_is_out_of_the_200(tmp_path):
     """Of the 200 only the 160 are here: where the others would lie, copies stand for them."""
     import csv
     from importlib.resources import files
     from shutil import copy
 
-    ours = load_rfid(real_rfid)
+    root = real("rfid-s23-160")
+    ours = load_rfid(root)
     rows = list(csv.DictReader(files("gsparc.data.public").joinpath("rfid-160.csv").read_text().splitlines()))
     (tmp_path / "spectrum").mkdir()
     number = {int(row["spectrum"]): i + 1 for i, row in enumerate(rows)}
-    lines = (real_rfid / "tx_pos.csv").read_text().splitlines()
+    lines = (root / "tx_pos.csv").read_text().splitlines()
     for i in range(1, 201):
-        copy(real_rfid / f"spectrum/{number.get(i, 1):05d}.png", tmp_path / f"spectrum/{i:05d}.png")
+        copy(root / f"spectrum/{number.get(i, 1):05d}.png", tmp_path / f"spectrum/{i:05d}.png")
     (tmp_path / "tx_pos.csv").write_text(
         "\n".join(["x,y,z", *(lines[number.get(i, 1)] for i in range(1, 201))])
     )
-    copy(real_rfid / "gateway_info.yml", tmp_path)
+    copy(root / "gateway_info.yml", tmp_path)
     listed = load({"name": "rfid", "root": str(tmp_path), "listed": 160})
     assert np.array_equal(listed.target, ours.target) and np.array_equal(listed.moving, ours.moving)
     assert all(map(np.array_equal, listed.release_split, ours.release_split))

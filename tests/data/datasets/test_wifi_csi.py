@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from releases import real
+from releases import release
+from robots import RUN
 
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.wifi_csi import read_wifi_csi
@@ -14,7 +15,6 @@ from gsparc.data.datasets.wsr import RECORD, SPACING_HZ, TONES, read_log
 from gsparc.data.load import load
 
 csiread = pytest.importorskip("csiread")
-RUN = "2021-06-27_202550"
 CARRIER = 5.54e9
 
 
@@ -22,7 +22,7 @@ CARRIER = 5.54e9
 def robot(tmp_path) -> Path:
     """A log of an Intel 5300 with senders and the computer's time, and the way of the robot that wrote it."""
     (tmp_path / "way.csv").write_text("time_s,x,y,z\n1624839900,0,0,1\n1624839960,6,0,1\n")
-    content = real(f"releases/wsr/csi_rx_{RUN}.dat").read_bytes()
+    content = release(f"releases/wsr/csi_rx_{RUN}.dat").read_bytes()
     (tmp_path / "rx.dat").write_bytes(content)
     return tmp_path / "rx.dat"
 
@@ -37,7 +37,7 @@ def standard(content: bytes) -> bytes:
 
 def test_a_folder_of_nexmon_with_its_places(caplog):
     caplog.set_level(logging.INFO)
-    folder = real("nexmon")
+    folder = release("nexmon")
     raw = read_wifi_csi(folder).arrays
     tone = (raw["frequency_hz"] - 5.24e9) / SPACING_HZ
     assert tone.tolist() == [*range(-26, 0), *range(1, 27)]
@@ -50,21 +50,23 @@ def test_a_folder_of_nexmon_with_its_places(caplog):
     level = 10 * np.log10(np.mean(np.abs(raw["csi"][:, 0]) ** 2, axis=1))
     assert np.allclose(level[[0, 12]], [-50, -49], atol=1e-3)
     data = load({"name": "wifi_csi", "file": str(folder)})
-    assert data.target.shape == (624, 1, 52) and len(np.unique(data.place)) == 52
+    logs = len(list(folder.glob("*.pcap")))
+    assert data.target.shape == (12 * logs, 1, 52) and len(np.unique(data.place)) == logs
     assert np.isnan(data.site.stations.position).all() and len(data.site.stations) == 2
     assert data.site.level_unit == "dBm"
 
 
 def test_tones_of_channels_from_a_transmitter_at_an_unknown_place_were_said_to_be_zero(caplog):
-    notes = " ".join(read_any(real("nexmon")).notes)
-    load({"name": "wifi_csi", "file": str(real("nexmon"))})
+    notes = " ".join(read_any(release("nexmon")).notes)
+    load({"name": "wifi_csi", "file": str(release("nexmon"))})
     assert "dataset=wifi_csi" in notes and "are 0 in all rows" not in caplog.text
 
 
 def test_packets_of_an_intel_5300_along_a_track(robot):
     log = read_log(robot)
     settings = {"places": robot.with_name("way.csv"), "carrier_hz": CARRIER}
-    raw = read_wifi_csi(robot, transmitters={"00:21:6a:30:d2:3c": (1, 2, 3)}, **settings).arrays
+    sender = ":".join(f"{part:02x}" for part in log.sender[0].tobytes())
+    raw = read_wifi_csi(robot, transmitters={sender: (1, 2, 3)}, **settings).arrays
     assert np.allclose(raw["frequency_hz"], CARRIER + SPACING_HZ * TONES)
     assert np.allclose(raw["rx_position"][:, 0], (log.time - 1624839900) / 10)
     assert np.allclose(raw["csi"], log.csi.swapaxes(1, 2)) and len(raw["station_name"]) == 3

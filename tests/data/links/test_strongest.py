@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from networks import network
-from releases import real
+from releases import release
 
 from gsparc.data.checks.plausibility import floor_warnings, link_levels, sanity_warnings
 from gsparc.data.datasets.powder import read_powder
@@ -103,7 +103,7 @@ def test_silent_cells_of_a_wide_table_were_lost():
 
 
 def test_outages_are_no_lists():
-    raw = read_powder(real("real/powder-rss-462mhz.npz"))
+    raw = read_powder(release("real/powder-rss-462mhz.npz"))
     assert interpret(raw, "powder").data.censored is None
 
 

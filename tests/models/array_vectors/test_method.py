@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
-from torch.utils.benchmark import Timer
+from releases import real
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load, split_for
@@ -160,9 +160,9 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
 
 
 @pytest.mark.slow
-def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
+def test_level_with_the_gp_on_random_and_ahead_on_grouped(tmp_path):
     """Real spectra: paired differences to the image GP."""
-    data = load({"name": "rfid", "root": str(real_rfid)})
+    data = load({"name": "rfid", "root": str(real("rfid-s23-160"))})
     ahead = {}
     for name in ("random", "grouped"):
         split = split_for({"name": name}, data)
@@ -177,13 +177,3 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
         ]
     assert ahead["random"][0] > 0 and ahead["random"][1] > 0
     assert ahead["grouped"][0] > 0.01 and ahead["grouped"][1] > 0.2
-
-
-@pytest.mark.slow
-def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
-    data = load({"name": "rfid", "root": str(real_rfid)})
-    method = ArrayField()
-    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
-    batch = data.batch(np.array([0]))
-    timer = Timer("method.predict(batch)", globals={"method": method, "batch": batch})
-    assert timer.blocked_autorange(min_run_time=0.3).median < 1e-3

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, room_vectors, spectra, walk
+from releases import release
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
@@ -127,8 +128,8 @@ def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     assert "1 spectrum cannot come from this array" in caplog.text
 
 
-def test_real_spectra_are_sixteen_complex_numbers(real_rfid):
-    data = load({"name": "rfid", "root": str(real_rfid)})
+def test_real_spectra_are_sixteen_complex_numbers():
+    data = load({"name": "rfid", "root": str(release("rfid-s23-160"))})
     rows = np.arange(40, 80)
     found = recover_vectors(data.site, data.target[rows], data.tx[rows])
     assert np.median(found.residual) < 1e-3 and not found.is_suspect.any()

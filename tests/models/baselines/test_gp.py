@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from releases import real
 from sklearn.decomposition import PCA
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
@@ -74,8 +75,8 @@ def test_few_components_say_so(campaign, folds, tmp_path):
         GaussianProcess(components=0)
 
 
-def test_metric_formats_on_the_real_subset(real_rfid, tmp_path):
-    data = load({"name": "rfid", "root": str(real_rfid)})
+def test_metric_formats_on_the_real_subset(tmp_path):
+    data = load({"name": "rfid", "root": str(real("rfid-s23-160"))})
     split = split_for({"name": "random"}, data)
     gp = GaussianProcess()
     gp.fit(data, split.folds[0], FitContext(tmp_path))

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from releases import REAL
 from rooms import nmse, shoebox
 from scenes import error
 
@@ -16,8 +15,6 @@ from gsparc.models.run_factors import best_run_factors, factor_matrix
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
-
-CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
 
 
 def _dense():
@@ -184,19 +181,3 @@ def test_channels_without_noise():
     rows = np.arange(120)
     method, _ = _fit(data, Fold(rows[:-1], rows[:0], rows[-1:]))
     assert error(method, data, rows[-1:]) < 0.1
-
-
-@pytest.mark.skipif(not CHANNELS.is_file(), reason="measured channels are not beside this checkout")
-def test_two_measured_runs_differ_by_one_phase():
-    """Antenna 0: with its own factor the other run helps; without, it harms."""
-    with np.load(CHANNELS) as stored:
-        used = np.flatnonzero(stored["mask"][:, 0])
-        places, csi = stored["tx_position"][used], stored["csi"][used, 0]
-        run = (stored["run"][used] == "EXP006").astype(np.int64)
-        still, tone = stored["rx_antenna_position"][0], stored["frequency_hz"].reshape(1)
-    arrays = {"tx_position": places, "rx_position": still, "csi": csi, "frequency_hz": tone}
-    data = from_arrays(arrays, {"name": "ceiling"})
-    drawn = np.random.default_rng(0).permutation(np.flatnonzero(run == 0))
-    fold = Fold(np.setdiff1d(np.arange(len(run)), drawn[:150]), drawn[:0], drawn[:150])
-    errors = [error(_fit(replace(data, run=known), fold)[0], data, fold.test) for known in (run, None)]
-    assert errors[0] < 0.35 and errors[0] < 0.95 * errors[1], errors

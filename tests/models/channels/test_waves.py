@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 from closed import conditioned, fitted_to
-from releases import REAL
 from rooms import WAVELENGTH, shoebox
-from scenes import answer_error, fold_of
+from scenes import answer_error
 
-from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Stations
 from gsparc.data.splits import Fold
@@ -301,16 +299,3 @@ def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
     asked = torch.from_numpy(np.concatenate([here[::-1], here[:1] + 1]))
     ends = query_ends(site, asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
     assert ends.station.tolist() == [1, 0, NOBODY]
-
-
-CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
-
-
-@pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
-def test_measured_channels_in_squares():
-    data = Techtile(CHANNELS, runs=["EXP006"], stations=[5]).load()
-    fold = fold_of(data, name="blocks", side_m=0.6)
-    field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
-    plain = ComplexGP()
-    plain.fit(data, fold, FitContext())
-    assert answer_error(field, data, fold.test) < 0.8 * answer_error(plain, data, fold.test)

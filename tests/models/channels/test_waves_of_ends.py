@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from closed import conditioned, fitted_to
-from releases import REAL
+from releases import real
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
@@ -163,15 +163,13 @@ def test_methods_of_one_end_are_refused_as_before():
         method.fit(data, fold, FitContext(stations="together"))
 
 
-CHANNELS = REAL / "real" / "techtile-csi-920mhz.npz"
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
 def test_measured_ceiling_in_squares():
     from gsparc.data.datasets.techtile import Techtile
 
-    data = Techtile(CHANNELS, runs=["EXP006"], stations=list(range(0, 42, 4))).load()
+    data = Techtile(
+        real("real/techtile-csi-920mhz.npz"), runs=["EXP006"], stations=list(range(0, 42, 4))
+    ).load()
     fold = fold_of(data, name="blocks", side_m=0.6)
     field, _ = fitted_to(ChannelField(), data, np.concatenate([fold.train, fold.val]))
     plain = wrap_per_station(ComplexGP(), data)

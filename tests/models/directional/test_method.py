@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from releases import REAL
+from releases import real
 from rooms import directed
 from scenes import error
 
@@ -25,8 +25,6 @@ from gsparc.models.mixture.methods import ImageSources
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.kernel import matern32_of_squares
 from gsparc.training.context import FitContext
-
-ROOM = REAL / "newrf-conference.npz"
 
 
 def fitted(data, fold, **settings):
@@ -240,9 +238,7 @@ def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
 
 def test_the_conference_room_from_43_receivers():
     """A search finds nothing there: NMSE 1.1; a network along the rays leaves 0.17."""
-    if not ROOM.exists():
-        pytest.skip(f"real data not found at {ROOM}")
-    data = load({"name": "newrf", "file": str(ROOM)})
+    data = load({"name": "newrf", "file": str(real("newrf-conference.npz"))})
     fold = make_split(data.moving, SplitSettings(name="sparse")).folds[0]
     method, _ = fitted(data, fold)
     assert len(fold.train) + len(fold.val) == 43

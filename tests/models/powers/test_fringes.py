@@ -5,16 +5,12 @@ import pytest
 import torch
 from closed import fitted_to, read_back
 from interference import WAVELENGTH, plane
-from releases import REAL
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.fringes import Blend, nearest_distances, resolves_wavelength
 from gsparc.models.powers.waves import field_db, fit_wave_weights, make_basis
 from gsparc.ops import Pose
-
-PLANE = REAL / "real" / "techtile-power-reci-rf-1.npz"
 
 
 def db(power: torch.Tensor) -> np.ndarray:
@@ -124,24 +120,3 @@ def test_a_blend_goes_from_rows_to_groups_to_nothing():
     distance = torch.tensor([0.0, 0.15, 0.3, 1.5, 5.0])
     share, factor = Blend((0.1, 0.2), (0.2, 0.6), (0.9, 0.7)).share_and_inflation(distance, 1.0)
     assert np.allclose(share, [0.2, 0.4, 0.6, 0.3, 0.0]) and np.allclose(factor, [0.9, 0.8, 0.7, 0.85, 1.0])
-
-
-@pytest.mark.slow
-def test_a_measured_plane():
-    if not PLANE.exists():
-        pytest.skip(f"{PLANE} is not there")
-    file = np.load(PLANE)
-    loud = np.flatnonzero(file["rssi_db"] > -75)
-    chosen = np.random.default_rng(0).permutation(loud)[:1800]
-    data = from_arrays(
-        {name: file[name][chosen] for name in ("rx_position", "rssi_db")}
-        | {"frequency_hz": file["frequency_hz"]}, {"name": "measured"},
-    )  # fmt: skip
-    square = np.floor(data.moving[:, :2] / 0.3).astype(int) @ [1, 100]
-    test = np.isin(square, np.unique(square)[::5])
-    batch, errors = data.batch(np.flatnonzero(test)), []
-    for fringes in (True, False):
-        field, _ = fitted_to(PowerField(fringes), data, np.flatnonzero(~test))
-        field.condition(data, np.flatnonzero(~test))
-        errors.append(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))
-    assert errors[0] < errors[1], errors

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from closed import fitted_to, read_back
-from releases import REAL
+from releases import real
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
@@ -19,12 +19,9 @@ from gsparc.processes import powers
 from gsparc.processes.powers import condition_on_powers
 from gsparc.training.context import FitContext
 
-CITY = REAL / "real" / "powder-rss-462mhz.npz"
-measured = pytest.mark.skipif(not CITY.is_file(), reason="measured city powers are not beside this checkout")
-
 
 def station(number: int, rows: int, seed: int) -> Measurements:
-    with np.load(CITY) as stored:
+    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
         decibels = stored["rssi_db"][:, number].astype(np.float64)
         heard = np.flatnonzero(np.isfinite(decibels))
         chosen = np.sort(np.random.default_rng(seed).permutation(heard)[:rows])
@@ -74,14 +71,12 @@ def errors_db(number: int, rows: int, seed: int, split: SplitSettings) -> tuple[
     return own, alone
 
 
-@measured
 def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
     """7.24 dB in squares of 300 m where ordinary kriging has 6.31: the likeliest process was taken alone."""
     own, alone = errors_db(7, 300, 106, SplitSettings("blocks", side_m=300.0, seed=1))
     assert own < 0.96 * alone, (own, alone)
 
 
-@measured
 def test_random_rows_were_predicted_by_the_mean_that_squares_prefer():
     """2.374 dB where the likeliest process alone has 2.353."""
     own, alone = errors_db(4, 600, 0, SplitSettings("random"))

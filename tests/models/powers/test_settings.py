@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from releases import real
 
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
@@ -20,7 +21,7 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
-from tests.models.powers.test_mixture import CITY, measured, station
+from tests.models.powers.test_mixture import station
 
 
 def town(count: int, exponent: float = 3.0, shadowing_db: float = 4.0, seed: int = 0) -> Measurements:
@@ -59,10 +60,9 @@ def test_of_silent_rows_those_in_doubt_are_weighed():
     assert (few.places[few.silent, 0] <= 400).sum() == (silent <= 400).sum()
 
 
-@measured
 def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
     """97 rows of a measured station chose 2 km and next to no noise: up to 63 dBm where nobody measured."""
-    with np.load(CITY) as stored:
+    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
         number = stored["station"].tolist().index("law73-nuc2-b210")
     data = station(number, 97, 9)
     rows = power_rows(data, np.arange(97))
