@@ -159,6 +159,12 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     if noise is not None and measured == "rssi_db":
         check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
     position_std = _not_negative(check, "position_std", rows)
+    devices = check.read_array("device", (rows,))
+    if devices is not None and kind != "rssi":
+        check.refuse("device", f"goes with powers, not with {measured}")
+    if devices is not None:
+        names, devices = np.unique(devices.astype(str), return_inverse=True)
+        about["device_names"] = tuple(names.tolist())
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
     _in_range(check, measured, values, mask)
@@ -183,7 +189,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
-        position_std=position_std, **of_rows,
+        position_std=position_std, device=devices, **of_rows,
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     if named and kind == "rssi":

@@ -121,7 +121,7 @@ class Builder:
                 values = self._of_rows(role)
                 self.arrays |= {} if values is None else {role: values}
         self._frequency(channels="csi" in self.arrays)
-        for role in ("run", "row_name"):
+        for role in ("run", "row_name", "device"):
             if role in self.chosen:
                 self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
         # Without names rows are called by their line in the file, so that messages survive dropped rows.

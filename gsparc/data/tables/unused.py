@@ -49,16 +49,17 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
             power_text += f"{'+' if effect.size < 0 else '-'}{head}{factor}"
             how = f"{say_column('rssi_db', power_text)} takes it off"
             what = f"a number that adds {effect.size:g} dB each to the level"
+        elif effect.kind == "device":
+            how = f"{say_column('device', head)} takes each off"
+            what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
+            what += ", or floors" * set(words[head]).issubset(FLOORS)
+            if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
+                how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
             names.append(head)
             how = f"{say_column('station', '+'.join(names))} tells them apart"
             what = "another transmitter for each value"
-            if effect.kind == "device":
-                what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-                what += ", or floors" * set(words[head]).issubset(FLOORS)
-                if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
-                    how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
-        how = "a file for each value takes them apart" if wide else how
+            how = "a file for each value takes them apart" if wide else how
         notes.append(Caution(f"{said}: {what}? {how}"))
     return notes
 
