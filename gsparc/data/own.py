@@ -192,9 +192,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         position_std=position_std, device=devices, **of_rows,
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
-    if named and kind == "rssi":
-        check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
-    data = data if kind == "rssi" else convert_conventions(data, named)
+    data = convert_conventions(data, named)
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, data.censored)

@@ -125,8 +125,8 @@ def _of_sheet(
     chosen.pop("device", None)
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
-    named = station, plain, device, name
-    return QueryPlaces(sheet.source, ends, sheet.rows, *named, (*notes, *guessed), table)
+    told = (*notes, *guessed)
+    return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, device, name, told, table)
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
