@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.errors import DataError
@@ -61,7 +62,8 @@ def traits(data: Measurements) -> set[str]:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
         holds = {"spectra": True, "above": grid.first_elevation >= 0, "hemisphere": plain}
-    return {name for name, held in {**holds, **placed}.items() if held}
+    turned = {"turned": data.site.kind != "rssi" and bool((data.rx_rotation != np.eye(3)).any())}
+    return {name for name, held in {**holds, **placed, **turned}.items() if held}
 
 
 def _values(change: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -91,6 +93,11 @@ def _places(change: Callable[[np.ndarray], np.ndarray], *which: str) -> Change:
         return replace(data, **places)
 
     return moved
+
+
+def _turned(change: Callable[[Rotation], Rotation]) -> Change:
+    """Receivers turned otherwise."""
+    return lambda d: replace(d, rx_rotation=change(Rotation.from_matrix(d.rx_rotation)).as_matrix())
 
 
 def _grid(first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0) -> Change:
@@ -173,6 +180,10 @@ CONVENTIONS = {
                               _places(lambda p: p[:, [1, 0, 2]], "rx")),
     "downwards": Convention("heights of the receiver counted downwards", "metres",
                             _places(lambda p: p * [1, 1, -1], "rx")),
+    "scalar_last": Convention("orientations as x, y, z, w", "turned",
+                              _turned(lambda r: Rotation.from_quat(np.roll(r.as_quat(), 1, 1)))),
+    "world_to_receiver": Convention("orientations from the world to the receiver", "turned",
+                                    _turned(lambda r: r.inv())),
     "zeros_unmeasured": Convention("0 for tones that were not measured", "tones", mask_zero_tones, False),
     "transposed": Convention("rows as azimuths, columns as elevations", "hemisphere", _transposed),
     "zenith": Convention("elevation from the zenith", "above", _grid(_from_zenith, 1)),

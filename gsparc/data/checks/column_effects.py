@@ -50,6 +50,11 @@ class Effect:
     contrast: float = 0.0
 
 
+TRUTHS = ({"true", "false"}, {"0", "1"}, {"yes", "no"}, {"t", "f"}, {"y", "n"})
+SMOOTH = 0.25  # of the variance about near rows, from which on levels follow these rather than a receiver
+SURE = 5.0  # deviations of the logarithm of a ratio of variances
+
+
 @dataclass(frozen=True)
 class LevelsAtPlaces:
     """Levels of links.
@@ -104,6 +109,31 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
         else:
             links = replace(links, station=_pairwise(links.station, texts[best.head]))
     return found
+
+
+def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Return columns of truths, and which of their values rows have that were filled in from near ones.
+
+    What is interpolated has no noise of its own: it differs far less from its neighbours than a measurement.
+    """
+    filled, apart = {}, np.full(len(links), np.nan)
+    for one in np.unique(links.station):
+        own = np.flatnonzero(links.station == one)
+        if len(own) > NEAR:
+            near = cKDTree(links.place[own]).query(links.place[own], k=NEAR // 2 + 1)[1][:, 1:]
+            apart[own] = links.level[own] - links.level[own][near].mean(1)
+    for head, words in columns.items():
+        said = np.char.lower(words[row])
+        if {*np.unique(said).tolist()} not in TRUTHS:
+            continue
+        spread = {value: apart[(said == value) & np.isfinite(apart)] for value in np.unique(said).tolist()}
+        (smooth, less), (_, more) = sorted(spread.items(), key=lambda item: np.median(np.abs(item[1])))
+        if min(len(less), len(more)) < LEAST_ROWS / 3:
+            continue
+        ratio = math.log(max(float(np.var(less)), 1e-12) / float(np.var(more)))
+        if ratio < math.log(SMOOTH) and ratio < -SURE * math.sqrt(2 / len(less) + 2 / len(more)):
+            filled[head] = str(words[row][said == smooth][0])
+    return filled
 
 
 def _fit(links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray] = ()) -> LevelField:

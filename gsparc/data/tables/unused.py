@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gsparc.data.checks.column_effects import LevelsAtPlaces, find_effects
+from gsparc.data.checks.column_effects import LEAST_ROWS, LevelsAtPlaces, find_effects, find_filled
 from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.errors import Caution
 from gsparc.data.tables.columns import Chosen, say_column, used_heads
@@ -39,6 +39,14 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
     power, notes, wide = chosen["rssi_db"][0], list[str](), level.shape[1] > 1
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     power_text = f"{power.head}{times}"
+    if words and len(links) < LEAST_ROWS:
+        few = f"columns that are not used are asked what they say of levels from {LEAST_ROWS} links on"
+        return [f"{few}, here are {len(links)}: devices, powers or other transmitters would pass unseen"]
+    for head, value in find_filled(links, row, words).items():
+        other = next(word for word in words[head][row] if word != value)
+        said = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, without noise"
+        how = f"{say_column('run', head)} 'dataset.runs=[\"{other}\"]' leaves them out"
+        notes.append(Caution(f"{said}: filled in, not measured? {how}"))
     for effect in find_effects(links, row, words):
         head = effect.head
         said = (

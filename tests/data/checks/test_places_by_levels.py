@@ -2,33 +2,20 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.distance import cdist
+from level_fields import ROWS, flight
 
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.datasets.own import apply_settings
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 
-FOOT, ROWS = 0.3048, 300
+FOOT = 0.3048
 WRONG = {
     "static_feet": lambda rows, still: (rows, still / FOOT),
     "moving_feet": lambda rows, still: (rows / FOOT, still),
     "heights_feet": lambda rows, still: (rows / [1, 1, FOOT], still),
     "exchange_xy": lambda rows, still: (rows[:, [1, 0, 2]], still),
 }
-
-
-def flight(seed: int) -> dict[str, np.ndarray]:
-    """Arrays of a drone over three stations; shadowing of 5 dB over 40 m, noise of 2 dB."""
-    rng = np.random.default_rng(seed)
-    place = np.c_[rng.uniform(0, [300, 200], (ROWS, 2)), rng.uniform(10, 120, ROWS)]
-    still = np.c_[rng.uniform(0, [300, 200], (3, 2)), rng.uniform(5, 30, 3)]
-    root = np.linalg.cholesky(25 * np.exp(-cdist(place, place) / 40) + 1e-6 * np.eye(ROWS))
-    station = np.arange(ROWS) % 3
-    away = np.linalg.norm(place - still[station], axis=1)
-    shadow = (root @ rng.normal(size=(ROWS, 3)))[np.arange(ROWS), station]
-    level = -30 - 28 * np.log10(away) + shadow + rng.normal(0, 2, ROWS)
-    return {"rx_position": place, "station_position": still, "station": station, "rssi_db": level}
 
 
 @pytest.mark.parametrize("name", list(WRONG))
