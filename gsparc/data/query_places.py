@@ -119,7 +119,8 @@ def _of_sheet(
         sheet.refuse_rows(head, np.flatnonzero(station == ""), "no station; expected its name")
     sheet.problems.raise_if_any()
     device, name = (
-        sheet.words(chosen[role][0].head or "") if role in chosen else None for role in ("device", "row_name")
+        sheet.joined(c.head for c in chosen[role]) if role in chosen else None
+        for role in ("device", "row_name")
     )
     # Columns that were read as one quantity; joined stations are several columns and stay as text.
     chosen.pop("device", None)

@@ -36,6 +36,7 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
     links = LevelsAtPlaces(place[row], station, level[row, column])
     words = {head: sheet.words(head) for head in sheet.heads if head not in used}
     names = [column.head or "" for column in chosen.get("station", ())]
+    devices = list[str]()
     power, notes, wide = chosen["rssi_db"][0], list[str](), level.shape[1] > 1
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     power_text = f"{power.head}{times}"
@@ -58,7 +59,8 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
             how = f"{say_column('rssi_db', power_text)} takes it off"
             what = f"a number that adds {effect.size:g} dB each to the level"
         elif effect.kind == "device":
-            how = f"{say_column('device', head)} takes each off"
+            devices.append(head)
+            how = f"{say_column('device', '+'.join(devices))} takes each off"
             what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
             what += ", or floors" * set(words[head]).issubset(FLOORS)
             if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
