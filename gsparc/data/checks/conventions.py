@@ -11,6 +11,7 @@ one. Places must agree, too.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -121,10 +122,9 @@ def _zeros(data: Measurements) -> list[str]:
 def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
     kind, place = data.site.kind, np.hstack([data.tx, data.rx_position])
-    names = [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(few)]
     groups, declared = _groups(place), _score(data, labels)
     rivals = {}
-    for name in names:
+    for name in _tried(few):
         with suppress(ValueError):  # a grid turned beyond a pole
             placed = convert_conventions(data, [name])
             # Within a wavelength all places are one: whatever does not move fits.
@@ -142,11 +142,20 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
     of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
     if float(of_group[:-DROPPED].sum()) + (best.phases - declared.phases) / 2 <= RATIO:
         return []
-    named, *alike = [name for name, one in rivals.items() if one.log_likelihood > best.log_likelihood - RATIO]
-    others = "".join(f" or dataset.{name}=true" for name in alike)
-    others += ", which these rows do not tell apart" if others else ""
-    how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better with "
-    return [f"{how}{CONVENTIONS[named].words}: is it that? dataset.{named}=true{others} mends it"]
+    how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better"
+    return _mending(how, {name: one.log_likelihood for name, one in rivals.items()})
+
+
+def _tried(data: Measurements) -> list[str]:
+    return [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(data)]
+
+
+def _mending(how: str, rivals: Mapping[str, float]) -> list[str]:
+    """The best of rivals by their likelihoods, with those that are as likely, and what mends it."""
+    alike = [name for name, one in rivals.items() if one > max(rivals.values()) - RATIO]
+    ways = " or ".join(f"dataset.{name}=true" for name in alike)
+    ways += ", which these rows do not tell apart," if len(alike) > 1 else ""
+    return [f"{how} with {CONVENTIONS[alike[0]].words}: is it that? {ways} mends it"]
 
 
 def _rivals_of_places(data: Measurements) -> list[str]:
@@ -169,15 +178,11 @@ def _rivals_of_places(data: Measurements) -> list[str]:
         field = fit_level_field(placed.moving, level, station, [np.log10(np.maximum(distance, nearest))])
         return field.score if least < -field.slope[0] < 10 * EXPONENTS[1] else -math.inf
 
-    names = [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(data)]
-    rivals = {name: score(convert_conventions(data, [name])) for name in names}
+    rivals = {name: score(convert_conventions(data, [name])) for name in _tried(data)}
     best, declared = max(rivals.values(), default=-math.inf), score(data, -math.inf)
     if not best - declared > CLEAR_PLACES:
         return []
-    named, *alike = sorted((n for n, one in rivals.items() if one > best - RATIO), key=lambda n: -rivals[n])
-    others = "".join(f" or dataset.{name}=true" for name in alike)
-    how = f"{len(rows)} powers drawn fall with distance more than a million times likelier with"
-    return [f"{how} {CONVENTIONS[named].words}: is it that? dataset.{named}=true{others} mends it"]
+    return _mending(f"{len(rows)} powers drawn fall with distance a million times likelier", rivals)
 
 
 def _groups(place: np.ndarray) -> np.ndarray:

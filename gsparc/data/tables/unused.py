@@ -9,10 +9,9 @@ import numpy as np
 from gsparc.data.checks.column_effects import LEAST_ROWS, LevelsAtPlaces, find_effects, find_filled
 from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.errors import Caution
+from gsparc.data.links.georeference import Georeference
 from gsparc.data.tables.columns import Chosen, say_column, used_heads
 from gsparc.data.tables.sheet import Sheet
-
-METRES_PER_DEGREE = 111_195.0
 
 
 def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) -> list[str]:
@@ -62,7 +61,7 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
             devices.append(head)
             how = f"{say_column('device', '+'.join(devices))} takes each off"
             what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-            what += ", or floors" * set(words[head]).issubset(FLOORS)
+            what += ", or floors" * all(word.lstrip("-").isdigit() for word in set(words[head]))
             if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
                 how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
@@ -74,15 +73,11 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
     return notes
 
 
-FLOORS = {str(number) for number in range(-9, 200)}
-
-
 def _places(arrays: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
     """Places (S, d) [m] of what moves; None where nothing does."""
     if "latitude" in arrays:
-        across = np.c_[arrays["latitude"], arrays["longitude"]] * METRES_PER_DEGREE
-        across[:, 1] *= np.cos(np.radians(np.median(arrays["latitude"])))
-        parts = [across]
+        degrees = arrays["latitude"], arrays["longitude"]
+        parts = [Georeference.from_coordinates(*degrees).from_degrees(*degrees)]
     else:
         parts = [a for name, a in arrays.items() if name in ("rx_position", "tx_position") and a.ndim == 2]
     parts += [
