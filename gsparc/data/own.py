@@ -159,12 +159,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     if noise is not None and measured == "rssi_db":
         check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
     position_std = _not_negative(check, "position_std", rows)
-    devices = check.read_array("device", (rows,))
-    if devices is not None and kind != "rssi":
-        check.refuse("device", f"goes with powers, not with {measured}")
-    if devices is not None:
-        names, devices = np.unique(devices.astype(str), return_inverse=True)
-        about["device_names"] = tuple(names.tolist())
+    about["device_names"], devices = check.read_devices(rows, kind)
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
     _in_range(check, measured, values, mask)
