@@ -106,7 +106,7 @@ def centre_positions(data: Measurements) -> Measurements:
     moved = replace(data, tx=tx - origin, rx_position=rx - origin)
     moving = moved.moving[usual]
     of_rows = ("tx", "rx_rotation", "target", "mask", "noise_variance", "station", "place", "censored", "run",
-               "position_std")  # fmt: skip
+               "position_std", "device")  # fmt: skip
     hashed = {name: getattr(data, name) for name in of_rows} | {
         "rx": rx, "array": site.array, "subcarriers_hz": site.subcarriers_hz,
         "target_scale": np.array(site.target_scale),

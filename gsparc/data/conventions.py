@@ -1,4 +1,4 @@
-"""Conventions of channels and spectra: what a file may follow instead of the schema's, and what mends it.
+"""Conventions of channels, spectra and places: what a file may follow instead of the schema's.
 
 `CONVENTIONS` names each with the change from it to the schema's: applied where a setting or an attribute of
 the file names it, and tried by `gsparc.data.checks.conventions`, which scores how well the direct path fits.
@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.errors import DataError
 from gsparc.data.limits import choice
-from gsparc.data.schema import LIGHT, Measurements
+from gsparc.data.schema import LIGHT, OTHER, Measurements
 from gsparc.data.units import UNITS
 from gsparc.ops import SphereGrid
 
@@ -47,16 +48,22 @@ def known_array(data: Measurements) -> np.ndarray | None:
 
 
 def traits(data: Measurements) -> set[str]:
-    """Return what channels or spectra are, as far as conventions ask for it."""
+    """Return what measurements are, as far as conventions ask for it."""
     grid, shape = data.site.grid, data.target.shape[1:]
-    if grid is None:
+    # Degrees are no feet; heights beside them may be.
+    metres = data.site.georeference is None and data.site.kind != "spectrum"
+    placed = {"metres": metres, "heights": data.site.kind != "spectrum" and bool(np.ptp(data.moving[:, 2]))}
+    if data.site.kind == "rssi":
+        holds = {}
+    elif grid is None:
         tones, square, antennas = shape[1] > 1, 1 < shape[0] == shape[1], known_array(data) is not None
         holds = {"channels": True, "tones": tones, "square": square, "antennas": antennas}
     else:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
         holds = {"spectra": True, "above": grid.first_elevation >= 0, "hemisphere": plain}
-    return {name for name, held in holds.items() if held}
+    turned = {"turned": data.site.kind != "rssi" and bool((data.rx_rotation != np.eye(3)).any())}
+    return {name for name, held in {**holds, **placed, **turned}.items() if held}
 
 
 def _values(change: Callable[[np.ndarray], np.ndarray]) -> Change:
@@ -72,18 +79,25 @@ def _array(factor: Callable[[Measurements], float]) -> Change:
     return lambda d: replace(d, site=replace(d.site, array=np.asarray(d.site.array) * factor(d)))
 
 
-def _places(change: Callable[[np.ndarray], np.ndarray], *ends: str) -> Change:
-    """Positions of ends changed, about the origin of the file."""
+def _places(change: Callable[[np.ndarray], np.ndarray], *which: str) -> Change:
+    """Positions of ends, `tx`, `rx`, `static` or `moving`, changed about the origin of the file."""
 
     def moved(data: Measurements) -> Measurements:
-        origin, stations = data.site.origin, data.site.stations
-        places = {end: change(getattr(data, end) + origin) - origin for end in ends}
-        if stations is not None and any(end.startswith(str(data.site.static_end)) for end in ends):
+        origin, stations, still = data.site.origin, data.site.stations, data.site.static_end or "tx"
+        ends = {{"static": still, "moving": OTHER[still]}.get(end, end) for end in which}
+        names = {"tx": "tx", "rx": "rx_position"}
+        places = {names[end]: change(getattr(data, names[end]) + origin) - origin for end in ends}
+        if stations is not None and data.site.static_end in ends:
             there = replace(stations, position=change(stations.position + origin) - origin)
             places["site"] = replace(data.site, stations=there)
         return replace(data, **places)
 
     return moved
+
+
+def _turned(change: Callable[[Rotation], Rotation]) -> Change:
+    """Receivers turned otherwise."""
+    return lambda d: replace(d, rx_rotation=change(Rotation.from_matrix(d.rx_rotation)).as_matrix())
 
 
 def _grid(first: Callable[[SphereGrid], tuple[float, float]], flipped: int = 0) -> Change:
@@ -153,12 +167,23 @@ CONVENTIONS = {
     "array_wavelengths": Convention("array_position in wavelengths", "antennas",
                                     _array(lambda data: LIGHT / float(data.site.tones().mean()))),
     "delays_removed": Convention("the delay of each row taken out", "tones", _with_delays),
-    "feet": Convention("positions in feet", "channels",
-                       _places(lambda p: p * FOOT, "tx", "rx_position")),
-    "exchange_xy": Convention("x and y of the receiver exchanged", "channels",
-                              _places(lambda p: p[:, [1, 0, 2]], "rx_position")),
-    "downwards": Convention("heights of the receiver counted downwards", "channels",
-                            _places(lambda p: p * [1, 1, -1], "rx_position")),
+    "feet": Convention("positions in feet", "metres", _places(lambda p: p * FOOT, "tx", "rx")),
+    "centimetres": Convention("positions in centimetres", "metres",
+                              _places(lambda p: p / 100, "tx", "rx")),
+    "static_feet": Convention("places of stations in feet beside rows in metres", "metres",
+                              _places(lambda p: p * FOOT, "static")),
+    "moving_feet": Convention("places of rows in feet beside stations in metres", "metres",
+                              _places(lambda p: p * FOOT, "moving")),
+    "heights_feet": Convention("heights of rows in feet", "heights",
+                               _places(lambda p: p * [1, 1, FOOT], "moving")),
+    "exchange_xy": Convention("x and y of the receiver exchanged", "metres",
+                              _places(lambda p: p[:, [1, 0, 2]], "rx")),
+    "downwards": Convention("heights of the receiver counted downwards", "metres",
+                            _places(lambda p: p * [1, 1, -1], "rx")),
+    "scalar_last": Convention("orientations as x, y, z, w", "turned",
+                              _turned(lambda r: Rotation.from_quat(np.roll(r.as_quat(), 1, 1)))),
+    "world_to_receiver": Convention("orientations from the world to the receiver", "turned",
+                                    _turned(lambda r: r.inv())),
     "zeros_unmeasured": Convention("0 for tones that were not measured", "tones", mask_zero_tones, False),
     "transposed": Convention("rows as azimuths, columns as elevations", "hemisphere", _transposed),
     "zenith": Convention("elevation from the zenith", "above", _grid(_from_zenith, 1)),

@@ -159,6 +159,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     if noise is not None and measured == "rssi_db":
         check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
     position_std = _not_negative(check, "position_std", rows)
+    about["device_names"], devices = check.read_devices(rows, kind)
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
     _in_range(check, measured, values, mask)
@@ -183,12 +184,10 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
-        position_std=position_std, **of_rows,
+        position_std=position_std, device=devices, **of_rows,
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
-    if named and kind == "rssi":
-        check.refuse("conventions", f"{', '.join(named)}: of channels and spectra, not of powers")
-    data = data if kind == "rssi" else convert_conventions(data, named)
+    data = convert_conventions(data, named)
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, data.censored)

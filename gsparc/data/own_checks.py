@@ -167,6 +167,16 @@ class Checker:
             )
         return array
 
+    def read_devices(self, rows: int, kind: str) -> tuple[tuple[str, ...] | None, np.ndarray | None]:
+        """Return names (D,) of devices and which of them measured each row (S,) int64; None where none is."""
+        array = self.read_array("device", (rows,))
+        if array is None:
+            return None, None
+        if kind != "rssi":
+            self.refuse("device", f"goes with powers, not with {kind}")
+        names, device = np.unique(array.astype(str), return_inverse=True)
+        return tuple(names.tolist()), device.reshape(-1).astype(np.int64)
+
     def read_mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
         """Return bool, like the measurement; None: all was measured. Only `censored` rows may be empty."""
         array = self.read_array("mask", shape)

@@ -17,7 +17,7 @@ from gsparc.data.tables.places import Places, read_places
 from gsparc.data.tables.sheet import Sheet
 
 # Only what a query needs: a column that looks like a level is none of its concern.
-GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station")
+GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station", "device")
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class QueryPlaces:
         rows: (n,) what messages call each.
         station: (n,) names; None where the file names none.
         plain: (n,) the same without what several columns may add to them.
+        device: (n,) names of devices, empty of none; None where no column names any.
         name: (n,) what a user calls each, where a column says so; else None.
         notes: what was guessed or not used, one line each.
         table: the columns of a table in order: head, quantity that was read out of it or None, text (n,).
@@ -40,6 +41,7 @@ class QueryPlaces:
     rows: tuple[str, ...]
     station: np.ndarray | None = None
     plain: np.ndarray | None = None
+    device: np.ndarray | None = None
     name: np.ndarray | None = None
     notes: tuple[str, ...] = ()
     table: tuple[tuple[str, str | None, np.ndarray], ...] = ()
@@ -91,7 +93,10 @@ def read_times(path: str | Path) -> np.ndarray | None:
 def _of_sheet(
     sheet: Sheet, notes: list[str], moving: Sequence[End], columns: Mapping[str, object]
 ) -> QueryPlaces:
-    chosen, guessed = choose_columns(sheet, columns, only=GUESSED)
+    said = {key: value for key, value in columns.items() if value is not None}
+    if "device" in sheet.heads:  # a head that a table of measurements would not be taken at its word for
+        said.setdefault("device", "device")
+    chosen, guessed = choose_columns(sheet, said, only=GUESSED)
     sheet.problems.raise_if_any()
     by_end = {end: read_places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
     sheet.problems.raise_if_any()
@@ -113,11 +118,16 @@ def _of_sheet(
         plain = sheet.words(head)
         sheet.refuse_rows(head, np.flatnonzero(station == ""), "no station; expected its name")
     sheet.problems.raise_if_any()
-    name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
+    device, name = (
+        sheet.joined(c.head for c in chosen[role]) if role in chosen else None
+        for role in ("device", "row_name")
+    )
     # Columns that were read as one quantity; joined stations are several columns and stay as text.
+    chosen.pop("device", None)
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
-    return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, name, (*notes, *guessed), table)
+    told = (*notes, *guessed)
+    return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, device, name, told, table)
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:

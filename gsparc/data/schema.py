@@ -138,6 +138,9 @@ class Site:
         freedom: what of each row's factor nobody knows, see `gsparc.physics.row_factors`.
         phase_reference: of rows that were turned to each other: `carrier`, phases over places are those of
             waves; `neighbours`, near rows were made alike. None where rows are as measured.
+        device_names: (D,) what measured powers is called; None where nothing tells.
+        device_levels: (D + 1, 2) offset [dB] of each to their mean, which was taken off, and variance [dB^2]
+            of what is not known of it; the last of a device that nobody named. None before that.
     """
 
     name: str
@@ -166,6 +169,8 @@ class Site:
     unit: str | None = None
     freedom: Freedom = "none"
     phase_reference: Literal["carrier", "neighbours"] | None = None
+    device_names: tuple[str, ...] | None = field(default=None, compare=False)
+    device_levels: np.ndarray | None = field(default=None, compare=False)
 
     @property
     def scored(self) -> Scored:
@@ -283,6 +288,8 @@ class Measurements:
         position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
             where positions count as exact.
         sequence: (S,) int64, number of each row in the order in which they were taken; None: as they stand.
+        device: (S,) int64, which of `site.device_names` measured a row; None where nothing tells, or their
+            offsets are taken off.
     """
 
     site: Site
@@ -303,6 +310,7 @@ class Measurements:
     run: np.ndarray | None = None
     position_std: np.ndarray | None = None
     sequence: np.ndarray | None = None
+    device: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.target)

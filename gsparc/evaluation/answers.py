@@ -126,6 +126,8 @@ def _notes(queries: QueryPlaces, site: Site) -> list[str]:
         notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
     if queries.station is not None and site.stations is None:
         notes.append("not used: stations; the model has none")
+    if queries.device is not None and site.device_names is None:
+        notes.append("not used: devices; the model tells none apart")
     return notes
 
 
@@ -157,7 +159,10 @@ def predict_places(
                 raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
             silent.append(f"left out: {error}")
             continue
-        blocks += [(own, rows) for rows in np.split(chosen, range(CHUNK, len(chosen), CHUNK))]
+        of = np.full(len(chosen), "") if queries.device is None else queries.device[row[chosen]]
+        for device in np.unique(of):
+            asked, rows = _select_device(own, str(device), queries.source), chosen[of == device]
+            blocks += [(asked, some) for some in np.split(rows, range(CHUNK, len(rows), CHUNK))]
     if not blocks:
         raise DataError(silent[0])
 
@@ -180,6 +185,16 @@ def predict_places(
     rows.sort()
     called = {} if stations is None else stations.named
     return Answers(row[rows], {head: np.array(of)[number[rows]] for head, of in called.items()}, said)
+
+
+def _select_device(predictor: Predictor, device: str, source: str) -> Predictor:
+    """The same, answering as a device; empty, or of a model that tells none apart: as it is."""
+    if not device or predictor.site.device_names is None:
+        return predictor
+    try:
+        return predictor.select_device(device)
+    except ValueError as error:
+        raise DataError(f"{source}: {error}; leave it empty for the mean one") from None
 
 
 def output_path(out: str | None, places: Path, overwrite: bool) -> Path:

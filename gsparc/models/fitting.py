@@ -26,6 +26,7 @@ from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
 from gsparc.models.aligned_rows import align_phases
 from gsparc.models.checkpoint import Stored
+from gsparc.models.device_offsets import take_off_devices
 from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -71,6 +72,7 @@ def fit_or_resume(
     budget = TimeBudget()
     # Before the method is made, as another may be called for once rows share a phase.
     ordered, rows = order_rows(data, fold)
+    ordered = take_off_devices(ordered, rows)
     if context.datamodule is not None and context.datamodule.measurements is data:
         module = copy.copy(context.datamodule)
         module.measurements = ordered

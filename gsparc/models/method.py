@@ -20,6 +20,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
+from gsparc.data.units import DB
 from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.time_budget import Effort
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from gsparc.processes.powers import PowerProcess
 
 T = TypeVar("T")
+MEAN_DEVICE = -1  # number of the device that nobody named, see `Site.device_levels`
 DOUBLE = {torch.float32: torch.float64, torch.complex64: torch.complex128}
 
 
@@ -53,6 +55,20 @@ class Prediction:
     def confidence(self) -> Tensor | None:
         """Return 1 - `unknown`, (B,) in [0, 1]: larger is surer."""
         return None if self.unknown is None else (1 - self.unknown).clamp(0, 1)
+
+    def of_devices(self, site: Site, device: Tensor | int = MEAN_DEVICE) -> Prediction:
+        """Return what devices (B,), or one, would read, where this is the mean one's; variances add."""
+        if site.device_levels is None:
+            return self
+        levels, shape = torch.from_numpy(site.device_levels)[torch.as_tensor(device)].reshape(-1, 2), [1] * 3
+        factor, spread = (10 ** (levels[:, 0] / 10)).to(self.mean.dtype), levels[:, 1].to(self.mean.dtype)
+        many = factor.reshape(-1, *shape[: self.mean.ndim - 1])
+        mean, variance, explained = self.mean * many, self.variance, self.explained
+        if variance is not None:
+            own = (mean / DB).square() * spread.reshape(many.shape)
+            scale = factor.square().reshape(-1, *shape[: variance.ndim - 1])
+            variance = variance * scale + own.reshape(variance.shape)
+        return Prediction(mean, variance, self.unknown, None if explained is None else explained * many)
 
     @staticmethod
     def joined(parts: Sequence[Prediction], order: Tensor | None = None) -> Prediction:
@@ -266,7 +282,10 @@ def predict_in_batches(
         for start in range(0, len(rows), size):
             chosen = order[start : start + size]
             batch = data.batch(rows[chosen])
-            yield chosen, batch, method.predict(batch)
+            said = method.predict(batch)
+            if data.device is not None:
+                said = said.of_devices(method.fitted_site, torch.from_numpy(data.device[rows[chosen]]))
+            yield chosen, batch, said
 
     if data.site.freedom == "none":
         yield from predict_batches()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def fit(
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     if save is not None:
         checkpoint.save(save, method, extra={"train_s": report.seconds})
-    return Predictor(method, data.site)
+    return Predictor(method, replace(data.site, device_levels=method.fitted_site.device_levels))
 
 
 def _raw_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:

@@ -17,7 +17,8 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Kind, Site
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
-from gsparc.models.method import HasGaussians, Method, Prediction, predict_with_threads
+from gsparc.models.device_offsets import find_device
+from gsparc.models.method import MEAN_DEVICE, HasGaussians, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.physics.row_factors import describe_freedom
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
@@ -79,6 +80,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         self.queries = Queries(site)
         self._unit = unit
         self.unit = self._answer_unit(None).name  # "1" of channels and spectra
+        self._device = MEAN_DEVICE
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
 
     def __repr__(self) -> str:
@@ -125,7 +127,21 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         return self._copy_with(method, whole, station_site(self.site, number), self._unit)
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
-        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
+        copy = Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
+        copy._device = self._device
+        return copy
+
+    def select_device(self, device: str) -> Predictor:
+        """Return the same model answering as one of the devices that measured would read.
+
+        Without it powers are those of the mean device, and the devices' variance is in theirs.
+
+        Raises:
+            ValueError: no device is called that.
+        """
+        copy = self._copy_with(self.method, self._whole, self.site, self._unit)
+        copy._device = find_device(device, self.site)
+        return copy
 
     def in_levels(self, unit: str | None) -> Predictor:
         """Return the same model whose powers and maps are levels in `unit`, dBm or dBW; None: as measured.
@@ -166,7 +182,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         query = self.queries.query(tx, rx).query
         own = predict_with_threads(self._whole, query)
         sure = self._method_confidence(own, query)
-        return replace(_to_unit(own, wanted), unknown=None if sure is None else 1 - sure)
+        return replace(self._in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
 
     def predict_query(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local (less `site.origin`) [m].
@@ -198,7 +214,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
         def ask(asked: Predictor) -> Any:
             query, single, as_torch = asked.queries.query(tx, rx)
-            said = _to_unit(predict_with_threads(asked._whole, query), asked._answer_unit(unit))
+            said = asked._in_unit(predict_with_threads(asked._whole, query), asked._answer_unit(unit))
             if said.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = said.variance.sqrt().float()
@@ -367,25 +383,27 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             moments, single = self._predict_grad(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query, single, as_torch = self.queries.query(tx, rx)
-        return match_input(_to_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch)
+        return match_input(
+            self._in_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch
+        )
 
     def _predict_grad(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
         moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx, self._prepared)
-        said, own = _to_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
+        said, own = self._in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
         mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
         unknown = None if said.unknown is None or not own else said.unknown.to(dtype)
         return Prediction(mean, said.variance, unknown), single
+
+    def _in_unit(self, stored: Prediction, unit: PowerUnit) -> Prediction:
+        """Of stored targets, as the chosen device reads them, in a unit."""
+        stored = stored.of_devices(self.site, self._device)
+        # In decibels a variance depends on the mean too.
+        variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
+        explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
+        return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)
 
 
 def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
     checkpoint.update_extra(path, extra)
-
-
-def _to_unit(stored: Prediction, unit: PowerUnit) -> Prediction:
-    """Of stored targets, in a unit."""
-    # In decibels a variance depends on the mean too.
-    variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
-    explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
-    return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)

@@ -12,6 +12,7 @@ from gsparc.data.inner_folds import InnerFolds, cut_folds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
+from gsparc.models.device_offsets import without_devices
 from gsparc.models.method import Method, MethodFactory, Reconditions
 from gsparc.models.per_station import PerStation, stations_of_fold, wrap_per_station
 from gsparc.training.context import FitContext
@@ -54,7 +55,7 @@ class Learned:
         """
         if isinstance(self.method, Reconditions):
             known = np.sort(np.concatenate([fold.train, fold.val]))
-            less = self.method.copy_conditioned(self.data, known)
+            less = self.method.copy_conditioned(without_devices(self.data, self.method.fitted_site), known)
             if less is not None:
                 return less
         # Nobody goes on from this fit: its checkpoints and curves go with the folder.

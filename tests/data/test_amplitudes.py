@@ -86,6 +86,8 @@ def test_beams_of_both_ends_were_advised_one_after_the_other(tmp_path):
     ]
     file.write_text("\n".join(["x,y,tx_beam,rx_beam,rsrp", *rows]))
     said = [note for note in parse_table(file).notes if "is not used and explains" in note]
-    assert len(said) == 2 and "station=tx_beam+rx_beam tells them apart" in said[1]
+    assert len(said) == 2 and "device=tx_beam+rx_beam takes each off" in said[1]
     data = interpret(parse_table(file, {"station": "tx_beam+rx_beam"}), file).data
     assert len(data.site.stations) == 6
+    found = interpret(parse_table(file, {"device": "tx_beam+rx_beam"}), file)
+    assert len(found.data.site.device_names) == 6 and not any("explains" in note for note in found.notes)

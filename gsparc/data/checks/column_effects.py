@@ -15,18 +15,15 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-import torch
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
-from gsparc.processes.factor import Factor
+from gsparc.processes.level_field import LevelField, fit_level_field
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
 CENTRES = 6  # about which those are chosen, so that they stay dense
 NEAR = 8  # rows that a row is compared with
 REPEATED = 4  # rows for each value of a column that may name something
-REACHES, NUGGETS = (1 / 3, 1 / 10, 1 / 30, 1 / 100), (0.05, 0.2, 0.7, 3.0)  # as in `level_steps`
-RATIO = math.log(30)  # of likelihoods
+RATIO = math.log(15)  # of likelihoods
 COPY, LESS, WEAK = (0.9, 0.7), 0.9, 0.85  # see `_contrast`
 TOLERANCE = 0.2  # of a slope that should be 1, or another power of ten
 MOST_EFFECTS = 4
@@ -51,6 +48,11 @@ class Effect:
     share: float
     size: float = 0.0
     contrast: float = 0.0
+
+
+TRUTHS = ({"true", "false"}, {"0", "1"}, {"yes", "no"}, {"t", "f"}, {"y", "n"})
+SMOOTH = 0.25  # of the variance about near rows, from which on levels follow these rather than a receiver
+SURE = 5.0  # deviations of the logarithm of a ratio of variances
 
 
 @dataclass(frozen=True)
@@ -103,69 +105,51 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
         if best.kind == "number" and value is not None:
             links = replace(links, level=links.level - best.size * value)
         elif best.kind == "device":
-            links = replace(links, level=links.level - _devices(links, texts[best.head]).offsets(links))
+            links = replace(links, level=links.level - _devices(links, texts[best.head]).regression)
         else:
             links = replace(links, station=_pairwise(links.station, texts[best.head]))
     return found
 
 
-@dataclass(frozen=True)
-class Fit:
-    """The best of a field's settings.
+def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Return columns of truths, and which of their values rows have that were filled in from near ones.
 
-    Attributes:
-        score: logarithm of the likelihood, less half of that of the rows for each constant.
-        columns: (n, k) regressors.
-        slope: (k,) of them.
+    What is interpolated has no noise of its own: it differs far less from its neighbours than a measurement.
     """
-
-    score: float
-    columns: np.ndarray
-    slope: np.ndarray
-
-    def offsets(self, links: LevelsAtPlaces) -> np.ndarray:
-        """Return what the regressors add (n,)."""
-        return self.columns @ self.slope
-
-
-def _fit(links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray] = ()) -> Fit:
-    """Fit a field and a constant for each of groups (n,), and slopes of columns over all of them."""
-    count, wide = len(links), float(np.ptp(links.place, axis=0).max())
-    table = np.column_stack([links.level, *columns])
-    parts = [np.flatnonzero(group == one) for one in np.unique(group)]
-    apart = [cdist(links.place[part], links.place[part]) for part in parts]
-    found = []
-    for reach in REACHES:
-        shapes = [np.exp(-one / max(reach * wide, 1e-9)) for one in apart]
-        for nugget in NUGGETS:
-            gram, logarithms = np.zeros((table.shape[1],) * 2), 0.0
-            for part, shape in zip(parts, shapes, strict=True):
-                factor = Factor.from_gram(torch.from_numpy(shape + nugget * np.eye(len(part))))
-                both = np.column_stack([np.ones(len(part)), table[part]])
-                white = factor.whiten(torch.from_numpy(both)).numpy()
-                own = white[:, 1:] - np.outer(white[:, 0], white[:, 0] @ white[:, 1:]) / (
-                    white[:, 0] @ white[:, 0]
-                )
-                gram += own.T @ own
-                logarithms += 2 * float(factor.lower.diagonal().log().sum())
-            slope = np.linalg.pinv(gram[1:, 1:]) @ gram[1:, 0]
-            variance = max(float(gram[0, 0] - slope @ gram[1:, 0]) / count, 1e-6)
-            constants = len(parts) + len(slope)
-            score = -0.5 * (count * math.log(variance) + logarithms + constants * math.log(count))
-            found.append(Fit(score, table[:, 1:], slope))
-    return max(found, key=lambda one: one.score)
+    filled, apart = {}, np.full(len(links), np.nan)
+    for one in np.unique(links.station):
+        own = np.flatnonzero(links.station == one)
+        if len(own) > NEAR:
+            near = cKDTree(links.place[own]).query(links.place[own], k=NEAR // 2 + 1)[1][:, 1:]
+            apart[own] = links.level[own] - links.level[own][near].mean(1)
+    for head, words in columns.items():
+        said = np.char.lower(words[row])
+        if {*np.unique(said).tolist()} not in TRUTHS:
+            continue
+        spread = {value: apart[(said == value) & np.isfinite(apart)] for value in np.unique(said).tolist()}
+        (smooth, less), (_, more) = sorted(spread.items(), key=lambda item: np.median(np.abs(item[1])))
+        if min(len(less), len(more)) < LEAST_ROWS / 3:
+            continue
+        ratio = math.log(max(float(np.var(less)), 1e-12) / float(np.var(more)))
+        if ratio < math.log(SMOOTH) and ratio < -SURE * math.sqrt(2 / len(less) + 2 / len(more)):
+            filled[head] = str(words[row][said == smooth][0])
+    return filled
 
 
-def _devices(links: LevelsAtPlaces, code: np.ndarray) -> Fit:
+def _fit(links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray] = ()) -> LevelField:
+    return fit_level_field(links.place, links.level, group, columns)
+
+
+def _devices(links: LevelsAtPlaces, code: np.ndarray) -> LevelField:
     return _fit(links, links.station, [(code == one).astype(float) for one in np.unique(code)[1:]])
 
 
 def _effect(
-    links: LevelsAtPlaces, plain: Fit, pairs: Sequence[np.ndarray], head: str, code: np.ndarray,
+    links: LevelsAtPlaces, plain: LevelField, pairs: Sequence[np.ndarray], head: str, code: np.ndarray,
     value: np.ndarray | None,
 ) -> Effect | None:  # fmt: skip
     """What one column explains; None: nothing, or it follows the level."""
-    fits: dict[Kind, tuple[Fit, float]] = {}
+    fits: dict[Kind, tuple[LevelField, float]] = {}
     if 0 < code.max() < len(code) / REPEATED and (contrast := _contrast(links, pairs, code)) < 1:
         fits["device"] = _devices(links, code), contrast
         fits["transmitter"] = _fit(links, _pairwise(links.station, code)), contrast

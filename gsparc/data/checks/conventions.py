@@ -1,15 +1,17 @@
-"""Whether channels and spectra follow the schema's conventions, told by the direct path between known ends.
+"""Whether measurements follow the schema's conventions, told by the direct path between known ends.
 
 Each rival of `CONVENTIONS` is scored as the declared one is. Of channels the share of
 a row's power along the direct path counts, with a free factor for each row, free phases of the antennas and a
 free delay common to all rows, and whether the factors of rows agree; of spectra how much of the sphere is
-stronger than the direction of the other end. A row counts once, however many entries it has, since
-reflections are common to them, and rows within half a wavelength count as one. Places must agree, too.
+stronger than the direction of the other end; of powers how well they fall with distance. A row counts once,
+however many entries it has, since reflections are common to them, and rows within half a wavelength count as
+one. Places must agree, too.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -19,6 +21,7 @@ from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_arra
 from gsparc.data.errors import list_first
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.processes.level_field import fit_level_field
 
 RATIO = math.log(1000)  # of likelihoods
 ROWS = 400
@@ -35,6 +38,8 @@ SHARED = 8  # rows with one phase, at least
 DELAYS = 4  # tried for each tone
 LEAST_DB = 6.0  # of the largest value: less is no spectrum in decibels
 EDGE = 0.5  # of the strongest lobe's peak; further down lie other paths and the floor
+CLEAR_PLACES = math.log(1e6)  # of powers: shadowing is not Gaussian
+EXPONENTS = 1.0, 6.0  # of a law of distance
 LOBE = 0.5  # logarithm of the ratio for the median spectrum, at least: lobes of arrays are no exact beams
 
 
@@ -62,7 +67,7 @@ def convention_warnings(data: Measurements) -> list[str]:
     """Name the convention that rows seem to follow instead of the declared one, and what mends it."""
     kind = data.site.kind
     if kind == "rssi":
-        return []
+        return _rivals_of_places(data)
     whole, labels = _arrayed(data)
     rows = _drawn(whole)
     few, drawn, labels = data.subset(rows[:1]), whole.subset(rows), labels[rows]
@@ -117,12 +122,14 @@ def _zeros(data: Measurements) -> list[str]:
 def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
     kind, place = data.site.kind, np.hstack([data.tx, data.rx_position])
-    names = [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(few)]
     groups, declared = _groups(place), _score(data, labels)
     rivals = {}
-    for name in names:
+    for name in _tried(few):
         with suppress(ValueError):  # a grid turned beyond a pole
-            rivals[name] = _score(convert_conventions(data, [name]), labels)
+            placed = convert_conventions(data, [name])
+            # Within a wavelength all places are one: whatever does not move fits.
+            if kind == "spectrum" or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean():
+                rivals[name] = _score(placed, labels)
 
     def may_be(name: str, rival: Score) -> bool:
         gain = float((rival.rows - declared.rows).mean())
@@ -135,11 +142,47 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
     of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
     if float(of_group[:-DROPPED].sum()) + (best.phases - declared.phases) / 2 <= RATIO:
         return []
-    named, *alike = [name for name, one in rivals.items() if one.log_likelihood > best.log_likelihood - RATIO]
-    others = "".join(f" or dataset.{name}=true" for name in alike)
-    others += ", which these rows do not tell apart" if others else ""
-    how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better with "
-    return [f"{how}{CONVENTIONS[named].words}: is it that? dataset.{named}=true{others} mends it"]
+    how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better"
+    return _mending(how, {name: one.log_likelihood for name, one in rivals.items()})
+
+
+def _tried(data: Measurements) -> list[str]:
+    return [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(data)]
+
+
+def _mending(how: str, rivals: Mapping[str, float]) -> list[str]:
+    """The best of rivals by their likelihoods, with those that are as likely, and what mends it."""
+    alike = [name for name, one in rivals.items() if one > max(rivals.values()) - RATIO]
+    ways = " or ".join(f"dataset.{name}=true" for name in alike)
+    ways += ", which these rows do not tell apart," if len(alike) > 1 else ""
+    return [f"{how} with {CONVENTIONS[alike[0]].words}: is it that? {ways} mends it"]
+
+
+def _rivals_of_places(data: Measurements) -> list[str]:
+    """A warning where powers fall with distance far better at places as another convention has them.
+
+    Beside a field of levels for each station: what is alike about near rows says nothing of distances.
+    """
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    known = np.isfinite(np.hstack([data.tx, data.rx_position])).all(axis=1) & (data.target[:, 0] > 0)
+    rows = np.flatnonzero(known & (data.censored_side(np.arange(len(data))) == 0))
+    if data.site.static_end is None or len(rows) < FEWEST["spectrum"]:
+        return []
+    rows = np.sort(np.random.default_rng(0).permutation(rows)[:ROWS])
+    data, station = data.subset(rows), station[rows]
+    level = 10 * np.log10(data.target[:, 0].astype(np.float64))
+
+    def score(placed: Measurements, least: float = 10 * EXPONENTS[0]) -> float:
+        distance = np.linalg.norm(placed.tx - placed.rx_position, axis=1)
+        nearest = float(np.ptp(placed.moving[:, :3], axis=0).max()) / 300
+        field = fit_level_field(placed.moving, level, station, [np.log10(np.maximum(distance, nearest))])
+        return field.score if least < -field.slope[0] < 10 * EXPONENTS[1] else -math.inf
+
+    rivals = {name: score(convert_conventions(data, [name])) for name in _tried(data)}
+    best, declared = max(rivals.values(), default=-math.inf), score(data, -math.inf)
+    if not best - declared > CLEAR_PLACES:
+        return []
+    return _mending(f"{len(rows)} powers drawn fall with distance a million times likelier", rivals)
 
 
 def _groups(place: np.ndarray) -> np.ndarray:

@@ -6,15 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from scipy.spatial.distance import cdist
 
-from gsparc.processes.factor import Factor
+from gsparc.processes.level_field import NUGGETS, fit_level_field
 
 MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
 LIKELIHOOD_BLOCKS = 300  # that choose the length of correlation
-REACHES = (1 / 3, 1 / 10, 1 / 30, 1 / 100)  # lengths of correlation, parts of the region
-NUGGETS = (0.05, 0.2, 0.5)  # variance of fading and noise, parts of that of shadowing
 MOST_STEPS = 3
 LEAST_ROWS = 60
 SHORTEST = 1 / 20  # part of a station's rows between two steps
@@ -45,11 +41,11 @@ def detect_level_steps(
 ) -> tuple[LevelStep, ...]:
     """Find where the level of one station changes though the places do not explain it.
 
-    The level is a line in the logarithm of the distance, plus shadowing that is correlated over places
-    (exponentially: Gudmundson, Electronics Letters 27, 1991), plus noise, plus a step at an unknown row. For
-    every row the step's generalised least-squares estimate and its variance follow from two cumulative sums
-    of the inverse covariance; the largest is kept, and the search repeated with it, like binary segmentation
-    (Scott and Knott, Biometrics 30, 1974). Places seen before and after a step count most, as they should.
+    The level is a line in the logarithm of the distance, plus a field (`gsparc.processes.level_field`), plus
+    a step at an unknown row. For every row the step's generalised least-squares estimate and its variance
+    follow from two cumulative sums of the inverse covariance; the largest is kept, and the search repeated
+    with it, like binary segmentation (Scott and Knott, Biometrics 30, 1974). Places seen before and after a
+    step count most, as they should.
 
     Args:
         position: (n, 2) or (n, 3) [m], in the order of measuring.
@@ -65,12 +61,15 @@ def detect_level_steps(
     level = np.array([np.median(level_db[b]) for b in blocks])
     if not np.ptp(level):
         return ()
-    mean = [np.ones(len(level))]
+    mean: list[np.ndarray] = []
     if station_position is not None:
         distance = np.linalg.norm(places - np.asarray(station_position)[: places.shape[1]], axis=1)
         mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
-    regressors = np.stack(mean, axis=1)
-    precision = _precision(places, level, regressors)
+    some = np.unique(np.linspace(0, len(level) - 1, LIKELIHOOD_BLOCKS).astype(int))
+    # Medians of rows hold less noise than rows do.
+    of_some = places[some], level[some], np.zeros(len(some)), [one[some] for one in mean]
+    field = fit_level_field(*of_some, nuggets=NUGGETS[:-1])
+    precision, regressors = field.precision(places), np.column_stack([np.ones(len(level)), *mean])
     steps = [
         LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(change))
         for k, change in zip(*_search(precision, level, regressors), strict=True)
@@ -84,32 +83,6 @@ def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
     size = max(3, math.ceil(len(rows) / most))  # a median of three does not see a single wrong row
     pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 10 * size) + 1)
     return [block for piece in pieces for block in np.array_split(piece, math.ceil(len(piece) / size))]
-
-
-def _precision(places: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> np.ndarray:
-    """Inverse covariance (n, n) [1/dB^2] of levels, its parameters of most likelihood on a grid."""
-    distance = cdist(places, places)
-    extent = float(np.ptp(places, axis=0).max())
-    some = np.unique(np.linspace(0, len(level) - 1, LIKELIHOOD_BLOCKS).astype(int))
-    best = (-math.inf, 0.0, 0.0, 0.0)
-    for reach in REACHES:
-        for nugget in NUGGETS:
-            shape = _covariance(distance[np.ix_(some, some)], reach * extent, nugget)
-            factor = Factor.from_gram(torch.from_numpy(shape))
-            weighed = factor.solve(torch.from_numpy(regressors[some])).numpy()
-            mean = np.linalg.lstsq(regressors[some].T @ weighed, weighed.T @ level[some], rcond=None)[0]
-            rest = level[some] - regressors[some] @ mean
-            white = factor.whiten(torch.from_numpy(rest)[:, None])
-            variance = float(white.square().sum()) / len(some)
-            likelihood = -0.5 * (len(some) * math.log(variance) + float(factor.log_determinant))
-            best = max(best, (float(likelihood), reach, nugget, variance))
-    _, reach, nugget, variance = best
-    whole = torch.from_numpy(_covariance(distance, reach * extent, nugget))
-    return Factor.from_gram(whole).inverse.numpy() / variance
-
-
-def _covariance(distance: np.ndarray, reach: float, nugget: float) -> np.ndarray:
-    return np.exp(-distance / reach) + nugget * np.eye(len(distance))
 
 
 def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> tuple[list[int], np.ndarray]:

@@ -87,9 +87,8 @@ def _implausible(data: Measurements, file_row: np.ndarray | None) -> list[str]:
     if places * stations > MOST_LINKS:
         return ["too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data, file_row)
-    if levels is None:
-        return [Severe(warning) for warning in convention_warnings(data)]
-    return sanity_warnings(levels, find_level_steps(levels))
+    told = list[str](map(Severe, convention_warnings(data)))
+    return told if levels is None else [*told, *sanity_warnings(levels, find_level_steps(levels))]
 
 
 class StandIn(Protocol):

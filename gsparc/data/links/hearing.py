@@ -20,6 +20,7 @@ from gsparc.data.selection import take_rows
 POWERS = ("rssi", "rssi_db")
 BESIDE, LEAST_MARKS = 6, 12  # rows around a mark; marks that tell
 WEAK_SHARE = 0.62  # of marks beside rows that are weaker than half of the station's: not heard
+MOST_DB = 400  # of any level
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 
 
@@ -32,7 +33,7 @@ def _are_levels(value: Any) -> bool:
 SAID = {
     "absent": ("auto", choice("auto", "unknown", "silent")),
     "not_heard": (None, or_null(Limit("a list of levels [dB] like [-999]", _are_levels))),
-    "saturation_db": ("auto", or_word(or_word(number(-400, 400), "auto"), "none")),
+    "saturation_db": ("auto", or_word(or_word(number(-MOST_DB, MOST_DB), "auto"), "none")),
 }
 
 
@@ -122,7 +123,7 @@ def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarr
     if level is None or values.ndim != 1:
         return None
     floor = np.broadcast_to(level, values.shape)
-    if (np.abs(floor) > 400).any():  # NaN: of that station or row it is not known
+    if (np.abs(floor) > MOST_DB).any():  # NaN: of that station or row it is not known
         return check.refuse("sensitivity_db", "expected dB between -400 and 400")
     return floor
 
@@ -189,7 +190,8 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     for mark in marks if given is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
         said = f"{share}, apart from all others: taken as not heard, below {floor}"
-        say = "dataset.not_heard=[] keeps them, sensitivity_db (dataset.columns.sensitivity_db) sets that"
+        does = "refuses" if abs(mark) > MOST_DB else "keeps"
+        say = f"dataset.not_heard=[] {does} them, sensitivity_db (dataset.columns.sensitivity_db) sets that"
         check.notes.append(Caution(f"{said}; {say}"))
     return silent
 

@@ -174,6 +174,7 @@ def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
     return columns if columns[0].label == JOINED or len(columns) < 2 else fine[:1] or columns
 
 
+JOINT = ("station", "device")
 JOINED = "joined"  # label of columns whose values together name a station
 
 
@@ -254,7 +255,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     # After the head as it is: heads may hold a `*`, a `+` or a `-`.
     if KINDS[role] != "text" and (column := _sum_of_columns(sheet, role, text)) is not None:
         return (column,)
-    joined = [_head(sheet, part.strip()) for part in text.split("+")] if role == "station" else []
+    joined = [_head(sheet, part.strip()) for part in text.split("+")] if role in JOINT else []
     if len(joined) > 1 and all(joined):
         return tuple(Column(role, JOINED, head=part) for part in joined)
     if "*" in text and role in heads.MANY:

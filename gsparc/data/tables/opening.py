@@ -95,8 +95,8 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         how = "write Parquet, of means by cells of places where rows are many"
         raise DataError(f"{source}: {fault} cells are read: {how}")
     lines = _with_heads(lines, comment, delimiter, source)
-    lines, comment_notes = _without_comments(lines, delimiter, source)
     lines, again_notes = _heads_once(lines)
+    lines, comment_notes = _without_comments(lines, delimiter, source)
     notes += comment_notes + again_notes
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
@@ -194,10 +194,12 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
 
 
 def _heads_once(lines: Lines) -> tuple[Lines, list[str]]:
-    """The lines without those that repeat the heads, as in files joined, and a note."""
-    first, *below = lines
-    line = lines[first].strip()
-    again = {n for n in below if lines[n].strip("\ufeff \t") == line}
+    """The lines without those that repeat the heads, with comments above, as in files joined, and a note."""
+    (first, *below), again, above = lines, set[int](), list[int]()
+    for n in below:
+        text = lines[n].strip("\ufeff \t")
+        again |= {n, *above} if text == lines[first].strip() else set()
+        above = [*above, n] if text.startswith(COMMENTS) else []
     if not again:
         return lines, []
     where = name_row_ranges([f"line {n}" for n in sorted(again)])

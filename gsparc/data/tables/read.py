@@ -121,9 +121,9 @@ class Builder:
                 values = self._of_rows(role)
                 self.arrays |= {} if values is None else {role: values}
         self._frequency(channels="csi" in self.arrays)
-        for role in ("run", "row_name"):
+        for role in ("run", "row_name", "device"):
             if role in self.chosen:
-                self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
+                self.arrays[role] = self.sheet.joined(column.head for column in self.chosen[role])
         # Without names rows are called by their line in the file, so that messages survive dropped rows.
         self.arrays.setdefault("row_name", np.array(self.sheet.rows))
         return self.arrays

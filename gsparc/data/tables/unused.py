@@ -6,13 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gsparc.data.checks.column_effects import LevelsAtPlaces, find_effects
+from gsparc.data.checks.column_effects import LEAST_ROWS, LevelsAtPlaces, find_effects, find_filled
 from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.errors import Caution
+from gsparc.data.links.georeference import Georeference
 from gsparc.data.tables.columns import Chosen, say_column, used_heads
 from gsparc.data.tables.sheet import Sheet
-
-METRES_PER_DEGREE = 111_195.0
 
 
 def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) -> list[str]:
@@ -36,9 +35,18 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
     links = LevelsAtPlaces(place[row], station, level[row, column])
     words = {head: sheet.words(head) for head in sheet.heads if head not in used}
     names = [column.head or "" for column in chosen.get("station", ())]
+    devices = list[str]()
     power, notes, wide = chosen["rssi_db"][0], list[str](), level.shape[1] > 1
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     power_text = f"{power.head}{times}"
+    if words and len(links) < LEAST_ROWS:
+        few = f"columns that are not used are asked what they say of levels from {LEAST_ROWS} links on"
+        return [f"{few}, here are {len(links)}: devices, powers or other transmitters would pass unseen"]
+    for head, value in find_filled(links, row, words).items():
+        other = next(word for word in words[head][row] if word != value)
+        said = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, without noise"
+        how = f"{say_column('run', head)} 'dataset.runs=[\"{other}\"]' leaves them out"
+        notes.append(Caution(f"{said}: filled in, not measured? {how}"))
     for effect in find_effects(links, row, words):
         head = effect.head
         said = (
@@ -49,29 +57,27 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
             power_text += f"{'+' if effect.size < 0 else '-'}{head}{factor}"
             how = f"{say_column('rssi_db', power_text)} takes it off"
             what = f"a number that adds {effect.size:g} dB each to the level"
+        elif effect.kind == "device":
+            devices.append(head)
+            how = f"{say_column('device', '+'.join(devices))} takes each off"
+            what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
+            what += ", or floors" * all(word.lstrip("-").isdigit() for word in set(words[head]))
+            if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
+                how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
             names.append(head)
             how = f"{say_column('station', '+'.join(names))} tells them apart"
             what = "another transmitter for each value"
-            if effect.kind == "device":
-                what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-                what += ", or floors" * set(words[head]).issubset(FLOORS)
-                if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
-                    how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
-        how = "a file for each value takes them apart" if wide else how
+            how = "a file for each value takes them apart" if wide else how
         notes.append(Caution(f"{said}: {what}? {how}"))
     return notes
-
-
-FLOORS = {str(number) for number in range(-9, 200)}
 
 
 def _places(arrays: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
     """Places (S, d) [m] of what moves; None where nothing does."""
     if "latitude" in arrays:
-        across = np.c_[arrays["latitude"], arrays["longitude"]] * METRES_PER_DEGREE
-        across[:, 1] *= np.cos(np.radians(np.median(arrays["latitude"])))
-        parts = [across]
+        degrees = arrays["latitude"], arrays["longitude"]
+        parts = [Georeference.from_coordinates(*degrees).from_degrees(*degrees)]
     else:
         parts = [a for name, a in arrays.items() if name in ("rx_position", "tx_position") and a.ndim == 2]
     parts += [

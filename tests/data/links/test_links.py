@@ -296,7 +296,7 @@ FORMS = {  # arrays and attributes, and what is said of them
     "times as places": (town(tx_position=WALK.astype("M8[s]")), {}, "tx_position: expected real numbers"),
     "a name of two": (town(), {"name": np.array([1.0, 2.0])}, "name: a list; expected text"),
     "a measurement of two": (town(), {"measurement": np.array(["rssi", "csi"])}, "names no measurement"),
-    "transposed powers": (town(), {"conventions": "transposed"}, "of channels and spectra, not of powers"),
+    "transposed powers": (town(), {"conventions": "transposed"}, "transposed: rows as azimuths, columns as"),
 }  # fmt: skip
 
 

@@ -1,0 +1,70 @@
+"""Offsets of the devices that measured: estimated from training rows, taken off before any method learns.
+
+Two phones at one place read levels that differ by a constant. One number for each device over all stations is
+estimated beside a field of levels at each, and belongs to the site: what methods learn and answer is the mean
+device's level, to which that of a named device is added.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.errors import list_first
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.processes.level_field import fit_level_field
+
+log = logging.getLogger(__name__)
+
+MOST_ROWS, MOST_OF_STATION, LEAST_OF_STATION = 6000, 1000, 60  # that tell; the cost is a station's cube
+
+
+def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
+    """Return levels as the mean device would read them, and a site that knows the offset of each device.
+
+    Only training rows tell. A device that has none there is taken for the mean one. Measurements whose rows
+    name no devices are returned as they are.
+    """
+    if data.device is None or data.site.device_names is None:
+        return data
+    names, rows = data.site.device_names, fold.train[data.censored_side(fold.train) == 0]
+    level = 10 * np.log10(np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny))
+    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    most = int(np.clip(MOST_ROWS / len(np.unique(station)), LEAST_OF_STATION, MOST_OF_STATION))
+    order = np.random.default_rng(0).permutation(len(rows))
+    some = np.sort(np.concatenate([order[station[order] == one][:most] for one in np.unique(station)]))
+    device, heard = data.device[rows][some], np.unique(data.device[rows][some])
+    each = [(device == one).astype(float) for one in heard[1:]]
+    field = fit_level_field(data.moving[rows][some], level[some], station[some], each)
+    offset = np.r_[0.0, field.slope]
+    offset -= offset.mean()
+    # The last row is of the mean device, and of those that nothing is known of.
+    spread = float(offset.var(ddof=1)) if len(offset) > 1 else 0.0
+    levels = np.tile([0.0, spread], (len(names) + 1, 1))
+    levels[heard] = np.c_[offset, np.zeros(len(heard))]
+    said = [f"{names[one]} {value:+.1f} dB" for one, value in zip(heard, offset, strict=True)]
+    log.info("devices: %s, beside their mean", list_first(said, 6))
+    return without_devices(data, replace(data.site, device_levels=levels))
+
+
+def without_devices(data: Measurements, site: Site) -> Measurements:
+    """Return rows less the offsets that a site knows, and as its; as they are where they name no devices."""
+    if data.device is None or site.device_levels is None:
+        return data
+    factor = 10 ** (-site.device_levels[data.device, 0] / 10)
+    target = (data.target * factor[:, None]).astype(data.target.dtype)
+    noise = None if data.noise_variance is None else data.noise_variance * (factor**2).astype(np.float32)
+    levels = replace(data.site, device_levels=site.device_levels)
+    return replace(data, target=target, noise_variance=noise, device=None, site=levels)
+
+
+def find_device(name: str, site: Site) -> int:
+    """Return the number of a device by its name; `ValueError` where there is none."""
+    names = site.device_names or ()
+    if name not in names:
+        known = f"there are {list_first(names)}" if names else f"{site.name} tells no devices apart"
+        raise ValueError(f"no device {name!r}; {known}")
+    return names.index(name)
