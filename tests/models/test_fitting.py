@@ -18,7 +18,7 @@ from gsparc.training.context import FitContext
 class Resumable(Nearest):
     """Counts its fits, and is interrupted in the one whose turn it is."""
 
-    resumable = takes_budget = True
+    resumable = takes_effort = True
     fits, stop_at = 0, 0
 
     def fit(self, data, fold, context):

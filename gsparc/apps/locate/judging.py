@@ -145,8 +145,9 @@ def locate_by_model(
     if anew:
         if stored:
             log.info("it was calibrated with %s: calibrated anew", ", ".join(other) or "the same settings")
-        seconds, seed = float(config.calibrate_s), int(config.seed)
-        retraining = run.retraining(run_dir=run_dir / "left_out", seed=seed, budget_s=seconds)
+        seed = int(config.seed)
+        other = {} if config.calibrate_effort is None else {"effort": float(config.calibrate_effort)}
+        retraining = run.retraining(run_dir=run_dir / "left_out", seed=seed, **other)
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:
