@@ -146,8 +146,7 @@ def locate_by_model(
         if stored:
             log.info("it was calibrated with %s: calibrated anew", ", ".join(other) or "the same settings")
         seed = int(config.seed)
-        other = {} if config.calibrate_effort is None else {"effort": float(config.calibrate_effort)}
-        retraining = run.retraining(run_dir=run_dir / "left_out", seed=seed, **other)
+        retraining = run.retraining(config.calibrate_effort, run_dir=run_dir / "left_out", seed=seed)
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:

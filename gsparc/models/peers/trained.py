@@ -172,9 +172,7 @@ class TrainedPeer(Method):
         self.network = self.makes(_make_scene(data, rows), self)
         if context.resume is not None:
             origin.require_same(read_interrupted(context.resume))
-        module = self.module(
-            self._count_steps(kind, context.counts) if asked is None else asked, context.run_dir
-        )
+        module = self.module(self._count_steps(kind, context.counts, asked), context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
         all_rows = Fold(rows, rows[:0], fold.test)
         trainer, batches = make_trainer(module, data, all_rows, context, files, watch)
