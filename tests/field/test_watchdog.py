@@ -67,7 +67,7 @@ def watched() -> Iterator[Looks]:
 
 LONGEST_S = 1.0  # of the thread's own processor time: a busy machine does not lengthen it
 KINDS = {  # what is measured, and overrides; as many rows as make the longest phase last
-    "powers": (lambda folder: powers(folder / "own.npz", 1200), ()),
+    "powers": (lambda folder: powers(folder / "own.npz", 1200), ("effort=0.1",)),
     "channels": (lambda folder: channels(folder / "own.npz", 300, shape="S"), ()),
     "channels of an array": (lambda folder: channels(folder / "own.npz", 150), ()),
     "images": (lambda folder: spectra(folder / "own.npz", 100), ()),
@@ -86,7 +86,7 @@ def test_an_interrupt_ends_every_phase_within_a_second(kind, tmp_path):
     make, overrides = KINDS[kind]
     data = make(tmp_path)
     data = data if hasattr(data, "site") else load({"name": "own", "file": str(data)})
-    config = compose("dataset=own", "dataset.file=x", "effort=0.1", "logger=none", *overrides)
+    config = compose("dataset=own", "dataset.file=x", "logger=none", *overrides)
     method = build(config.model).create_for(data)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -84,7 +84,7 @@ def test_one_model_of_a_network_was_fitted_under_four_names():
 
 
 @pytest.mark.parametrize(("group", "of", "entry", "message"), [
-    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x\.chose: no such setting; there are choose, effort"),
+    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x\.chose: no such setting; there are choose"),
     ("splits", SplitChoice, {"draw": 3}, r"splits\.x\.draw: no such setting; there are choose, datasets"),
 ])  # fmt: skip
 def test_a_wrong_entry_is_named(group, of, entry, message):

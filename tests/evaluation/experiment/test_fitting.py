@@ -55,7 +55,7 @@ def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
     one = prepared(problem, tmp_path, "mean")
     facts = {"program": one.state.program, "git": "0123456789"}
     assert one.filled(facts).earlier == "" and one.filled({**facts, "program": "q"}).earlier == "01234567"
-    assert one.folder == tmp_path / "own" / "random" / "mean" / "5" / "0" and one.result() is None
+    assert one.folder == tmp_path / "own" / "random" / "mean" / "0.5" / "0" and one.result() is None
 
 
 def test_a_full_disk_ends_a_comparison(problem, tmp_path):
