@@ -259,13 +259,11 @@ def test_without_the_residual_gaussians_are_alone(name):
     torch.testing.assert_close(found.mean, found.explained)
 
 
-def test_stations_have_fields_of_their_own_and_share_the_seconds():
+def test_stations_have_fields_of_their_own():
     fitted = fit("powers of several stations", stations="each")
     assert isinstance(fitted.method, PerStation) and fitted.method.effects == "residual"
     assert all(isinstance(copy, Powers) for _, copy in fitted.method)
-    begun = [line for line in fitted.lines if line.startswith("training ")]
-    given = [float(line.partition("within ")[2].split()[0]) for line in begun if "init=powers" in line]
-    assert len(given) == 2 and given[1] < given[0]  # what the first left
+    assert sum("init=powers" in line for line in fitted.lines if line.startswith("training ")) == 2
 
 
 def test_weights_to_start_from_were_ignored_in_closed_form(tmp_path):
