@@ -26,7 +26,7 @@ TODAY = pytest.mark.parametrize(
     "page", [*PRESENT, *MEASURED], ids=lambda page: f"{page.parent.name}/{page.name}"
 )
 README_LINES = 100
-GONE = ("vsgp", "directed", "model=bearings", "committee", "trainer.budget_s", "trainer.val_every")
+GONE = ("vsgp", "directed", "model=bearings", "committee", "budget_s", "budget_clock", "trainer.val_every")
 
 
 def test_every_package_is_on_the_map():

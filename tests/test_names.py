@@ -15,7 +15,7 @@ from gsparc.commands.train import train
 
 CONF = sorted((ROOT / "conf").rglob("*.yaml"))
 HYDRAS = {"hydra", "defaults", "_target_", "name"}
-ENTRIES = {"datasets", "splits", "methods", "budgets"}  # of comparisons: their heads say what they hold
+ENTRIES = {"datasets", "splits", "methods"}  # of comparisons: their heads say what they hold
 
 
 def _leaves(node: yaml.MappingNode) -> Iterator[int]:

@@ -20,12 +20,12 @@ COLUMNS = (
     Column("times faster", ".3g"),
 )  # fmt: skip
 # A dense reference may take seconds: after half a second no new round begins.
-REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
+REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, rounds_s=0.5)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Time all kernels; return the facts of `summary.json`, the table is also `bench.csv`."""
-    clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
+    clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, rounds_s=config.rounds_s)
     check_arguments(config, device=choice("cpu", "cuda"))
     device = config.device
     backend_named(device)  # where there is no such device, its reason comes first

@@ -1,4 +1,4 @@
-"""`gsparc compare`: methods x datasets x splits under equal budgets, one table, one figure."""
+"""`gsparc compare`: methods x datasets x splits by effort, one table, one figure."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.commands.train import read_inputs, train
 from gsparc.data.files import platform_cache
+from gsparc.data.limits import POSITIVE
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.cells import Budget, Contender, plan_cells, plugin_contenders
+from gsparc.evaluation.experiment.cells import Contender, plan_cells, plugin_contenders
 from gsparc.evaluation.experiment.latency import time_by_dataset
-from gsparc.evaluation.experiment.pictures import draw_budgets, draw_splits
+from gsparc.evaluation.experiment.pictures import draw_efforts, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
 from gsparc.evaluation.experiment.run_cells import CellResult, PreparedCell, prepare_cell, run_cells
 from gsparc.evaluation.experiment.table import (
@@ -51,14 +52,13 @@ def task(config: DictConfig) -> pd.DataFrame:
     folder = settings["cells"]
     cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     problems = load_every_problem(settings)
-    budgets = [
-        Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
-        for b in settings["budgets"]
-    ]
+    for effort in settings["efforts"]:
+        POSITIVE.check("efforts", effort)
+    counted = settings["efforts"], settings["seeds"], settings["only"]
     own = {name: of or {} for name, of in settings["datasets"].items()}
     prepared = [
         prepare_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
-        for problem, cell in plan_cells(problems, methods, budgets, settings["only"])
+        for problem, cell in plan_cells(problems, methods, *counted)
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     log.info("cells are in %s", cells_dir)
@@ -103,7 +103,7 @@ def write_comparison(
     for here in by_set:
         draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)
     if not rows.draws.all():
-        draw_budgets(rows[~rows.draws], run_dir / "compare.png", ours, figures)
+        draw_efforts(rows[~rows.draws], run_dir / "compare.png", ours, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}
     write_summary(run_dir / "summary.json", {"cells": len(filled), **best, **provenance()})
     shown: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]

@@ -17,8 +17,8 @@ from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number,
 
 LIMITS = {
     "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)),
-    "calibrate": whole(0), "calibrate_s": POSITIVE, "rows": or_null(whole(1)), "phase_known": switch(),
-    "renew": switch(),
+    "calibrate": whole(0), "calibrate_effort": or_null(POSITIVE), "rows": or_null(whole(1)),
+    "phase_known": switch(), "renew": switch(),
 }  # fmt: skip
 
 

@@ -28,7 +28,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     runs = find_runs(paths)
     # Times of other days and machines do not compare: every model is asked anew, here.
     if config.retime:
-        runs = time_again(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
+        runs = time_again(runs, rounds=int(config.rounds), rounds_s=float(config.rounds_s))
     out = run_directory()
     origin = write_report(out, config.title, runs, _fronts(paths), config.figures)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(group_by_study(runs)), **origin}

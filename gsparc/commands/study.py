@@ -46,7 +46,7 @@ def study_of(config: DictConfig) -> Study:
         instantiate(config.kind).conditions(),
         int(config.rounds),
         int(config.seed),
-        ClockSettings(rounds=int(config.queries), budget_s=float(config.query_s)),
+        ClockSettings(rounds=int(config.queries), rounds_s=float(config.query_s)),
     )
 
 

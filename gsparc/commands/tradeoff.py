@@ -53,7 +53,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     threads = [1] if single else _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, with_reduction(method, some, inputs)) for some in settings]
-    clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
+    clock = replace(BLOCKS, rounds=config.rounds, rounds_s=config.rounds_s)
     how = data, run.split, config.eval_on, clock
     points, beside = tradeoff.measure_points(candidates, threads, config.baselines, *how)
     kept = points[points.kept_with_model == 1]

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
@@ -46,14 +47,13 @@ from gsparc.evaluation.sector_levels import draw_sector_levels
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import all_methods, build, fill_defaults
-from gsparc.training import curve, tracking
+from gsparc.training import tracking
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Effort, TimeBudget
+from gsparc.training.effort import Effort
 
 log = logging.getLogger(__name__)
 log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
 
-LEAST_SHARE = 0.1  # of the seconds, for the fit, however long reading took
 # What a run leaves; of another one, all of it would be read beside this one's.
 LEFT = (
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
@@ -88,14 +88,12 @@ class RunInputs:
         method: unfitted, or what chooses it.
         module, split: the data, read, and their folds.
         reads: which of the given options were heeded so far.
-        watch: of the seconds since reading began.
     """
 
     method: MethodFactory
     module: DataModule
     split: Split
     reads: heeded.Reads
-    watch: TimeBudget
 
 
 def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInputs:
@@ -111,10 +109,10 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
     RunSettings.from_config(config)
     tracking.refuse_missing_loggers(config)
-    watch, reads = TimeBudget(clock=config.budget_clock), options.options_to_note(config, method)
+    reads = options.options_to_note(config, method)
     with heeded.record_reads(reads):
         module = _data(config, known)
-        return RunInputs(method, module, split_for(to_dict(config.split), module.measurements), reads, watch)
+        return RunInputs(method, module, split_for(to_dict(config.split), module.measurements), reads)
 
 
 def train(
@@ -150,7 +148,7 @@ def train(
 
         with tracking.open_loggers(config) as loggers:
             whole = fit_context(config, run_dir=run_dir, loggers=loggers, datamodule=begun.module)
-            contexts = _of_folds(whole, split, resumes, begun.watch.spent)
+            contexts = _of_folds(whole, split, resumes)
             with heeded.record_reads(reads), _advising(contexts):
                 # `Method.fit` of every fold; what takes gradient steps (models/splat/method.py) makes the
                 # Trainer of `config.trainer` there and calls `trainer.fit(module, datamodule)`.
@@ -171,6 +169,7 @@ def train(
             facts["program"] = program_hash(to_dict(config))
             files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
             objects = TrainedRun(fits.methods, files, data, split, evaluation)
+            _end_curves(contexts, fits.train_s, evaluation, config.eval_on)
             if in_full:
                 _draw(loggers, config, facts, objects, run_dir)
         evaluation.write(run_dir, run_id=run_id)
@@ -243,12 +242,10 @@ def _say(config: DictConfig, method: MethodFactory, data: Measurements, split: S
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
     guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
-    limit, folds = method.describe_time_limit(data.site, config.budget_s), len(split.folds)
-    each = f", each of {folds} folds" if limit and folds > 1 else ""
     steps = config.trainer.max_steps
     how = method.describe_fit(data, Effort().scale_by(config.effort), None if steps == -1 else steps)
     how = f": {how}" if how else ""
-    log.info("%-10s%s", "fitting", f"{method.name}{how}{each}{', ' * bool(limit)}{limit}{guessed}")
+    log.info("%-10s%s", "fitting", f"{method.name}{how}{guessed}")
 
 
 def _known_walls(config: DictConfig) -> Any:
@@ -256,21 +253,10 @@ def _known_walls(config: DictConfig) -> Any:
     return None if walls is None else read_walls(walls)
 
 
-def _of_folds(
-    whole: FitContext, split: Split, resumes: Sequence[Path | None], read_s: float
-) -> list[FitContext]:
-    """What the fit of each fold is given.
-
-    Args:
-        read_s: that reading took [s]: the seconds that are given begin with the first read.
-    """
+def _of_folds(whole: FitContext, split: Split, resumes: Sequence[Path | None]) -> list[FitContext]:
+    """What the fit of each fold is given."""
     contexts = fold_contexts(whole, split) if len(resumes) > 1 else [whole]
-    contexts = [replace(one, resume=resume) for one, resume in zip(contexts, resumes, strict=True)]
-    if whole.budget_s is not None:
-        # Reading is charged to the first fold: the others find the data read.
-        left_s = max(whole.budget_s - read_s, LEAST_SHARE * whole.budget_s)
-        contexts[0] = replace(contexts[0], budget_s=left_s)
-    return contexts
+    return [replace(one, resume=resume) for one, resume in zip(contexts, resumes, strict=True)]
 
 
 @contextmanager
@@ -293,17 +279,27 @@ def _keep(
     context = contexts[number]
     for note in report.notes:
         log_of_models.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
-    if not curve.read_curve(context.run_dir):  # a method that trains in one piece
-        context.log_curve(report.seconds, fitted.name)
     marks = fitting.run_extra(report, data, split.folds[number], context)
     extra = {**marks, "fold": number, "split_sha256": split.sha256, "run_id": run_id}
     extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
 
+def _end_curves(
+    contexts: Sequence[FitContext], seconds: Sequence[float], evaluation: Evaluation, eval_on: str
+) -> None:
+    """End the curve of every fold with its seconds and the error of what was fitted on the rows scored."""
+    columns = evaluation.columns
+    squared = columns["error_db"] ** 2 if "error_db" in columns else columns.get("mse")
+    for number, (context, spent) in enumerate(zip(contexts, seconds, strict=True)):
+        own = [] if squared is None else squared[columns["fold"] == number]
+        error = float(np.nanmean(own)) if np.isfinite(own).any() else None
+        context.log_curve(spent, f"{eval_on} rows", error)
+
+
 def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
     """Its name where a baseline of that name would be fitted in the same way."""
-    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_budget
+    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_effort
     kind = all_methods().get(method.name)
     same = kind is not None and to_dict(config.model) == config_node(import_target(kind))
     return method.name if plainly and same else None
@@ -311,11 +307,11 @@ def _as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
 
 def _of_fits(fits: FoldFits) -> dict[str, Any]:
     cpu_s = statistics.fmean(fits.train_cpu_s)
-    facts: dict[str, Any] = {"model/limited_by_clock": fits.limited_by, "time/train_cpu_s": cpu_s}
+    facts: dict[str, Any] = {"time/train_cpu_s": cpu_s}
     said = [note for note in fits.notes if not isinstance(note, Caution)]  # those were warnings
     facts["model/learned"] = "\n".join(said) or None
     if fits.cost.stages:
-        facts |= {"time/cost": fits.cost.describe(fits.limited_by), "time/unused_s": fits.cost.unused_s}
+        facts |= {"time/cost": fits.cost.describe(), "time/unused_s": fits.cost.unused_s}
     return facts
 
 

@@ -130,7 +130,7 @@ def run_all(work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: s
 
 def _time_left(left: Mapping[float, int], spent: Mapping[float, Sequence[float]]) -> float:
     """Seconds that pieces `left` by cost take, as those of the same cost took, else in proportion to it."""
-    # Costs are guesses: methods without a budget take a hundredth of theirs, others several times theirs.
+    # Costs are guesses: some take a hundredth of theirs, others several times theirs.
     rate = sum(map(sum, spent.values())) / max(sum(cost * len(own) for cost, own in spent.items()), 1e-9)
     mean = {cost: sum(own) / len(own) for cost, own in spent.items()}
     return sum(count * mean.get(cost, rate * cost) for cost, count in left.items())

@@ -89,10 +89,11 @@ class Opened:
         site, extra = self.stored[0].site, self.stored[0].extra
         return Predictor(self.methods[0], site, trusted=confidence.read_trusted(extra), extra=extra)
 
-    def retraining(self, **others: Any) -> Learned:
+    def retraining(self, effort: float | None = None, **others: Any) -> Learned:
         """Return the first method with what it learned from; only classes of gsparc make it unfitted.
 
         Args:
+            effort: in place of the run's; None: the run's.
             **others: of `FitContext`, in place of the run's.
 
         Raises:
@@ -103,6 +104,7 @@ class Opened:
             raise DataError(f"{self.stored[0].path} does not say how it was trained: train it anew")
         # Not trusted: a stranger's checkpoint may name any class, and to build is to execute it.
         factory = build(config["model"], trusted=False)
+        others |= {} if effort is None else {"effort": effort}
         context = FitContext(**effort_settings(config) | others)
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 

@@ -190,7 +190,7 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     """Say what limits figures: no test, stand-ins, rows that were learned from,
-    a training that seconds ended, and a busy machine.
+    and a busy machine.
     """
     conditions = []
     if facts.get("split/name") == "none" and not facts.get("split/test"):
@@ -205,11 +205,6 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     # A run that was not learned from has a phase that nothing tells: its figure is of another question.
     if count := facts.get("split/unseen_runs"):
         conditions.append(f"{count} runs were not learned from: scored after the best common phase of each")
-    if facts.get("model/limited_by_clock"):
-        repeat = "fixed steps or searches repeat exactly"
-        if facts["model/limited_by_clock"] == "wall":
-            repeat = f"budget_clock=processor does not count what others do, {repeat}"
-        conditions.append(f"the time limit ended training, so the result depends on this machine: {repeat}")
     load = facts.get("machine/load")
     return conditions + busy_machine([] if load is None else [load])
 

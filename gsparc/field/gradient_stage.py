@@ -25,12 +25,12 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.distributed import SummedGradients
 from gsparc.field.module import NetworkModule
-from gsparc.field.stage_budget import SPENT, StageBudget
 from gsparc.training.context import FitContext
-from gsparc.training.time_budget import Spent, TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
+SPENT = "time/spent_s"
 TAKEN = "steps/taken"
 KEPT = "steps/kept"
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
@@ -55,12 +55,12 @@ class TrainerResult:
     Attributes:
         kept: steps whose result is kept; None where the schedule was gone through to its end.
         taken: steps in all.
-        timed_out: whether `trainer.max_time` ended it.
+        notes: that `trainer.max_time` ended it.
     """
 
     kept: int | None
     taken: int
-    timed_out: bool
+    notes: tuple[str, ...]
 
 
 def requested_steps(context: FitContext, rows: int, model_steps: int | None = None) -> int | None:
@@ -89,13 +89,29 @@ def requested_steps(context: FitContext, rows: int, model_steps: int | None = No
 
 
 class ReportSteps(L.Callback):
-    """Steps of training as a metric: of all attributes, only these leave a process."""
+    """Steps and seconds of training as metrics: of all attributes, only these leave a process.
+
+    Args:
+        watch: of the fit; a resumed run has the seconds of its stage that were spent before.
+    """
+
+    def __init__(self, watch: Stopwatch) -> None:
+        self.watch, self._began = watch, watch.seconds
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the seconds spent."""
+        return {"seconds": self.watch.seconds - self._began}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.watch.charge(float(state["seconds"]))
 
     def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
         """Save, also after a checkpoint with every step done.
 
         Of an unfinished schedule, what was taken is kept.
         """
+        trainer.callback_metrics[SPENT] = torch.tensor(self.watch.seconds, dtype=torch.float64)
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
         if trainer.global_step < module.total_steps:
             trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
@@ -168,7 +184,7 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
 def make_trainer(
     module: NetworkModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
-    budget: TimeBudget, watch: Sequence[L.Callback] = (),
+    watch: Stopwatch, keeping: Sequence[L.Callback] = (),
 ) -> tuple[L.Trainer, DataModule]:  # fmt: skip
     """Return the Trainer that trains `module` on `fold.train`, watching `fold.val`, and its data.
 
@@ -178,21 +194,20 @@ def make_trainer(
         module: what is trained.
         data, fold, context: of the fit.
         checkpoints: how `last.ckpt` is written.
-        budget: of the fit, running.
-        watch: callbacks that say which steps are kept.
+        watch: of the fit.
+        keeping: callbacks that say which steps are kept.
 
     Raises:
         ValueError: several devices that do not train one model.
     """
     folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
-    budget.restart()
     if batches is None or batches.measurements is not data:
         batches = Loaded(data, context.batch_size)
     batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
     usable = _drop_unusable(context.callbacks(), len(fold.val), module.count is not None)
-    callbacks = [StageBudget(budget), *watch, *usable]
+    callbacks = [*keeping, *usable]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -222,7 +237,7 @@ def make_trainer(
     if processes is not None:
         options["strategy"] = processes
     trainer = make(
-        callbacks=[*callbacks, ReportSteps(), stop],
+        callbacks=[*callbacks, ReportSteps(watch), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,
@@ -257,18 +272,18 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
         batches.trainer = None  # which holds the optimizer's state
 
 
-def read_trainer_result(trainer: L.Trainer, budget: TimeBudget) -> TrainerResult:
-    """Return the steps of a Trainer that has ended, and charge what it spent elsewhere to the budget."""
+def read_trainer_result(trainer: L.Trainer, watch: Stopwatch) -> TrainerResult:
+    """Return the steps of a Trainer that has ended, and charge what other processes say of an earlier run."""
     metrics = trainer.callback_metrics
-    more = Spent(*metrics[SPENT].tolist()) - budget.by_clock  # of other processes, and of an earlier run
-    budget.charge(Spent(max(more.wall, 0.0), max(more.processor, 0.0)))
+    watch.charge(max(float(metrics[SPENT]) - watch.seconds, 0.0))
     kept = int(metrics[KEPT]) if KEPT in metrics else None
     taken = int(metrics[TAKEN])
     timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
-    timed_out = any((timer.time_remaining() or 0) <= 0 for timer in timers)
-    if timed_out:
-        log.warning("trainer.max_time ended training after %d of %d steps", taken, trainer.max_steps)
-    return TrainerResult(kept, taken, timed_out)
+    if not any((timer.time_remaining() or 0) <= 0 for timer in timers):
+        return TrainerResult(kept, taken, ())
+    ended = f"trainer.max_time ended training after {taken} of {trainer.max_steps} steps"
+    log.warning("%s", ended)
+    return TrainerResult(kept, taken, (f"{ended}: another machine ends elsewhere",))
 
 
 def _drop_unusable(callbacks: Sequence[L.Callback], val_rows: int, gaussians: bool) -> Sequence[L.Callback]:

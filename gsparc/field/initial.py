@@ -15,7 +15,7 @@ from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Smoothness
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 Snapshot = Literal["none", "phase", "phase_timing"]  # what every channel snapshot has of its own
 
@@ -78,7 +78,7 @@ class InitTask:
         transmitter: (3,) [m], the static one's; None where it moves.
         seed: of every random choice.
         run_dir: where reports go.
-        budget: of the fit.
+        watch: of the fit.
     """
 
     settings: ModelSettings
@@ -89,7 +89,7 @@ class InitTask:
     transmitter: Tensor | None
     seed: int
     run_dir: Path
-    budget: TimeBudget
+    watch: Stopwatch
 
     @property
     def most_anchors(self) -> int:

@@ -72,7 +72,11 @@ class Stored:
         except (yaml.YAMLError, RecursionError, ValueError):
             damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
             raise CheckpointError(damaged) from None
-        return loaded if isinstance(loaded, dict) else {}
+        if not isinstance(loaded, dict):
+            return {}
+        if isinstance(model := loaded.get("model"), dict):
+            model.pop("budget_s", None)  # of files when seconds ended fits
+        return loaded
 
 
 def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None) -> None:

@@ -116,9 +116,9 @@ def method_from_state(site: Site, state: dict[str, Any]) -> ClosedForm:
 def to_containers(part: Any) -> Any:
     """Return a dict of a dataclass by its fields' names, lists of tuples, and all else as it is.
 
-    >>> from gsparc.training.time_budget import Spent
-    >>> to_containers(Spent(wall=2.0))
-    {'wall': 2.0, 'processor': 0.0}
+    >>> from gsparc.training.cost import Cost
+    >>> to_containers(Cost({"search": 2.0}))
+    {'stages': {'search': 2.0}, 'unused': {}}
     """
     if is_dataclass(part):
         return {each.name: to_containers(getattr(part, each.name)) for each in fields(part)}
@@ -128,9 +128,9 @@ def to_containers(part: Any) -> Any:
 def from_containers(kind: type[T], stored: dict[str, Any]) -> T:
     """Return the dataclass of this kind whose `to_containers` was stored; lists become tuples.
 
-    >>> from gsparc.training.time_budget import Spent
-    >>> from_containers(Spent, {"wall": 2.0, "processor": 0.5})
-    Spent(wall=2.0, processor=0.5)
+    >>> from gsparc.training.cost import Cost
+    >>> from_containers(Cost, {"stages": {"search": 2.0}, "unused": {}}).seconds
+    2.0
 
     Raises:
         TypeError: a field without a default is missing, or there is one that the kind does not have.

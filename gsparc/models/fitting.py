@@ -30,7 +30,7 @@ from gsparc.models.device_offsets import take_off_devices
 from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ FOLDS, STATIONS = r"fold\d+", r"station\d+|unheard"  # names of parts' folders
 LAST = ("refit/last.ckpt", "last.ckpt")  # what an interrupted part leaves, the later stage first
 # Settings that a run must share with what it goes on from.
 DECIDING = ("model", "dataset.batch_size", "init_from", "stations")
-CHANGEABLE = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
+CHANGEABLE = ("trainer", "callbacks", "effort", "model.refit")
 """Settings that may change on the way, and are then named."""
 UNHASHED = (
     "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
@@ -69,7 +69,7 @@ def fit_or_resume(
         ValueError: the folder holds a part of other data, rows, seed or settings, or there are weights to
             start from (`init_from`), and the method has none.
     """
-    budget = TimeBudget()
+    watch = Stopwatch()
     # Before the method is made, as another may be called for once rows share a phase.
     ordered, rows = order_rows(data, fold)
     ordered = take_off_devices(ordered, rows)
@@ -78,7 +78,7 @@ def fit_or_resume(
         module.measurements = ordered
         context = replace(context, datamodule=module)
     (ordered, rows), left = align_phases(ordered, rows), context.resume
-    aligning = budget.spent if ordered.site.freedom != "none" else 0.0
+    aligning = watch.seconds if ordered.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count_reads("*")
     if left is not None and left.is_dir():
@@ -105,7 +105,7 @@ def fit_or_resume(
 
 def run_extra(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
     """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
-    report_fields = {"train_s": report.seconds, "notes": list(report.notes), "limited_by": report.limited_by}
+    report_fields = {"train_s": report.seconds, "notes": list(report.notes)}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**report_fields, **Origin.from_fit(data, fold, context).to_extra()}
 
@@ -127,7 +127,7 @@ def _restore_fit(
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
     notes = tuple(extra.get("notes", ()))
-    return method, FitReport(float(extra["train_s"]), notes, extra.get("limited_by"), cost)
+    return method, FitReport(float(extra["train_s"]), notes, cost)
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:

@@ -21,7 +21,7 @@ from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import EffectSettings, resolve_terms
 from gsparc.models.uplink.method import UplinkField
-from gsparc.training.time_budget import Effort
+from gsparc.training.effort import Effort
 
 log = logging.getLogger(__name__)
 

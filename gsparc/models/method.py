@@ -23,7 +23,7 @@ from gsparc.data.splits import Fold
 from gsparc.data.units import DB
 from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Effort
+from gsparc.training.effort import Effort
 
 if TYPE_CHECKING:
     from gsparc.processes.powers import PowerProcess
@@ -96,7 +96,7 @@ class MethodFactory(ABC):
     uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_parts = False  # whether it resumes parts in folders of their own
-    takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
+    takes_effort = False  # whether `FitContext.effort` changes its fit
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
 
     @abstractmethod
@@ -114,10 +114,6 @@ class MethodFactory(ABC):
         Raises:
             ValueError: this makes none of that class.
         """
-
-    def describe_time_limit(self, site: Site, budget_s: float | None) -> str:
-        """Say what ends a fit at a site before all that is counted; "" where nothing does."""
-        return "" if budget_s is None else f"within {budget_s:g} s"
 
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """Say how measurements would be learned, before they are; "" where the name says it.

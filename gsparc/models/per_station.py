@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.errors import list_first
-from gsparc.data.executor import run_all, uses_other_processes
+from gsparc.data.executor import run_all
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -37,7 +37,7 @@ from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import Spent, worst_clock
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class PerStation(Method):
 
     def __init__(self, factory: MethodFactory) -> None:
         self.factory, self.name, self.guesses = factory, factory.name, factory.guesses
-        self.takes_budget, self.uses_censored = factory.takes_budget, factory.uses_censored
+        self.takes_effort, self.uses_censored = factory.takes_effort, factory.uses_censored
         self._copies: dict[int, Method] = {}
         self._shared = False  # whether one copy knows all stations
 
@@ -130,7 +130,7 @@ class PerStation(Method):
             ValueError: a station of the test rows has too few training rows, or all are learned together, and
                 the method cannot take both ends for moving.
         """
-        budget = context.time_budget()
+        watch = Stopwatch()
         numbers = self._station_numbers(data, fold, context)
         self.site, notes = data.site, list[str]()
         left = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
@@ -138,17 +138,13 @@ class PerStation(Method):
         if resumable and left is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
-        # In other processes stations run side by side: each may take all of the seconds.
-        local = not uses_other_processes()
 
         def fit_station(turn: int) -> tuple[Method, FitReport]:
             number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
             resume = None if left is None else left / folder
             # The run's `datamodule` loads rows of all stations: a station's fit makes loaders of its own.
-            own = context.for_part(
-                folder, budget_s=budget.left_s if local else context.budget_s, datamodule=None, resume=resume
-            )
+            own = context.for_part(folder, datamodule=None, resume=resume)
             if len(numbers) > 1:
                 # Others take a second each: `run_all` says how far they are.
                 level = logging.INFO if self.factory.resumable else logging.DEBUG
@@ -157,7 +153,7 @@ class PerStation(Method):
             rows, part = self._rows_and_measurements(data, number)
             # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            before = budget.by_clock.wall
+            before = watch.seconds
             try:
                 copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
             except KeyboardInterrupt:
@@ -169,8 +165,7 @@ class PerStation(Method):
             if resumable and len(numbers) > 1:
                 extra = fitting.run_extra(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
-            earlier = max(report.seconds - (budget.by_clock.wall - before), 0.0)  # by the interrupted run
-            budget.charge(Spent(earlier, earlier))
+            watch.charge(max(report.seconds - (watch.seconds - before), 0.0))  # by the interrupted run
             return copy, report
 
         fits = run_all(fit_station, range(len(numbers)), f"stations of {self.name}")
@@ -182,9 +177,8 @@ class PerStation(Method):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
-        limited = worst_clock(*(one.limited_by for one in reports))
         cost = sum((one.cost for one in reports), Cost())
-        return FitReport(budget.by_clock.wall, tuple(notes), limited, cost)
+        return FitReport(watch.seconds, tuple(notes), cost)
 
     def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.

@@ -24,6 +24,7 @@ from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
+from gsparc.training.effort import refuse_seconds
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +33,7 @@ VALIDATED = SplitSettings().val_fraction
 
 def fit(
     rx: Any = None, tx: Any = None, *, rssi: Any = None, csi: Any = None, spectrum: Any = None,
-    unit: str = "dBm", model: str = "gsparc", effort: float = 1.0, budget_s: float | None = None,
+    unit: str = "dBm", model: str = "gsparc", effort: float = 1.0,
     seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None,
     terms: Sequence[Any] | Any = (), align: str = "auto", **arrays: Any,
 ) -> Predictor:  # fmt: skip
@@ -52,7 +53,6 @@ def fit(
         unit: of `rssi`, and of what is answered: dBm, dBW, dB (of a reference nobody knows), W, mW, ...
         model: a name of `gsparc train --help`.
         effort: that searches, rows and steps are multiplied by: .3 is quick, 3 thorough.
-        budget_s: seconds after which searches and steps end with what they have; None: no end.
         seed: of whatever is random.
         save: a checkpoint to write, for `gsparc.load` and all commands.
         settings: arguments of the model's class.
@@ -66,6 +66,7 @@ def fit(
         DataError: arrays that `gsparc check` would refuse, all problems with array and row.
         ValueError: no such model or setting, one that cannot learn these measurements, or no unit of powers.
     """
+    refuse_seconds(arrays)
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
     given = {name: np.asarray(value) for name, value in inputs.items() if value is not None}
     raw = Raw(given, {}) if rssi is None else _raw_powers(given, np.asarray(rssi), unit)
@@ -85,8 +86,8 @@ def fit(
             f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
         )
     factory = wrap_per_station(kind(**own), data)
-    fold = _split_validation(data, VALIDATED if factory.takes_budget else 0.0, seed)
-    context = FitContext(seed=seed, effort=effort, budget_s=budget_s)
+    fold = _split_validation(data, VALIDATED if factory.takes_effort else 0.0, seed)
+    context = FitContext(seed=seed, effort=effort)
     method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)

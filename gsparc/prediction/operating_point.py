@@ -65,7 +65,7 @@ def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], ReductionInpu
 
 log = logging.getLogger(__name__)
 
-CLOCK = replace(BLOCKS, rounds=12, budget_s=3.0)
+CLOCK = replace(BLOCKS, rounds=12, rounds_s=3.0)
 QUANTILE = 0.75  # a point fits when three of four of its queries did: its median then does so again
 QUERIES = 16  # at places drawn in the scene's box
 

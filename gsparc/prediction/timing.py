@@ -32,9 +32,9 @@ class ClockSettings(Checked):
 
     Attributes:
         rounds: largest number of rounds, each visiting every contender once.
-        least: rounds that are run even when they exceed the budget.
+        least: rounds that are run even when they exceed `rounds_s`.
         warmup: calls of each contender before the clock starts.
-        budget_s: no new round starts after this many seconds [s].
+        rounds_s: no new round starts after this many seconds [s].
         calls: timed calls of a visit.
         untimed: calls at the start of each visit, which bring the contender's data back into the caches.
     """
@@ -42,13 +42,13 @@ class ClockSettings(Checked):
     rounds: int = setting(60, whole(1))
     least: int = 5
     warmup: int = 3
-    budget_s: float = 5.0
+    rounds_s: float = 5.0
     calls: int = 1
     untimed: int = 0
 
 
 # Where contenders differ in threads: a new team of threads slows the first call of every visit.
-BLOCKS = ClockSettings(rounds=40, warmup=0, budget_s=60.0, calls=4, untimed=1)
+BLOCKS = ClockSettings(rounds=40, warmup=0, rounds_s=60.0, calls=4, untimed=1)
 
 
 def time_interleaved(
@@ -77,7 +77,7 @@ def time_interleaved(
     begin = time.perf_counter()
     try:
         for turn in range(settings.rounds):
-            if turn >= settings.least and time.perf_counter() - begin > settings.budget_s:
+            if turn >= settings.least and time.perf_counter() - begin > settings.rounds_s:
                 break
             for name in order:
                 if torch.get_num_threads() != threads[name]:

@@ -22,7 +22,6 @@ from gsparc.processes.censored import PseudoValues, log_evidence
 from gsparc.processes.factor import BLAS, Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
-from gsparc.processes.worker import stop_when_late
 
 LOOKS, SETTLED = 40, 5e-6  # of a walk: most evaluations, and the relative gain of a step that is the last
 BAD = 1e12  # in place of a density where no Cholesky factor exists
@@ -192,7 +191,7 @@ def minimise(
     start = min(points, key=lambda point: evaluate(point)[0]) if len(points) > 1 else points[0]
     result = minimize(
         evaluate, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-        options={"ftol": tolerance, "maxfun": looks}, callback=stop_when_late,
+        options={"ftol": tolerance, "maxfun": looks},
     )  # fmt: skip
     return result.x, float(result.fun)
 

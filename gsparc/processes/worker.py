@@ -39,12 +39,12 @@ def raise_if_cancelled() -> None:
 
 
 def end_when(condition: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Make `out_of_time` say, within, what `condition`, or who surrounds it, says, in this thread.
+    """Make `out_of_steps` say, within, what `condition`, or who surrounds it, says, in this thread.
 
     >>> with end_when(lambda: True):
-    ...     out_of_time()
+    ...     out_of_steps()
     True
-    >>> out_of_time()
+    >>> out_of_steps()
     False
     """
     return _add_condition("over", condition)
@@ -56,13 +56,7 @@ def step_limit(steps: int) -> Callable[[], bool]:
     return lambda: getattr(_asked, "steps", 0) >= end
 
 
-def out_of_time() -> bool:
-    """Tell whether this thread's time is over: a loop of more than a second then ends with what it has."""
+def out_of_steps() -> bool:
+    """Tell whether this thread's effort is spent: a loop of many steps then ends with what it has."""
     over = getattr(_asked, "over", None)
     return over is not None and over()
-
-
-def stop_when_late(*unused: object) -> None:
-    """Return the callback of `scipy.optimize.minimize`: no step follows when it is late."""
-    if out_of_time():
-        raise StopIteration

@@ -1,1 +1,1 @@
-"""How the field learns: the LightningModule, initial values, schedules, time budget, resuming."""
+"""How the field learns: the LightningModule, initial values, schedules, effort, resuming."""

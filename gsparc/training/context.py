@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting, whole
+from gsparc.data.limits import POSITIVE, Checked, choice, setting, whole
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import LINE, NO_COST, Cost
+from gsparc.training.effort import Effort
 from gsparc.training.race import Race
-from gsparc.training.time_budget import NOTHING, Clock, Effort, Spent, TimeBudget
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
@@ -34,18 +33,16 @@ class FitReport:
     Attributes:
         seconds: that it took, validations too [s].
         notes: what a reader must know (early stop, dropped components), one line each.
-        limited_by: the clock whose seconds decided something, so that another machine's result may differ.
         cost: of each stage.
     """
 
     seconds: float
     notes: tuple[str, ...] = ()
-    limited_by: Clock | None = None
     cost: Cost = NO_COST
 
     def with_cost(self, cost: Cost) -> FitReport:
         """Return the report with its stages, which are logged."""
-        log.info(LINE.format(of_what="", cost=cost.describe(self.limited_by)))
+        log.info(LINE.format(of_what="", cost=cost.describe()))
         return replace(self, cost=cost)
 
 
@@ -57,9 +54,6 @@ class FitContext(Checked):
         run_dir: where the fit may write; empty: nowhere.
         seed: of whatever is random and has no seed of its own.
         effort: that all counts of `Effort` are multiplied by.
-        budget_s: seconds after which searches and steps end with what they have; None: no end.
-        asked_s: `budget_s` of the whole fit, which a part's has what is left of.
-        budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
             `choose_stations` says.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
@@ -78,16 +72,12 @@ class FitContext(Checked):
         config_yaml: the whole configuration, stored in every checkpoint.
 
     Raises:
-        ValueError: an effort or a budget that is not positive, an unknown clock or `stations`, or a batch
-            without rows.
+        ValueError: an effort that is not positive, unknown `stations`, or a batch without rows.
     """
 
     run_dir: Path = Path()
     seed: int = 0
     effort: float = setting(1.0, POSITIVE)
-    budget_s: float | None = setting(None, or_null(POSITIVE))
-    asked_s: float | None = None
-    budget_clock: Clock = setting("wall", choice(*get_args(Clock)))
     stations: StationModels = setting("auto", choice(*get_args(StationModels)))
     split: SplitSettings | FileSettings | None = None
     leave_out: tuple[np.ndarray, ...] = ()
@@ -103,11 +93,6 @@ class FitContext(Checked):
     loggers: Sequence[Any] = ()
     terms: tuple[Any, ...] = ()
     config_yaml: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.asked_s is None:
-            object.__setattr__(self, "asked_s", self.budget_s)
 
     def for_part(self, folder: str, **changes: Any) -> FitContext:
         """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
@@ -128,7 +113,7 @@ class FitContext(Checked):
         curve.write_curve(self.run_dir, [*curve.read_curve(self.run_dir), row])
         curve.log_row(self.loggers, row)
 
-    def time_budget(self, before: Spent = NOTHING) -> TimeBudget:
-        """Return what a fit counts, and the seconds that may end it, some spent before."""
-        seconds = math.inf if self.budget_s is None else self.budget_s
-        return TimeBudget(seconds, self.budget_clock, before, Effort().scale_by(self.effort))
+    @property
+    def counts(self) -> Effort:
+        """What a fit counts before it ends."""
+        return Effort().scale_by(self.effort)

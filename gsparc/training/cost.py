@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from gsparc.training.time_budget import Clock
-
 LINE = "cost{of_what}: {cost}"  # of a log and of a summary
 LEAST_S = 0.05  # of a stage that is named
 
@@ -42,17 +40,16 @@ class Cost:
         """Return the sum over stages without weight [s]."""
         return sum(self.unused.values())
 
-    def describe(self, limited_by: Clock | None) -> str:
+    def describe(self) -> str:
         """Return one line."""
         parts = []
         for name, spent in self.stages.items():
             unused = f" ({self.unused[name]:.1f} s unused)" if name in self.unused else ""
             parts += [f"{name} {spent:.1f} s{unused}"] if spent >= LEAST_S else []
-        ended = "" if limited_by is None else "; the time limit ended it"
         total = f"{self.seconds:.1f} s"
         share = self.unused_s / max(self.seconds, LEAST_S)
         total = f"{share:.0%} of {total} unused" if self.unused else f"{total} in all"
-        return f"{', '.join(parts)}; {total}{ended}"
+        return f"{', '.join(parts)}; {total}"
 
 
 NO_COST = Cost()

@@ -21,7 +21,7 @@ FILLED = re.compile(r"own/\S+: \S+ \S+ after ")  # a line of each cell
 def words(tmp_path, *more: str) -> list[str]:
     return [
         f"+datasets.own.file={tmp_path / 'own.npz'}", "splits.random.datasets=[own]", "threads=1",
-        "budgets=[{seconds: 0.3, seeds: [0]}]", f"cells={tmp_path / 'cells'}",
+        "efforts=[0.005]", f"cells={tmp_path / 'cells'}",
         f"hydra.run.dir={tmp_path / 'run'}", *more,
     ]  # fmt: skip
 
@@ -55,7 +55,7 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     (first,) = (value for name, value in summary.items() if name.endswith("/first"))
     table = (tmp_path / "run" / "compare.csv").read_text()
-    assert first in ("nearest", "mean", "swiftwrf") and "own,random,0.3,swiftwrf" in table
+    assert first in ("nearest", "mean", "swiftwrf") and "own,random,0.005,swiftwrf" in table
     for file in ("compare.csv", "compare.md", "compare.png", "compare.svg"):
         assert (tmp_path / "run" / file).exists()
     assert "3 cells, 3 already done" in compare(tmp_path, only, "latency=false")[1]

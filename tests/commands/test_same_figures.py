@@ -24,7 +24,7 @@ CASES = {
     "stations of the city": ("dataset=powder", "dataset.file", "real/powder-rss-462mhz.npz",
                              "dataset.stations=[6,7,9]", "dataset.max_rows=700", "stations=together"),
 }  # fmt: skip
-SAME = ("model/init", "model/made", "model/steps", "model/num_gaussians", "model/limited_by_clock")
+SAME = ("model/init", "model/made", "model/steps", "model/num_gaussians")
 
 
 def trained(case, folder, *before):

@@ -237,14 +237,14 @@ def test_what_is_in_target_units_is_converted_with_the_target(room):
 
 def test_locate_built_whatever_class_a_checkpoint_named():
     """Settings that the stored class does not follow were instantiated, `os.system` as well."""
-    settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "budget_s": 2.0}
+    settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "effort": 2.0}
     split = SimpleNamespace(folds=[None])
     run = Opened([None], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, split)
     with pytest.raises(ValueError, match=r"os\.system.*refused"):
-        run.retraining(budget_s=5.0)
+        run.retraining(5.0)
     settings["model"] = {"_target_": "gsparc.models.baselines.nearest.Nearest"}
-    context = run.retraining(budget_s=5.0).context
-    assert (context.seed, context.budget_s, context.stations) == (3, 5.0, "auto")
+    context = run.retraining(5.0).context
+    assert (context.seed, context.effort, context.stations) == (3, 5.0, "auto")
     run.stored[0].configuration = {}
     with pytest.raises(DataError, match=r"a\.ckpt does not say how it was trained"):
         run.retraining()

@@ -69,12 +69,6 @@ def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tm
     assert f"no significant gain in {PATIENCE} validations" in caplog.text
 
 
-def test_a_budget_spent_before_the_first_step_took_steps_that_nothing_spoke_for(measured, tmp_path, caplog):
-    """One step of the first stage chose as many as seconds were left for in the second: 29.1 -> 28.0 dB."""
-    late = fitted(measured, tmp_path / "late", "init=images", "model.refit=true", budget_s=1e-3)
-    assert late.steps == 0 and "budget_s=0.001: none is left for gradient steps" in caplog.text
-
-
 def test_no_steps_of_the_model_took_those_of_the_trainer(measured, tmp_path):
     """`model=array`, which is solved, took as many gradient steps as `trainer.max_steps` said."""
     assert fitted(measured, tmp_path, "init=images", "model.steps=0", steps=20).steps_taken == 0

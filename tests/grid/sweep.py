@@ -62,7 +62,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="draw 100 combinations instead of the covering set")
     parser.add_argument("--rows", type=int, nargs="+", default=[30, 300, 3000])
     parser.add_argument("--csv", type=Path, help="write the table, as docs/results/kinds.csv is")
-    parser.add_argument("more", nargs="*", help="overrides, such as budget_s=5")
+    parser.add_argument("more", nargs="*", help="overrides, such as effort=.3")
     given = parser.parse_args()
     logging.disable(logging.WARNING)
     worlds = every(tuple(given.rows))

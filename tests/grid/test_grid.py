@@ -20,9 +20,9 @@ SOME = covering(every((300,)), 1)[:7]  # the first meet most pairs
 GROSS = 1.5  # times the allowed error, in decibels as much more
 
 
-def assert_served(world: World, folder, budget_s: float, parts=PARTS) -> None:
+def assert_served(world: World, folder, effort: float, parts=PARTS) -> None:
     """Train, and fail where the default is behind on fresh seeds as well, or a part does not answer."""
-    more = (f"budget_s={budget_s}", "threads=1")
+    more = (f"effort={effort}", "threads=1")
     found, objects = run(world, 0, folder, more)
     assert not found.refused, found.refused
     if found.grossly_behind(GROSS):
@@ -39,7 +39,7 @@ def assert_served(world: World, folder, budget_s: float, parts=PARTS) -> None:
 def test_every_kind_of_thirty_rows(number, tmp_path):
     # Each part of the product meets several kinds; all meet all in `make grid`.
     parts = [part for place, part in enumerate(PARTS) if place < 3 or (number + place) % 5 == 0]
-    assert_served(FEW[number], tmp_path, 1.5, parts)
+    assert_served(FEW[number], tmp_path, 0.1, parts)
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_every_kind_of_thirty_rows(number, tmp_path):
     [pytest.param(one, id=one.name, marks=pytest.mark.rare if i > 4 else ()) for i, one in enumerate(SOME)],
 )
 def test_every_kind_of_three_hundred_rows(world, tmp_path):
-    assert_served(world, tmp_path, 15.0)
+    assert_served(world, tmp_path, 0.5)
 
 
 def test_a_process_of_one_length_predicted_the_mean_in_a_gap(tmp_path):

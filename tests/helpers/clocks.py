@@ -21,8 +21,7 @@ class WoundClock:
 
 
 def wound(monkeypatch) -> SimpleNamespace:
-    """The `monotonic` and `process_time` that every time budget looks at."""
-    clocks = SimpleNamespace(monotonic=WoundClock(), process_time=WoundClock())
-    monkeypatch.setattr("gsparc.training.time_budget.time", clocks)
-    monkeypatch.setattr("gsparc.training.time_budget.torch.get_num_threads", lambda: 1)
+    """The clock that every stopwatch looks at."""
+    clocks = SimpleNamespace(monotonic=WoundClock())
+    monkeypatch.setattr("gsparc.training.stopwatch.time", clocks)
     return clocks

@@ -16,12 +16,9 @@ from gsparc.training.context import FitContext
 Form = TypeVar("Form", bound=ClosedForm)
 
 
-def fitted_to(
-    method: Form, data: Measurements, rows: np.ndarray, budget_s: float | None = None
-) -> tuple[Form, tuple[str, ...]]:
+def fitted_to(method: Form, data: Measurements, rows: np.ndarray) -> tuple[Form, tuple[str, ...]]:
     """The method fitted to rows (n,), and its notes."""
-    context = FitContext(budget_s=budget_s)
-    return method, method.fit(data, Fold(rows, rows[:0], rows[:0]), context).notes
+    return method, method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext()).notes
 
 
 def conditioned(prior: ChannelPrior, data: Measurements, rows: np.ndarray) -> ChannelField:

@@ -230,9 +230,9 @@ ALIKE = {
 SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
 TINY = {  # what makes each command short
-    "train": {**SHORT, "budget_s": "1", "baselines": "[mean]", "logger": "none"},
+    "train": {**SHORT, "effort": "0.1", "baselines": "[mean]", "logger": "none"},
     "study": {
-        **SHORT, "budget_s": "1", "baselines": "[]", "query_s": "0.1", "queries": "5", "rounds": "1",
+        **SHORT, "effort": "0.1", "baselines": "[]", "query_s": "0.1", "queries": "5", "rounds": "1",
     },
     "tradeoff": {"threads": "[1]", "rounds": "2", "baselines": "[]"},
     "evaluate": {**SHORT, "baselines": "[mean]"},

@@ -18,7 +18,7 @@ from gsparc.models.registry import method_class
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docs" / "results" / "compare" / "settings.csv"
 PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf")
-NO_SETTING = ("_target_", "name", "seed", "budget_s")
+NO_SETTING = ("_target_", "name", "seed")
 
 
 def table() -> str:

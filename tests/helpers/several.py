@@ -27,7 +27,7 @@ from gsparc.field.module import GaussianModule
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 BATCH = 7  # no multiple of two processes, nor a divisor of the rows
 
@@ -105,10 +105,9 @@ def trained(
         folder, batch_size=BATCH, datamodule=shown, trainer=options, resume=resume,
         callbacks=lambda: [*densifying(), last, *more],
     )  # fmt: skip
-    budget = TimeBudget()
     L.seed_everything(0, verbose=False)
     trained = made.double() if double else made
-    trainer, batches = make_trainer(trained, data, fold, context, TorchCheckpointIO(), budget)
+    trainer, batches = make_trainer(trained, data, fold, context, TorchCheckpointIO(), Stopwatch())
     with interruptible(trainer, batches):
         trainer.fit(trained, datamodule=batches, ckpt_path=resume, weights_only=True)
     return made

@@ -18,7 +18,7 @@ from gsparc.training.context import FitContext
 class Resumable(Nearest):
     """Counts its fits, and is interrupted in the one whose turn it is."""
 
-    resumable = takes_budget = True
+    resumable = takes_effort = True
     fits, stop_at = 0, 0
 
     def fit(self, data, fold, context):
@@ -106,7 +106,7 @@ def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(
     monkeypatch.setattr(executor, "SAY_S", 0.0)
     monkeypatch.setattr(executor, "LINES", 100)
     caplog.set_level("INFO", "gsparc")
-    fitted(town, tmp_path, budget_s=30.0)
+    fitted(town, tmp_path, effort=2.0)
     lines = [one.getMessage().partition(", about")[0] for one in caplog.records]
     said = [line for line in lines if "station" in line]
     left = [f"{i} of 3 stations of {Resumable.name}" for i in (1, 2)]

@@ -189,8 +189,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
 
 
 def test_seconds_of_stations_were_said_to_be_unused(town):
-    assert wrap_per_station(method_class("gsparc")(), town).takes_budget
-    assert not wrap_per_station(method_class("idw")(), town).takes_budget
+    assert wrap_per_station(method_class("gsparc")(), town).takes_effort
+    assert not wrap_per_station(method_class("idw")(), town).takes_effort
 
 
 def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):

@@ -89,7 +89,7 @@ def fitted(name: str) -> tuple[Method, Measurements, Fold]:
         data = MAKES.get(name, kinds.received)(Path(folder))
         method = unfitted(name).create_for(data)
         fold = fold_of(data)
-        method.fit(data, fold, short(Path(folder), 10, budget_s=3.0 if method.takes_budget else None))
+        method.fit(data, fold, short(Path(folder), 10, effort=0.1))
     return method, data, fold
 
 

@@ -108,10 +108,10 @@ def spoilt(data, wrong):
 def test_trained_methods_stay_finite_or_refuse(tmp_path, what, name, wrong):
     data = MAKE[what][0](tmp_path)
     fold = uplink_fold() if what == "uplink" else split_for({"name": "random", "seed": 1}, data).folds[0]
-    config = compose(f"model={name}", "budget_s=0.5", *(["model.max_steps=20"] if name == "fire" else []))
+    config = compose(f"model={name}", *(["model.max_steps=20"] if name == "fire" else []))
     method, asked = build(config.model).create_for(data), data.batch(np.setdiff1d(fold.test, [7]))
     try:
-        method.fit(spoilt(data, wrong) if wrong else data, fold, short(tmp_path, 4, budget_s=0.5))
+        method.fit(spoilt(data, wrong) if wrong else data, fold, short(tmp_path, 4, effort=0.1))
         found = method.predict(asked).mean
     except ValueError as refused:
         assert wrong and "\n" not in str(refused)

@@ -41,7 +41,7 @@ def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch,
         "training_step_case",
         lambda projection, device: training_step_case(projection, count=5, device=device),
     )
-    bench.task(compose("counts=[20]", "projections=[tangent]", "rounds=2", "budget_s=0", config="bench"))
+    bench.task(compose("counts=[20]", "projections=[tangent]", "rounds=2", "rounds_s=0", config="bench"))
     facts = json.loads((tmp_path / "summary.json").read_text())
     seconds = {name: value for name, value in facts.items() if name.startswith("bench/")}
     assert len(seconds) == 7 and min(seconds.values()) > 0

@@ -26,7 +26,7 @@ KINDS = {
 @pytest.mark.parametrize("model", ["gp", "gsparc"])
 def test_arrays_of_every_kind_become_a_predictor_that_is_stored(kind, model, tmp_path):
     file = tmp_path / "model.ckpt"
-    found = gsparc.fit(rx=PLACES, tx=END, model=model, budget_s=1.0, save=file, **KINDS[kind])
+    found = gsparc.fit(rx=PLACES, tx=END, model=model, effort=0.1, save=file, **KINDS[kind])
     assert " on arrays; " in repr(found)  # and not on gsparc
     again = gsparc.load(file)
     one, two = (np.asarray(getattr(each, kind)(rx=PLACES[:3])) for each in (found, again))
@@ -78,7 +78,7 @@ def test_powers_in_dbm_were_answered_in_milliwatts(model, several, tmp_path):
     level = np.c_[POWERS, np.roll(POWERS, 7)] if several else POWERS
     asked, answers = PLACES[:6] + 0.2, {}
     for unit in UNITS if model == "gp" else ("dBm", "W"):
-        found = gsparc.fit(rx=PLACES, rssi=UNITS[unit](level), unit=unit, model=model, budget_s=30.0,
+        found = gsparc.fit(rx=PLACES, rssi=UNITS[unit](level), unit=unit, model=model,
                            save=tmp_path / "m.ckpt", **where)  # fmt: skip
         again = gsparc.load(tmp_path / "m.ckpt")
         assert found.unit == again.unit == unit and gsparc.load(tmp_path / "m.ckpt", unit="dBm").unit == "dBm"

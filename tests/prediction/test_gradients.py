@@ -152,8 +152,7 @@ def fitted(name: str) -> tuple[Predictor, Measurements]:
             patch.setattr(complex_gp, "NEAREST", 20)
         method = wrap_per_station(case.make(), data).create_for(data)
         fold = make_split(data.moving, SplitSettings(), place=data.place).folds[0]
-        budget = 0.5 if method.takes_budget else None
-        method.fit(data, fold, short(Path(folder), 10, budget_s=budget))
+        method.fit(data, fold, short(Path(folder), 10, effort=0.1))
     site = type(data.site)(**{**vars(data.site), "origin": data.site.origin + WORLD})
     found = Predictor(method, site)
     return found if case.station is None else found.select_station(int(case.station)), data

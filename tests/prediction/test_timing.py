@@ -1,4 +1,4 @@
-"""The clock: turns, warm-up, budget, machine facts."""
+"""The clock: turns, warm-up, seconds, machine facts."""
 
 import torch
 from clocks import WoundClock
@@ -21,14 +21,14 @@ def test_contenders_take_turns_after_warming_up():
     assert {name: len(values) for name, values in times.items()} == {"a": 3, "b": 3}
 
 
-def test_budget_stops_rounds_but_not_below_the_least(monkeypatch):
+def test_seconds_stop_rounds_but_not_below_the_least(monkeypatch):
     watch = WoundClock()
     monkeypatch.setattr(timing.time, "perf_counter", watch)
     slow = {"slow": lambda turn: watch.wind(0.02)}
-    times = time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, budget_s=0.01))
+    times = time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, rounds_s=0.01))
     assert len(times["slow"]) == 4 and (abs(times["slow"] - 20) < 1).all()
     assert (
-        len(time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, budget_s=0.5))["slow"]) == 25
+        len(time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, rounds_s=0.5))["slow"]) == 25
     )
 
 

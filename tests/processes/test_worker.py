@@ -8,10 +8,9 @@ from gsparc.processes.worker import (
     Cancelled,
     cancel_when,
     end_when,
-    out_of_time,
+    out_of_steps,
     raise_if_cancelled,
     step_limit,
-    stop_when_late,
 )
 
 
@@ -32,14 +31,12 @@ def test_it_is_late_after_so_many_steps_of_this_thread_alone():
     def work():
         with end_when(step_limit(2)):
             for _ in range(3):
-                seen.append(out_of_time())
+                seen.append(out_of_steps())
                 raise_if_cancelled()
 
     thread = threading.Thread(target=work)
     with end_when(lambda: True):
         thread.start()
         thread.join()
-        assert out_of_time()
-        with pytest.raises(StopIteration):
-            stop_when_late()
-    assert seen == [False, False, True] and not out_of_time()
+        assert out_of_steps()
+    assert seen == [False, False, True] and not out_of_steps()

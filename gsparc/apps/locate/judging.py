@@ -145,8 +145,8 @@ def locate_by_model(
     if anew:
         if stored:
             log.info("it was calibrated with %s: calibrated anew", ", ".join(other) or "the same settings")
-        seconds, seed = float(config.calibrate_s), int(config.seed)
-        retraining = run.retraining(run_dir=run_dir / "left_out", seed=seed, budget_s=seconds)
+        seed = int(config.seed)
+        retraining = run.retraining(config.calibrate_effort, run_dir=run_dir / "left_out", seed=seed)
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:

@@ -36,7 +36,7 @@ class PromiseSettings(Checked):
         folds: fits, each without other blocks; more of few rows, until `ROWS_OUT` are held out.
         rows: of each fold that are asked about, at most, drawn evenly.
         block_m: side of the blocks, every second fold's twice that [m]; None: a tenth of the longer side.
-        budget_s: seconds of each refit; None: as the model was trained.
+        effort: of each refit; None: as the model was trained.
         seed: of the blocks.
     """
 
@@ -44,7 +44,7 @@ class PromiseSettings(Checked):
     folds: int = setting(4, whole(1))
     rows: int = setting(4000, whole(1))
     block_m: float | None = setting(None, or_null(POSITIVE))
-    budget_s: float | None = setting(None, or_null(POSITIVE))
+    effort: float | None = setting(None, or_null(POSITIVE))
     seed: int = setting(0, whole(0))
 
 
@@ -105,8 +105,8 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     """
     data = learned.data
     places = data.moving[learned.rows]
-    if settings.budget_s is not None:
-        learned = replace(learned, context=replace(learned.context, budget_s=settings.budget_s))
+    if settings.effort is not None:
+        learned = replace(learned, context=replace(learned.context, effort=settings.effort))
     longest = float(np.ptp(places[:, -3:-1], axis=0).max())
     # A tenth of the site: blocks large against the distance between rows, and some hundred of them.
     side = settings.block_m or longest / 10

@@ -29,6 +29,7 @@ from gsparc.data.instantiate import GROUPS, plugins
 from gsparc.evaluation import console
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
 from gsparc.models import registry
+from gsparc.training.effort import refuse_seconds
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
@@ -71,6 +72,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     console.ConsoleHandler.read.clear()
     try:
         with _noting(interrupts):
+            refuse_seconds(dict(word.lstrip("+").split("=", 1) for word in words if "=" in word))
             for folder in (given.config_dir, given.config_path):
                 check_yaml(folder)
             if given.cfg and given.multirun:

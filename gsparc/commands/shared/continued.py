@@ -7,6 +7,8 @@ from pathlib import Path
 
 import yaml
 
+from gsparc.training.effort import GONE
+
 PATHS = ("init_from", "known_walls")  # settings that may be files, beside those of groups
 DEEP = 4  # RUN/fold0/refit/last.ckpt
 
@@ -29,6 +31,7 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
     files = (told / "overrides.yaml", told / "hydra.yaml")
     its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
     own = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & said.keys()]
+    own = [one for one in own if _key(one).rpartition(".")[2] not in GONE]  # of runs that seconds ended
     own = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in own]
     once_only = [] if {"-m", "--multirun"} & {*words} else ["hydra.mode=RUN"]  # it may be a job of a multirun
     return [*own, *once_only, *words]

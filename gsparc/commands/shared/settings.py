@@ -18,6 +18,7 @@ from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import to_dict as to_dict
 from gsparc.models.registry import all_methods
+from gsparc.training.effort import refuse_seconds
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,7 @@ class RunSettings(Checked):
         eval_on: rows that are scored.
         baselines: names of methods; None: all plain ones that serve the data.
         effort: that all counts of a fit are multiplied by.
-        budget_s: seconds that may end training, or of timing; None: as the rest is configured.
-        budget_clock: `wall` or `processor`.
+        rounds_s: seconds after which timing starts no round.
         stations: `auto`, `each` or `together`.
         rounds, queries, draws: trainings of a study, timings of its rows, trials of a promise.
     """
@@ -41,8 +41,7 @@ class RunSettings(Checked):
     eval_on: str = setting("test", choice("train", "val", "test"))
     baselines: tuple[str, ...] | None = ()
     effort: float = setting(1.0, POSITIVE)
-    budget_s: float | None = setting(None, or_null(POSITIVE))
-    budget_clock: str = setting("wall", choice("wall", "processor"))
+    rounds_s: float = setting(1.0, POSITIVE)
     stations: str = setting("auto", choice("auto", "each", "together"))
     rounds: int = setting(1, whole(1))
     queries: int = setting(1, whole(1))
@@ -57,6 +56,7 @@ class RunSettings(Checked):
         """
         values = OmegaConf.to_container(config, resolve=True)
         assert isinstance(values, dict)
+        refuse_seconds(dict(_leaves(values)))
         known: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         settings = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
         trainer = values.get("trainer") or {}

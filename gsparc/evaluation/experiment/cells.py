@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from itertools import product
 
 from gsparc.data.instantiate import import_target, plugins
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models.registry import built_in_methods
 
-ANY = "any"  # stands for the budget or seed of a method that has none
+ANY = "any"  # stands for the effort or seed of a method that has none
 
 
 @dataclass(frozen=True)
@@ -20,22 +21,20 @@ class Contender:
     Attributes:
         name: in tables.
         choose: overrides of train.yaml that select it; empty: `model=<name>`.
-        budget: overrides with `{budget_s}`; empty when its time cannot be chosen.
+        effort: whether it takes part once for every effort and seed, or once.
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
         networks: takes part where stations are sectors of a network, which have one model whatever is chosen.
-        only_longest: too slow for any but the longest budget.
     """
 
     name: str
     choose: tuple[str, ...] = ()
-    budget: tuple[str, ...] = ()
+    effort: bool = False
     kinds: tuple[str, ...] = ()
     stations: bool = False
     scene: bool = False
     networks: bool = True
-    only_longest: bool = False
 
     def serves(self, problem: Problem) -> bool:
         """Return whether it can take part."""
@@ -44,10 +43,10 @@ class Contender:
         needs = problem.stations >= self.stations and problem.scene >= self.scene
         return kind and needs and self.networks >= problem.network
 
-    def overrides(self, budget_s: float | None) -> list[str]:
+    def overrides(self, effort: float | None) -> list[str]:
         """Return overrides of train.yaml, but for the seed."""
-        timed = [] if budget_s is None else [text.format(budget_s=f"{budget_s:g}") for text in self.budget]
-        return [*(self.choose or (f"model={self.name}",)), *timed]
+        own = self.choose or (f"model={self.name}",)
+        return [*own, *([] if effort is None else [f"effort={effort:g}"])]
 
 
 @dataclass(frozen=True)
@@ -56,19 +55,19 @@ class Cell:
 
     Attributes:
         dataset, split, method: names.
-        budget_s: seconds per model [s]; None for a method without budget.
+        effort: that what it counts is multiplied by; None for a method that counts nothing.
         seed: of the method, and of the split where that is drawn several times; None for neither.
     """
 
     dataset: str
     split: str
     method: str
-    budget_s: float | None
+    effort: float | None
     seed: int | None
 
     def __str__(self) -> str:
-        budget = ANY if self.budget_s is None else f"{self.budget_s:g}"
-        return f"{self.dataset}/{self.split}/{self.method}/{budget}/{ANY if self.seed is None else self.seed}"
+        effort = ANY if self.effort is None else f"{self.effort:g}"
+        return f"{self.dataset}/{self.split}/{self.method}/{effort}/{ANY if self.seed is None else self.seed}"
 
 
 def plugin_contenders() -> dict[str, Contender]:
@@ -77,68 +76,42 @@ def plugin_contenders() -> dict[str, Contender]:
     for name, path in plugins("model").items():
         kind = import_target(path)
         if name not in built_in_methods() and kind is not None:  # one that cannot be imported is warned of
-            budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
-            found[name] = Contender(name, (), budget, tuple(getattr(kind, "kinds", ())))
+            found[name] = Contender(name, (), kind.takes_effort, tuple(getattr(kind, "kinds", ())))
     return found
 
 
-@dataclass(frozen=True)
-class Budget:
-    """Seconds of training for every method that takes a budget.
-
-    Attributes:
-        seconds: per model [s]; a split of five folds trains five.
-        seeds: one training each.
-        splits: where it is given; empty for all.
-    """
-
-    seconds: float
-    seeds: tuple[int, ...]
-    splits: tuple[str, ...] = ()
-
-
 def plan_cells(
-    problems: Sequence[Problem], methods: Mapping[str, Contender], budgets: Sequence[Budget],
-    only: Sequence[str] = (),
+    problems: Sequence[Problem], methods: Mapping[str, Contender], efforts: Sequence[float],
+    seeds: Sequence[int], only: Sequence[str] = (),
 ) -> list[tuple[Problem, Cell]]:  # fmt: skip
-    """List all cells, the most useful first: every problem's table before further seeds and longer budgets.
+    """List all cells, the most useful first: every problem's table before further efforts and seeds.
 
     Args:
         problems: the most wanted first; one of several draws of a split gives a method its seed.
         methods: who takes part.
-        budgets: the most wanted first, which splits that none of them names have, too.
+        efforts, seeds: the most wanted first; a method that counts nothing takes part once.
         only: patterns of `str(cell)`; empty for all.
 
     Raises:
         ValueError: a pattern that no cell matches.
     """
     able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
-    # Methods without a budget first: they stand in the tables of all budgets.
-    once = ((p, m) for p, those in able for m in those if not m.budget)
+    # Methods that count nothing first: they stand in the tables of all efforts.
+    once = ((p, m) for p, those in able for m in those if not m.effort)
     cells = [(p, Cell(p.dataset, p.split, m.name, None, p.draw)) for p, m in once]
-    longest = max((b.seconds for b in budgets), default=0.0)
-    # First seeds of all budgets before second ones.
-    turns = ((n, b) for n in range(max((len(b.seeds) for b in budgets), default=0)) for b in budgets)
-    named = {split for budget in budgets for split in budget.splits}
-    for turn, budget in ((n, b) for n, b in turns if n < len(b.seeds)):
-        for problem, those in able:
-            # A split that no budget names has the first: a table without our row would mislead.
-            of = not budget.splits or problem.split in budget.splits
-            of |= budget is budgets[0] and problem.split not in named
+    for turn, seed in enumerate(seeds):
+        for effort, (problem, those) in product(efforts, able):
             # A drawn split has its draws for seeds: further seeds would repeat the first draw.
-            if not of or (turn and problem.draw is not None):
+            if turn and problem.draw is not None:
                 continue
-            seed = budget.seeds[turn] if problem.draw is None else problem.draw
-            cells += [
-                (problem, Cell(problem.dataset, problem.split, m.name, budget.seconds, seed))
-                for m in those
-                if m.budget and not (m.only_longest and (turn > 0 or budget.seconds < longest))
-            ]
+            own = seed if problem.draw is None else problem.draw
+            named = ((problem.dataset, problem.split, m.name) for m in those if m.effort)
+            cells += [(problem, Cell(*name, effort, own)) for name in named]
     names = [str(cell) for _, cell in cells]
     for pattern in only:
         if not any(fnmatchcase(name, pattern) for name in names):
             raise ValueError(
-                f"only: {pattern!r} matches no cell; they are dataset/split/method/budget/seed, "
+                f"only: {pattern!r} matches no cell; they are dataset/split/method/effort/seed, "
                 f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
     return [one for one in cells if not only or any(fnmatchcase(str(one[1]), part) for part in only)]

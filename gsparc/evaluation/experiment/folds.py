@@ -25,14 +25,13 @@ from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import wrap_per_station
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
-from gsparc.training.time_budget import Clock, worst_clock
 
 
 def fit_context(config: DictConfig, **others: Any) -> FitContext:
     """Return the context of a fit as a composed configuration says, and what is given.
 
     Args:
-        config: its seed, effort, budget, split, `init_from`, batch size, Trainer and callbacks.
+        config: its seed, effort, split, `init_from`, batch size, Trainer and callbacks.
         **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
     """
     init_from = config.get("init_from")
@@ -54,7 +53,6 @@ def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     return {
         # `get`: configurations of other commands, and older ones, lack some of these keys.
         "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
-        "budget_s": config.get("budget_s"), "budget_clock": config.get("budget_clock", "wall"),
         "stations": config.get("stations", "auto"), "split": own and split_settings(own),
     }  # fmt: skip
 
@@ -73,7 +71,6 @@ class FoldFits:
         train_s: seconds of each fit [s], without validation.
         train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not inflate them.
         notes: what the first fold's fit said.
-        limited_by: the clock whose seconds decided something: on another machine the result may be another.
         cost: of all fits together.
     """
 
@@ -81,7 +78,6 @@ class FoldFits:
     train_s: tuple[float, ...]
     train_cpu_s: tuple[float, ...]
     notes: tuple[str, ...]
-    limited_by: Clock | None = None
     cost: Cost = NO_COST
 
     def figures(self, data: Measurements, split: Split) -> dict[str, float | None]:
@@ -136,5 +132,5 @@ def fit_folds(
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
         methods, tuple(one.seconds for one in reports), processor, reports[0].notes,
-        worst_clock(*(one.limited_by for one in reports)), sum((one.cost for one in reports), NO_COST),
+        sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip

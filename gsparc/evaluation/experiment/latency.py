@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
 ENDLESS_MS = 10_000.0  # from here on it is timed once
 # 60 rounds give a 95th percentile from three samples beyond it.
-FAST = ClockSettings(rounds=60, budget_s=30.0)
-SLOW = ClockSettings(rounds=5, least=1, warmup=0, budget_s=20.0)
+FAST = ClockSettings(rounds=60, rounds_s=30.0)
+SLOW = ClockSettings(rounds=5, least=1, warmup=0, rounds_s=20.0)
 ONCE = replace(SLOW, rounds=1)
 
 
@@ -41,7 +41,7 @@ def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, di
     methods: dict[str, Method] = {}
     for one in filled:
         if one.cell.method not in methods:
-            # The first of a method's cells stands for all of its budgets and seeds.
+            # The first of a method's cells stands for all of its efforts and seeds.
             methods[one.cell.method] = loading.load(one.checkpoint)[0]
     calls = query_calls(methods, problem.data, problem.folds.folds[0].test)
     found: dict[str, dict[str, float]] = {}

@@ -21,7 +21,7 @@ from gsparc.models.method import Method, MethodFactory
 log = logging.getLogger(__name__)
 
 # Counted where they are heeded; of other settings only those are judged whose reads are noted.
-COUNTED = ("trainer", "callbacks", "dataset.batch_size", "budget_s", "stations")
+COUNTED = ("trainer", "callbacks", "dataset.batch_size", "effort", "stations")
 RENDERED = (  # settings of the model that only rasterized Gaussians have
     "field", "emission", "attenuation", "raster", "response", "confidence", "loss", "optimizer", "refit",
     "keep_best", "steps",
@@ -84,7 +84,7 @@ def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | 
         data: that it learned from.
     """
     stations = data.site.stations is not None and len(data.site.stations) > 1
-    counted = {"budget_s": method.takes_budget, "stations": stations}
+    counted = {"effort": method.takes_effort, "stations": stations}
     reads.noted |= {name for name, heeded in counted.items() if heeded}
     known = {option.path for option in reads.options}
     why: dict[str, list[str]] = defaultdict(list)
@@ -109,7 +109,7 @@ def _instead(path: str, method: Method, reads: Reads, data: Measurements) -> str
     started = method.facts()["model/init"] if group == "init" else None
     # The first that holds is told: from what decides all options to what concerns one.
     reasons = (
-        (path == "budget_s", f"the seconds of {method.name} cannot be chosen"),
+        (path == "effort", f"{method.name} counts nothing"),
         (path == "stations", "there is one station"),
         (group == "split" and data.release_split is not None, REDRAW),
         (group == "split", "this split does not use it"),

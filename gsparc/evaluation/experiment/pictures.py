@@ -19,8 +19,8 @@ LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
 
 
-def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()) -> None:
-    """Save accuracy against costs, see `save`: a line joins the budgets; `ours` has a large mark.
+def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()) -> None:
+    """Save accuracy against costs, see `save`: a line joins the efforts; `ours` has a large mark.
 
     `rows` are as of `table_of_cells`.
     """
@@ -49,7 +49,7 @@ def draw_budgets(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
 
 def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
     for name, own in rows.dropna(subset=horizontal).groupby("method", sort=False):
-        own = own.sort_values("budget_s", na_position="first")
+        own = own.sort_values("effort", na_position="first")
         style = style_of(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
         x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
         level = [shown(*one) for one in zip(own.figure, own.score_db, strict=True)]
@@ -65,7 +65,7 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
     splits, names = list(rows.split.unique()), list(methods_by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
-        here = rows[rows.split == split].drop_duplicates("method", keep="last")  # the longest budget
+        here = rows[rows.split == split].drop_duplicates("method", keep="last")  # the largest effort
         here = here.fillna({"value_error": 0.0}).set_index("method")
         most = (here.value + here.value_error).max()
         best = here.score_db.idxmax()

@@ -27,7 +27,7 @@ from gsparc.models.checkpoint import MODEL
 
 log = logging.getLogger(__name__)
 
-FREE_S = 5.0  # guessed for a method without a budget
+FREE_S, EFFORT_S = 5.0, 60.0  # guessed for a method that counts nothing; for one of effort 1
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,10 @@ class PreparedCell:
 
     @property
     def expected_s(self) -> float:
-        """Seconds it will take: its budget on every fold, and something for scoring [s]."""
+        """Seconds it may take, guessed by its effort, and something for scoring [s]."""
         # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
-        return len(self.problem.folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
+        fit_s = FREE_S if self.cell.effort is None else EFFORT_S * self.cell.effort
+        return len(self.problem.folds.folds) * (fit_s + 2.0)
 
     def result(self) -> CellResult | None:
         """Return the result, if it is done."""
@@ -105,8 +106,8 @@ def prepare_cell(
     cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, cells_dir: Path,
     reuse: bool = False,
 ) -> PreparedCell:  # fmt: skip
-    """Compose a cell's configuration and name its folder, `dataset/split/method/budget/seed`."""
-    overrides = [*problem.chosen, *contender.overrides(cell.budget_s)]
+    """Compose a cell's configuration and name its folder, `dataset/split/method/effort/seed`."""
+    overrides = [*problem.chosen, *contender.overrides(cell.effort)]
     config = compose(settings, overrides, problem.draw, cell.seed)
     state = State.from_config(config, problem.content, problem.folds.sha256)
     return PreparedCell(cell, problem, config, cells_dir / str(cell), state, reuse)

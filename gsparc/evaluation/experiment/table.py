@@ -1,4 +1,4 @@
-"""Cells of one problem and budget side by side: accuracy, latency, training."""
+"""Cells of one problem and effort side by side: accuracy, latency, training."""
 
 from __future__ import annotations
 
@@ -41,14 +41,12 @@ BESIDE = {  # figures beside the score, and their headings, by their columns
     ),
     "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
 }  # fmt: skip
-OTHERWISE = 0.1  # share of a budget: a method that spent more or less than this beside it is named
-LITTLE = 2 / 3  # share of a budget below which a longer one is proposed
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 GIVEN = {"newrf", "directional_gp", "calibrated_raytracer"}  # methods that learn from more than places
 PROBLEM = ["dataset", "split"]
-GROUP = [*PROBLEM, "budget_s", "method"]
-CELL = [*GROUP[:2], "method", "budget_s", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
+GROUP = [*PROBLEM, "effort", "method"]
+CELL = [*GROUP[:2], "method", "effort", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
     *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
     "behind_error_db", *BESIDE, "second_figure", "second_value", "train_s",
@@ -74,12 +72,12 @@ def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
         return pd.DataFrame(columns=CELL)
     # pandas would make 1.0 of 1 where another row has None.
     seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
-    numbers = ["budget_s", "load", *BESIDE, "second_value"]
+    numbers = ["effort", "load", *BESIDE, "second_value"]
     return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
 
 
 def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = None) -> pd.DataFrame:
-    """Return the cells of a method under one budget, averaged over seeds or over draws of the split.
+    """Return the cells of a method of one effort, averaged over seeds or over draws of the split.
 
     Args:
         filled: cells.
@@ -88,7 +86,7 @@ def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = Non
     Returns:
         Columns `ROW` (see `columns_of_csv`), and `results`, a row of each seed or draw; NaN where something
         is not known.
-        `budget_s` [s]: NaN for a method without one, which stands in the tables of all budgets.
+        `effort`: NaN for a method that counts nothing, which stands in the tables of all efforts.
         `score_db`: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE; `spread_db`: its standard
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
         `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
@@ -124,7 +122,7 @@ def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = Non
     timed = pd.DataFrame(columns=TIMED) if timed is None else timed
     rows = rows.merge(timed, "left").astype(dict.fromkeys(SPEED, float))
     rows["order"] = rows.groupby(PROBLEM, sort=False).ngroup()
-    rows = rows.sort_values(["order", "budget_s", "method"], na_position="first")
+    rows = rows.sort_values(["order", "effort", "method"], na_position="first")
     return rows[[*ROW, "results"]].reset_index(drop=True)
 
 
@@ -152,23 +150,23 @@ def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
 
 
 def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return a table per dataset, split and budget, best first; methods without a budget stand in each."""
+    """Return a table per dataset, split and effort, best first; methods that count nothing stand in each."""
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
-        without = here.budget_s.isna()
-        for budget in sorted(here.budget_s.dropna().unique()) or [None]:
-            members = here[without | (here.budget_s == budget)]
+        without = here.effort.isna()
+        for effort in sorted(here.effort.dropna().unique()) or [None]:
+            members = here[without | (here.effort == effort)]
             blocks.append(members.sort_values("score_db", ascending=False, kind="stable"))
     return blocks
 
 
 def title_of(block: pd.DataFrame) -> str:
-    """Return names and budget of a block, and how often its split was drawn."""
-    budget = block.budget_s.max()
-    timed = "" if np.isnan(budget) else f", a budget of {budget:g} processor seconds per model"
+    """Return names and effort of a block, and how often its split was drawn."""
+    effort = block.effort.max()
+    counted = "" if np.isnan(effort) else f", effort {effort:g}"
     draws = int(block.seeds.max()) if block.draws.any() else 0
     count = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
-    return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{timed}{count}"
+    return f"{block.dataset.iloc[0]}, split {block.split.iloc[0]}{counted}{count}"
 
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
@@ -198,15 +196,6 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
-    budget, share = block.budget_s.max(), block.train_cpu_s / block.budget_s  # NaN without a budget
-    otherwise = block[(share - 1).abs() > OTHERWISE].itertuples()
-    if spent := ", ".join(f"{row.method} {row.train_cpu_s:.3g}" for row in otherwise):
-        lines.append(f"spent of {budget:g} processor seconds: {spent}")
-    # Beside a method that used it whole; one that used next to nothing has ended by itself.
-    for row in block[share.between(OTHERWISE, LITTLE) & (share.max() > 1 - OTHERWISE)].itertuples():
-        more = f"budgets=[{{seconds: {budget**2 / row.train_cpu_s:.2g}, seeds: [0]}}]"
-        used = f"{row.method} used {row.train_cpu_s / budget:.0%} of its budget"
-        lines[-1] += f"; {used}: {more} gives it as much, unless it ended by itself"
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
@@ -219,7 +208,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another program (at commit): {old}")
     lines += [GIVEN_HEARD] * bool(block.outage.notna().any())
-    return lines + busy_machine(block.load[block.budget_s.notna()].dropna().tolist())
+    return lines + busy_machine(block.load[block.effort.notna()].dropna().tolist())
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:

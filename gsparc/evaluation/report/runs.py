@@ -221,7 +221,7 @@ def error_sizes(run: Run, name: str) -> np.ndarray:
 log = logging.getLogger(__name__)
 
 
-def time_again(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
+def time_again(runs: Sequence[Run], *, rounds: int = 40, rounds_s: float = 60.0) -> list[Run]:
     """Return the runs with the times of single queries, each also written to its `render_ms.csv`.
 
     A sweep runs jobs at the same time, which disturbs their times; call this after it.
@@ -229,7 +229,7 @@ def time_again(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0)
     Args:
         runs: those without a readable checkpoint keep the times they have.
         rounds: visits to each.
-        budget_s: no new round after this [s].
+        rounds_s: no new round after this [s].
     """
     calls: dict[int, Call] = {}
     for number, run in enumerate(runs):
@@ -248,7 +248,7 @@ def time_again(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0)
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }
-    times = time_interleaved(calls, replace(BLOCKS, rounds=rounds, budget_s=budget_s), threads)
+    times = time_interleaved(calls, replace(BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
     for number, ms in times.items():
         write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
     return [replace(run, render_ms=times[i]) if i in times else run for i, run in enumerate(runs)]

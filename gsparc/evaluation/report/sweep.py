@@ -36,11 +36,11 @@ class SweepReport(Callback):
     Args:
         retime: time the models of the sweep when all jobs are done, in turns, with nothing beside them.
         rounds: visits to each model by the clock.
-        budget_s: no new round after this [s].
+        rounds_s: no new round after this [s].
     """
 
-    def __init__(self, retime: bool = True, rounds: int = 40, budget_s: float = 60.0) -> None:
-        self.retime, self.rounds, self.budget_s = retime, rounds, budget_s
+    def __init__(self, retime: bool = True, rounds: int = 40, rounds_s: float = 60.0) -> None:
+        self.retime, self.rounds, self.rounds_s = retime, rounds, rounds_s
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **unused: Any) -> None:
         """Report a failure when it happens; the sweep goes on, and ends with exit status 1."""
@@ -83,7 +83,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
 
     runs = find_runs([folder])
     if settings.retime:
-        runs = time_again(runs, rounds=settings.rounds, budget_s=settings.budget_s)
+        runs = time_again(runs, rounds=settings.rounds, rounds_s=settings.rounds_s)
     origin = write_report(folder, title, runs)
     for number, (study, together) in enumerate(group_by_study(runs).items()):
         group = drop_shared_overrides(together)

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.physics.array_response import make_co_array
 from gsparc.processes.factor import Factor
-from gsparc.training.time_budget import Effort
+from gsparc.training.effort import Effort
 
 log = logging.getLogger(__name__)
 

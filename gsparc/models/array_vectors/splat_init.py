@@ -33,7 +33,7 @@ from gsparc.ops import Pose
 from gsparc.physics.array_response import steering_matrix
 from gsparc.processes.features import whitened_features
 from gsparc.processes.neighbourhood import covering_rows
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ def start_from_vectors(task: InitTask) -> Start:
             "model.attenuation.inverse_distance=false"
         )
     process = learn_vector_process(
-        task.data, task.rows, task.most_anchors, task.seed, task.run_dir, task.budget
+        task.data, task.rows, task.most_anchors, task.seed, task.run_dir, task.watch
     )
     return Start(
         process.prior, partial(set_emissions, process=process, receiver=task.receiver), process.left_out
@@ -82,7 +82,7 @@ def start_from_vectors(task: InitTask) -> Start:
 
 def learn_vector_process(
     data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path,
-    budget: TimeBudget | None = None,
+    watch: Stopwatch | None = None,
 ) -> VectorProcess:  # fmt: skip
     """Retrieve the vectors of the given rows (cached where known) and fit their process.
 
@@ -92,7 +92,7 @@ def learn_vector_process(
         anchors: largest number of places that stand for them.
         seed: of every random choice.
         run_dir: for the report of phase retrieval.
-        budget: see `recover_cached`.
+        watch: see `recover_cached`.
 
     Raises:
         ValueError: the site declares no usable array, or there are no rows.
@@ -103,7 +103,7 @@ def learn_vector_process(
     if not len(rows):
         raise ValueError("the training set is empty")
     array, grid, wavelength = site.array_geometry()
-    recovery = recover_cached(data, rows, seed, budget)
+    recovery = recover_cached(data, rows, seed, watch)
     if run_dir != Path():  # of a run: a fit in Python leaves nothing behind
         write_recovery_report(recovery, data, rows, run_dir / "array_recovery.csv")
     matrix = steering_matrix(array, grid, wavelength).numpy()

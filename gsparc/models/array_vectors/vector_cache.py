@@ -16,7 +16,7 @@ from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.models.array_vectors.phase_retrieval import RecoveredVectors, recover_vectors
 from gsparc.models.target_rows import training_targets
-from gsparc.training.time_budget import NOTHING, Spent, TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +24,7 @@ AT_ONCE = 1024  # rows solved together, which bounds the memory
 
 
 @lru_cache(maxsize=1)
-def _solved_rows(key: str) -> dict[int, tuple[tuple[Any, ...], Spent, TimeBudget]]:
+def _solved_rows(key: str) -> dict[int, tuple[tuple[Any, ...], float, Stopwatch]]:
     """By row of the data last asked for its parts of `RecoveredVectors`, their seconds, and who paid last."""
     return {}
 
@@ -33,7 +33,7 @@ forget_vectors = _solved_rows.cache_clear  # before what is to pay for its own w
 
 
 def recover_cached(
-    data: Measurements, rows: np.ndarray, seed: int = 0, budget: TimeBudget | None = None
+    data: Measurements, rows: np.ndarray, seed: int = 0, watch: Stopwatch | None = None
 ) -> RecoveredVectors:
     """Return array vectors of the given rows.
 
@@ -44,26 +44,25 @@ def recover_cached(
         data: spectra of a static array.
         rows: (n,) sorted.
         seed: of the random starts.
-        budget: of the fit, which is charged for rows that another fit has solved.
+        watch: of the fit, which is charged for rows that another fit has solved.
     """
-    budget = budget or TimeBudget()
+    watch = watch or Stopwatch()
     known = _solved_rows(f"{identity_hash(data)} {seed}")
     names = [one.name for one in fields(RecoveredVectors)]
     missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
-    unpaid = [row for row in rows.tolist() if row in known and known[row][2] is not budget]
+    unpaid = [row for row in rows.tolist() if row in known and known[row][2] is not watch]
     if unpaid:
-        more = sum((known[row][1] for row in unpaid), NOTHING)
+        more = sum(known[row][1] for row in unpaid)
         said = "array vectors of %d spectra were computed before, by a fit whose %.2f s count here, too"
-        log.info(said, len(unpaid), more.wall)
-        budget.charge(more)
-        known.update((row, (*known[row][:2], budget)) for row in unpaid)
+        log.info(said, len(unpaid), more)
+        watch.charge(more)
+        known.update((row, (*known[row][:2], watch)) for row in unpaid)
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
-        began = budget.by_clock
+        began = watch.seconds
         recovery = recover_vectors(data.site, training_targets(data, part), data.tx[part], seed)
         parts = zip(*(getattr(recovery, name) for name in names), strict=True)
-        spent = budget.by_clock - began
-        each = Spent(spent.wall / len(part), spent.processor / len(part))
-        known.update((row, (one, each, budget)) for row, one in zip(part.tolist(), parts, strict=True))
+        each = (watch.seconds - began) / len(part)
+        known.update((row, (one, each, watch)) for row, one in zip(part.tolist(), parts, strict=True))
     return RecoveredVectors(*map(np.stack, zip(*(known[row][0] for row in rows.tolist()), strict=True)))
 
 

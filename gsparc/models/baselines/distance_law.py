@@ -27,8 +27,7 @@ from gsparc.physics.decibels import RELATIVE_DB, to_decibels
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import TINY_M, Law
-from gsparc.processes.worker import stop_when_late
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 EXPONENTS = (0.0, 8.0)  # bounds of n: 2 in free space, 6 through many walls
 USUAL, SPREAD = 3.0, 2.0  # mean and deviation of a prior on n, which only few rows notice
@@ -174,11 +173,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
         place = place + 0.05 * size * flat  # in the plane itself heights have no slope
         loss = to_decibels(((place - rows.places) ** 2).sum(1) + tiny) / 2
         start = np.concatenate([_initial_parameters(loss, rows), place / size])
-        result.append(
-            minimize(
-                neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits, callback=stop_when_late
-            )
-        )
+        result.append(minimize(neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits))
     place = min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size
     if flat[2]:  # its mirror image fits as well, and few stations stand under the ground
         place[2] = low[2] + abs(place[2] - low[2])
@@ -213,13 +208,13 @@ class DistanceLaw(Differentiable):
         raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
-        started = TimeBudget()
+        started = Stopwatch()
         self.law, notes = fit_site_law(rows, self.fitted_site)
         law = self.law
         summary = (
             f"exponent {law.exponent:.3g} from {law.floor:.3g} m on, "
             f"deviation {law_variance(law) ** 0.5:.3g} dB"
-            f" ({started.spent:.2g} s)"
+            f" ({started.seconds:.2g} s)"
         )
         return tuple(f"distance_law: {note}" for note in (summary, *notes))
 

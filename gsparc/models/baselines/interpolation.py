@@ -17,7 +17,7 @@ from gsparc.models.target_rows import heard_rows, power_rows, to_targets, traini
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 
 def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
@@ -46,7 +46,7 @@ class Interpolator(Method):
         rows = known if self.uses_censored else heard_rows(data, known)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
-        start = TimeBudget()
+        start = Stopwatch()
         # Before learning, which asks for the kind and shape of targets.
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
         # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
@@ -62,7 +62,7 @@ class Interpolator(Method):
                 f"{self.name}: its checkpoint loses {', '.join(lost)}: name it in `stored` (tensor, number, "
                 "string) or make it again in `_relearn(state)`"
             )
-        return FitReport(start.spent, (*notes, *_runs_note(data, known)))
+        return FitReport(start.seconds, (*notes, *_runs_note(data, known)))
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""

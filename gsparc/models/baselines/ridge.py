@@ -14,7 +14,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
 from gsparc.models.uplink.interface import UplinkMethod, mean_power, root_mean_power
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 PENALTIES = (10.0 ** np.arange(-6, 1)).tolist()  # of the Gram matrix's mean diagonal
 
@@ -35,7 +35,7 @@ class Ridge(UplinkMethod):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Solve the normal equations for each penalty and scaling, keep what validates best."""
-        started = TimeBudget()
+        started = Stopwatch()
         self.site = self._require_uplink(data)
         best: tuple[float, float, bool] | None = None
         for unit in (True, False):
@@ -54,7 +54,7 @@ class Ridge(UplinkMethod):
         self.unit = best[2]
         self.maps = _solve_ridge(*self._normal_equations(data, every, self.unit), best[1])
         note = f"ridge: penalty {best[1]:g}, rows {'of unit power' if best[2] else 'as they are'}"
-        return FitReport(started.spent, (note,))
+        return FitReport(started.seconds, (note,))
 
     def _normal_equations(self, data: Measurements, rows: np.ndarray, unit: bool) -> tuple[Tensor, Tensor]:
         """Gram matrices (M, F, F) and products with the targets (M, F, O)."""

@@ -39,7 +39,8 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Effort, TimeBudget
+from gsparc.training.effort import Effort
+from gsparc.training.stopwatch import Stopwatch
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (10.0 ** np.arange(-4, 1)).tolist()  # of the signal's power, candidates
@@ -78,7 +79,7 @@ class ComplexGP(ClosedForm):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
-        started = TimeBudget()
+        started = Stopwatch()
         if data.site.kind != "csi" or data.site.wavelength is None:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = np.concatenate([fold.train, fold.val])
@@ -88,7 +89,7 @@ class ComplexGP(ClosedForm):
         notes = self._fit_by_neighbours(data, known) if many else self._fit_one_factor(data, known)
         length, noise = float(self.kernel.length), self.kernel.noise
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
-        return FitReport(started.spent, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
+        return FitReport(started.seconds, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
     def _candidate_kernels(self, places: Tensor, values: Tensor) -> Iterator[Kernel]:
         """Candidates for values (n, R) at places (n, D) [m]; two lengths beside `neighbours`."""

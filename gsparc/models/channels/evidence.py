@@ -23,7 +23,6 @@ from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.left_out import left_out_residuals as left_out_rows
-from gsparc.processes.worker import stop_when_late
 
 WEAK = 1e-3  # pull of every parameter to where it started, which holds those that nothing depends on
 STEPS = 30
@@ -193,7 +192,7 @@ def fit_terms(
         return total, gradient.numpy()
 
     optimum = minimize(
-        cost_and_slopes, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, callback=stop_when_late,
+        cost_and_slopes, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds,
         options={"maxiter": steps, "ftol": SETTLED},
     )  # fmt: skip
     found = torch.from_numpy(optimum.x)

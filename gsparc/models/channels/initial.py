@@ -47,8 +47,7 @@ from gsparc.models.run_factors import RunFactors
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.left_out import rows_of_groups
 from gsparc.processes.places import ORIGIN, has_both_ends
-from gsparc.processes.worker import Cancelled, cancel_when
-from gsparc.training.time_budget import Effort, TimeBudget
+from gsparc.training.effort import Effort
 
 BEYOND = 10.0  # extents of the places after which nothing is known any more
 COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on at most
@@ -119,7 +118,7 @@ class TermCandidate:
 
 
 def find_terms(
-    data: Measurements, rows: np.ndarray, settings: ChannelSettings, budget: TimeBudget
+    data: Measurements, rows: np.ndarray, settings: ChannelSettings, effort: Effort
 ) -> tuple[ChannelPrior, tuple[str, ...]]:
     """Return the terms with their numbers, and notes about them.
 
@@ -127,34 +126,30 @@ def find_terms(
         data: kind csi.
         rows: (n,) measurements to learn from.
         settings: terms.
-        budget: before it is over no further term is tried, so that there is time for the weights.
+        effort: rows that numbers are learned on.
 
     Raises:
         ValueError: the data are no channels of a known carrier with one static end.
     """
-    start, factors, note = _fit_isotropic(data, rows, budget)
+    start, factors, note = _fit_isotropic(data, rows, effort)
     every = group_channels(data, rows, True)
     every = tuple(normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
-    most = budget.effort.term_rows
+    most = effort.term_rows
     groups, cache = thin_groups(every, COLUMNS, most), Cache()
     if compress_groups(groups[:1], start, cache)[0].is_uncompressed:
         groups = thin_groups(every, DENSE_COLUMNS, min(most, DENSE_ROWS))
     notes, wavelength = [note], 2 * math.pi / every[0].slot.wavenumber
     search = _Search(replace(settings, rows=most), groups, every, wavelength, cache)
     steps = [search._measure(start, search._compress(start))]
-    try:
-        with cancel_when(budget.is_spent):  # what the seconds end is as if it had not been tried
-            search.add_terms(steps, notes)
-    except Cancelled:
-        notes.append("waves: the time limit ended the search for terms")
+    search.add_terms(steps, notes)
     return steps[-1].prior, tuple(notes)
 
 
-def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudget) -> RunFactors:
+def estimate_run_factors(data: Measurements, rows: np.ndarray, effort: Effort) -> RunFactors:
     """Return the factor of each run of channels at rows (n,), by the waves that explain them."""
     # Directions turn factors by a degree and double the seconds.
     few = ChannelSettings(directions=False, correlated=False, mirrors=0)
-    prior, _ = find_terms(data, rows, few, budget)
+    prior, _ = find_terms(data, rows, few, effort)
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
     both = zip(prior.signal_covariances(groups), groups, strict=True)
     runs = np.unique(np.asarray(data.run)[rows])
@@ -162,12 +157,10 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, budget: TimeBudge
     return RunFactors(runs, factors)
 
 
-def _fit_isotropic(
-    data: Measurements, rows: np.ndarray, budget: TimeBudget
-) -> tuple[ChannelPrior, Tensor, str]:
+def _fit_isotropic(data: Measurements, rows: np.ndarray, effort: Effort) -> tuple[ChannelPrior, Tensor, str]:
     """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
     groups = group_channels(data, rows, False)
-    looked = thin_groups(groups, COLUMNS, budget.effort.chosen_on)
+    looked = thin_groups(groups, COLUMNS, effort.chosen_on)
     runs = 1 if data.run is None else len(np.unique(data.run[rows]))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     tried: list[tuple[float, Tensor, float, float]] = []
@@ -175,8 +168,6 @@ def _fit_isotropic(
         isotropic = partial(isotropic_correlation, length=length * wavelength)
         bounded = [isotropic(g.places, g.places, g.slot.wavenumber) for g in looked]
         for noise in NOISES:
-            if tried and budget.is_spent():
-                break
             eye = [noise * torch.eye(len(each), dtype=each.dtype) for each in bounded]
             factors, told = fit_run_factors(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
             tried.append((negative_log_likelihood(factors, told), factors, length * wavelength, noise))

@@ -27,7 +27,7 @@ from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 MIN_SEEN = 2  # receivers with a ray to a source; of more than `SearchSettings.max_sources` those seen by most
 MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
@@ -60,7 +60,7 @@ class DirectionalGP(SourcesInFrame):
         Raises:
             ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
         """
-        started = TimeBudget()
+        started = Stopwatch()
         require_static_phase(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
@@ -103,7 +103,7 @@ class DirectionalGP(SourcesInFrame):
             f"{math.degrees(clusters.error):.2g} degrees; {changed}"
             f"constant share of the gains' variance {self.posterior.kernel.constant:.1%}"
         )
-        return FitReport(started.spent, (note,))
+        return FitReport(started.seconds, (note,))
 
     def _thin_posterior(self, limit: int) -> SightedSources:
         """Every so many-th row, at most `limit`."""

@@ -20,7 +20,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.models.image_sources.search import Found, Search, SearchSettings
 from gsparc.processes.worker import Cancelled, cancel_when, end_when, step_limit
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.effort import Effort
 
 log = logging.getLogger(__name__)
 
@@ -50,9 +50,9 @@ class Member:
 
 def run_searches(
     row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
-    budget: TimeBudget, look: Look | None = None, start: Found | None = None,
+    effort: Effort, look: Look | None = None, start: Found | None = None,
 ) -> list[Member]:  # fmt: skip
-    """Run one search per set of rows, best first; at least one, others while the budget lasts.
+    """Run one search per set of rows, best first; at least one.
 
     The first two that have reached the noise floor are the last: searches of higher numbers do not start, or
     end without a result, whichever of them is finished first.
@@ -62,7 +62,7 @@ def run_searches(
         transmitter: (3,) float64 [m], in the same frame.
         settings: of every search.
         noise_floor: known variance of the noise, in units of the rows' power.
-        budget: effort of each, and what ends all together.
+        effort: of each.
         look: at the first search after each of its rounds, and after the last.
         start: sources that each starts from.
 
@@ -74,9 +74,8 @@ def run_searches(
     stopped = threading.Event()
 
     def is_share_spent(share: float) -> Callable[[], bool]:
-        """Tell whether so much of a search's effort, from now, or all of the seconds are spent."""
-        counted = step_limit(round(share * budget.effort.evaluations))
-        return lambda: counted() or budget.is_spent()
+        """Tell whether so much of a search's effort, from now, is spent."""
+        return step_limit(round(share * effort.evaluations))
 
     def is_unwanted(number: int) -> bool:
         """Tell whether those before it are all that is wanted."""
@@ -106,7 +105,7 @@ def run_searches(
         return Member(scene, error, number)
 
     def run_unless_unwanted(number: int) -> Member | None:
-        if is_unwanted(number) or (number > 0 and budget.is_spent()):
+        if is_unwanted(number):
             return None
         try:
             with cancel_when(partial(is_unwanted, number)), end_when(is_share_spent(1.0)):

@@ -40,8 +40,9 @@ from gsparc.physics.mirror_planes import hesse_form, image_rotations
 from gsparc.physics.row_factors import Freedom, align_factors
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
+from gsparc.training.effort import Effort
 from gsparc.training.race import Race
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +70,7 @@ class ImageSourceGP(SourcesInFrame):
     name = "image_source_gp"
     members: tuple[GainPosterior, ...] = ()
     _groups: tuple[np.ndarray, ...] = ()
-    takes_budget = True
+    takes_effort = True
     start: Found | None = None
 
     def __init__(
@@ -92,8 +93,8 @@ class ImageSourceGP(SourcesInFrame):
         require_fixed_rotation(data)
         seen = np.concatenate([fold.train, fold.val])
         self._groups = context.leave_out
-        effort = context.effort * (1.0 if context.leave_out else ALONE)
-        budget, settings = replace(context, effort=effort).time_budget(), self.settings
+        effort = Effort().scale_by(context.effort * (1.0 if context.leave_out else ALONE))
+        watch, settings = Stopwatch(), self.settings
         self.site, antennas = data.site, data.target.shape[1]
         # The frame is of rows of all searches: their scenes are averaged in it.
         self.frame = SourceFrame.from_rows(
@@ -112,7 +113,7 @@ class ImageSourceGP(SourcesInFrame):
                 data, start, direct_path_scene(start, self._transmitter_in_frame(), self.noise_floor)
             )
         if settings.offsets != "none":
-            data = self._align_offsets(data, seen, budget)
+            data = self._align_offsets(data, seen, effort)
             notes.append(
                 f"{self.name}: {settings.offsets} offset of every snapshot estimated; predictions have none"
             )
@@ -123,7 +124,7 @@ class ImageSourceGP(SourcesInFrame):
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = partial(self._log_look, context.race, group, data.batch(group), [math.inf])
         given = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
-        members = self._run_searches(row_sets, settings, budget, look, given)
+        members = self._run_searches(row_sets, settings, effort, look, given)
         if calibrated:
             again = self._calibrate_antennas(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
@@ -133,8 +134,8 @@ class ImageSourceGP(SourcesInFrame):
         rows = self._draw(data, seen)
         self._set_members(rows, members)
         self.held = self._predict_left_out(data, seen, members, len(rows))
-        notes += self._describe_search(members, budget)
-        return FitReport(budget.by_clock.wall, tuple(notes), budget.limited_by)
+        notes += self._describe_search(members)
+        return FitReport(watch.seconds, tuple(notes))
 
     def _set_posteriors(self, rows: Rows, scenes: list[SourceScene]) -> None:
         """Set the processes, and what answers queries, from rows in the frame."""
@@ -148,13 +149,12 @@ class ImageSourceGP(SourcesInFrame):
         self.weights = torch.softmax(-ensemble.SHARPNESS * error.log(), 0)
         return self
 
-    def _describe_search(self, members: list[Member], budget: TimeBudget) -> list[str]:
+    def _describe_search(self, members: list[Member]) -> list[str]:
         """What was found, and what ended the search."""
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = ensemble.reached_noise_floor([member.left_out for member in members], self.noise_floor)
         ended = "two agree up to noise, enough" if agree else "all that effort= asks for"
-        ended = "ended by the time budget" if budget.limited else ended
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
         notes = [f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources"]
         if boxes or patches:
@@ -176,13 +176,13 @@ class ImageSourceGP(SourcesInFrame):
         return replace(data, target=data.target * factors.numpy()[:, None])
 
     def _run_searches(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        self, row_sets: list[Rows], settings: SearchSettings, effort: Effort,
         look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
         """What `run_searches` finds about the static end, best first."""
         still, floor = self._transmitter_in_frame(), self.noise_floor
         self.asks_visibility = ensemble.occludes_antennas_alike(row_sets[0])
-        return ensemble.run_searches(row_sets, still, settings, floor, budget, look, start)
+        return ensemble.run_searches(row_sets, still, settings, floor, effort, look, start)
 
     def _log_look(
         self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: SourceScene
@@ -232,14 +232,14 @@ class ImageSourceGP(SourcesInFrame):
         assert self.site is not None and self.site.static_position is not None
         return torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
 
-    def _align_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
+    def _align_offsets(self, data: Measurements, known: np.ndarray, effort: Effort) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
         direct = SourceScene.from_static_end(self._transmitter_in_frame(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
             rows = self._draw_search_rows(aligned, known, 0)
-            scene = self._run_searches([rows], few, budget)[0].scene
+            scene = self._run_searches([rows], few, effort)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
                 gains = GainPosterior(self._draw_search_rows(aligned, known, 0), scene).mean_gains
                 aligned = self._remove_offsets(data, known, scene, gains)

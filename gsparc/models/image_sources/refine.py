@@ -12,7 +12,7 @@ from torch import Tensor
 from gsparc.models.image_sources.gp_likelihood import GainPosterior, PhasedGains
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, KernelVisibility, SourceScene
-from gsparc.processes.worker import out_of_time
+from gsparc.processes.worker import out_of_steps
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
@@ -28,7 +28,7 @@ Cost = Callable[[SourceScene], Tensor]  # negative log prior [nats] of a scene
 
 
 def refine_scene(rows: Rows, scene: SourceScene, steps: int, cost: Cost | None = None) -> SourceScene:
-    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `out_of_time`.
+    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `out_of_steps`.
 
     Args:
         rows: measurements.
@@ -55,7 +55,7 @@ def refine_scene(rows: Rows, scene: SourceScene, steps: int, cost: Cost | None =
         value, gradient = _cost_and_gradient(rows, scene, values, correlation, cost)
         if value < lowest:
             lowest, best = value, _scene_at(scene, [v.clone() for v in values])
-        if step == steps or out_of_time():
+        if step == steps or out_of_steps():
             break
         for v, slope in zip(values, gradient, strict=True):
             v.grad = slope
@@ -100,7 +100,7 @@ def _cost_and_gradient(
 def learn_visibility(
     rows: Rows, scene: SourceScene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
 ) -> SourceScene:
-    """Fit the visibility kernel by likelihood until `out_of_time`, with a log-normal prior about `centre`.
+    """Fit the visibility kernel by likelihood until `out_of_steps`, with a log-normal prior about `centre`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
     `quadrature` is learned as well, unless it is 1: its prior is about the present one.
@@ -123,7 +123,7 @@ def learn_visibility(
         return replace(trial, quadrature=float(torch.sigmoid(value.detach()[-1])))
 
     for _ in range(steps):
-        if out_of_time():
+        if out_of_steps():
             break
         posterior = GainPosterior(rows, current_scene())
         slope, gains = posterior.conditioned.nll_gradient, posterior.empty_covariance()

@@ -17,7 +17,7 @@ from gsparc.models.image_sources.refine import ROUND_STEPS, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import SourceScene
 from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, hesse_form, images, reflect
-from gsparc.processes.worker import out_of_time
+from gsparc.processes.worker import out_of_steps
 
 LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
 MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
@@ -30,9 +30,9 @@ MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
 def drop_planes(rows: Rows, scene: SourceScene, tolerance: float) -> SourceScene:
-    """Try to remove planes until `out_of_time`: sequences become the nearest over others [tolerance: m]."""
+    """Try to remove planes until `out_of_steps`: sequences become the nearest over others [tolerance: m]."""
     index = 0
-    while index < len(scene.planes) and not out_of_time():
+    while index < len(scene.planes) and not out_of_steps():
         shorter = _remove_plane(scene, index, tolerance)
         if shorter is not None:
             shorter = refine_scene(rows, shorter, ROUND_STEPS)
@@ -191,10 +191,10 @@ def reassign_to_walls(scene: SourceScene, walls: Tensor) -> SourceScene:
 
 
 def prune_sources(rows: Rows, scene: SourceScene, min_gain: float) -> SourceScene:
-    """Drop sources that gain under `min_gain` nats, twice with a plane of their own, or `out_of_time`."""
+    """Drop sources that gain under `min_gain` nats, twice with a plane of their own, or `out_of_steps`."""
     posterior, kept = GainPosterior(rows, scene), list(range(len(scene.sequences)))
     for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):
-        if out_of_time():
+        if out_of_steps():
             break
         sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in scene.sequences[i])
         lost = posterior.nll_without_source(kept.index(i)) - posterior.nll

@@ -33,7 +33,7 @@ from gsparc.models.image_sources.rows import LEAST_ROWS, Rows
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, direct_amplitude
 from gsparc.physics.mirror_planes import Reflections, bisector, reflect
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import out_of_time
+from gsparc.processes.worker import out_of_steps
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ class SearchSettings(Checked):
 
 
 class Search:
-    """One search over one set of normalised rows (`Frame`); if `out_of_time`, with what was found so far.
+    """One search over one set of normalised rows (`Frame`); if `out_of_steps`, with what was found so far.
 
     Args:
         rows: a few hundred.
@@ -181,7 +181,7 @@ class Search:
         posterior = GainPosterior(self.rows, self.scene)
         parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for number, parent in enumerate(parents):
-            if number and out_of_time():
+            if number and out_of_steps():
                 break
             spread = partial(self._antenna_images, parent)
             apart = 0.5 * self.wavelength
@@ -241,7 +241,7 @@ class Search:
 
     def _try_walls(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
-        if walls is None or out_of_time():
+        if walls is None or out_of_steps():
             return
         before = self.scene
         self.scene = orders.reassign_to_walls(before, walls)

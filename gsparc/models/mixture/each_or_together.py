@@ -22,7 +22,7 @@ class LearnsTogether(MethodFactory):
     """Learns several stations of a site in one field, or each in its own."""
 
     both_ends = True
-    takes_budget = True
+    takes_effort = True
     init: InitSettings
     own_terms: tuple[Columns, ...] = ()  # of one station's powers
 

@@ -24,10 +24,9 @@ from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.weights import LEAST_HELD, HeldOutPair, in_error_unit
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.terms import EffectSettings
-from gsparc.processes.worker import end_when
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import FellBehind, Race, mean_square
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +40,7 @@ BESIDE = 2  # searches then, of the usual effort
 
 def fit_candidates(
     parts: Mapping[str, Candidate], init: InitSettings, effects: EffectSettings, data: Measurements,
-    fold: Fold, context: FitContext, budget: TimeBudget, cut: InnerFolds | None,
+    fold: Fold, context: FitContext, watch: Stopwatch, cut: InnerFolds | None,
 ) -> tuple[dict[str, ClosedForm], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
     """Fit candidates; return them, what each cost, and which settings each read.
 
@@ -51,7 +50,7 @@ def fit_candidates(
     Args:
         parts: candidates by name, which have settings `init`.
         fold: validation rows are solved for, too, where nothing is weighed.
-        budget: running; what is left of it ends each.
+        watch: of the fit.
         cut: how training rows are cut; None of one initialiser.
 
     Raises:
@@ -67,26 +66,25 @@ def fit_candidates(
     race: Race | None = None
 
     def add_to_curve(what: str, error: float) -> None:
-        context.log_curve(budget.by_clock.wall, what, error)
+        context.log_curve(watch.seconds, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES and (why := _why_not_searched(race, bool(fields) and budget.is_spent())):
+        if name in SEARCHES and (why := _why_not_searched(race)):
             log.info("init=%s is left out: %s", name, why)
             continue
-        within, began = replace(context, budget_s=budget.left_s), budget.by_clock.wall
+        began = watch.seconds
         try:
             leave_out = groups if name in OPEN_ENDED else ()  # these predict the groups themselves
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
-            within = replace(within, leave_out=leave_out, race=race, beside=fields)
-            with heeded.set_apart() as read[name], end_when(budget.is_spent):
+            within = replace(context, leave_out=leave_out, race=race, beside=fields)
+            with heeded.set_apart() as read[name]:
                 field = parts[name](settings, effects.visibility is not False, within)
                 report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
             if not field.asks_visibility:
                 read[name].discard("model.effects.visibility")
             fields[name] = field
-            # Every group costs a fit: when the seconds are over, validation rows alone weigh solutions.
-            if name not in OPEN_ENDED and not budget.is_spent():
+            if name not in OPEN_ENDED:
                 field.held = _predict_groups(field, data, rows, groups)
             if field.held is not None:
                 target = in_error_unit(data.batch(field.held.rows).target, data.site)
@@ -96,7 +94,7 @@ def fit_candidates(
                 race = one if race is None or one.error < race.error else race
         except ValueError as error:
             if isinstance(error, FellBehind):  # a `ValueError`, too
-                reports[name] = FitReport(budget.by_clock.wall - began)
+                reports[name] = FitReport(watch.seconds - began)
             elif len(parts) == 1 or name == init.name:
                 raise
             log.info("init=%s is left out: %s", name, error)
@@ -107,10 +105,8 @@ def fit_candidates(
     return fields, reports, read
 
 
-def _why_not_searched(race: Race | None, is_spent: bool) -> str | None:
-    """Why no search is begun: the time is over, or another solution as near as searches come; else None."""
-    if is_spent:
-        return "the seconds were over"
+def _why_not_searched(race: Race | None) -> str | None:
+    """Why no search is begun: another solution is as near as searches come; else None."""
     if race is None or race.error > CONVERGED_ERROR:
         return None
     return f"another solution has an NMSE of {race.error:.4f} on held-out rows"

@@ -38,7 +38,7 @@ from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
-from gsparc.training.time_budget import worst_clock
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 QUERY_CHUNK = 1024  # memory; stations at one place share most of their work, see `ChannelField`
@@ -122,24 +122,19 @@ class Mixture(LearnsTogether, ClosedForm):
         context: FitContext, std: np.ndarray,
     ) -> FitReport:  # fmt: skip
         """First where rows were measured, then where they rather were."""
-        budget = context.time_budget()
+        watch = Stopwatch()
         # Files of the folder are of the second pass, which an interrupted run goes on with.
         first = replace(context, run_dir=Path(), resume=None)
         report = self._solve(parts, init, data, fold, first)
         rows, by, note = refine_places(self, self.runs.remove_factors(data), std)
-        if by.any() and budget.is_spent():
-            note = f"{note}, but the seconds are over: they stay as measured"
         log.info("%s", note)
-        if not by.any() or budget.limited:
-            limited = worst_clock(report.limited_by, budget.limited_by)
-            return replace(report, notes=(note, *report.notes), limited_by=limited)
-        limited, spent = report.limited_by, budget.by_clock.wall
-        rest = replace(context, budget_s=budget.left_s)
-        report = self._solve(parts, init, move_rows(data, rows, by), fold, rest)
-        limited = worst_clock(limited, report.limited_by)
+        if not by.any():
+            return replace(report, notes=(note, *report.notes))
+        spent = watch.seconds
+        report = self._solve(parts, init, move_rows(data, rows, by), fold, context)
         cost = replace(report.cost, stages={"measured places": spent, **report.cost.stages})
         notes = (note, *report.notes)
-        return replace(report, seconds=spent + report.seconds, notes=notes, limited_by=limited, cost=cost)
+        return replace(report, seconds=spent + report.seconds, notes=notes, cost=cost)
 
     def _solve(
         self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
@@ -152,37 +147,33 @@ class Mixture(LearnsTogether, ClosedForm):
         Raises:
             ValueError: the only candidate, or the one asked for, cannot solve this.
         """
-        budget = context.time_budget()
-        end = "" if context.budget_s is None else f", within {context.budget_s:.3g} s"
-        log.info("training in closed form: init=%s%s", " and ".join(parts), end)
+        watch = Stopwatch()
+        log.info("training in closed form: init=%s", " and ".join(parts))
         known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
         self.runs = _estimate_run_factors(data, known, context)
         data = self.runs.remove_factors(data)
-        stages = {"factors of runs": budget.by_clock.wall} if len(self.runs) > 1 else {}
+        stages = {"factors of runs": watch.seconds} if len(self.runs) > 1 else {}
         cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
         found, reports, read = fit_candidates.fit_candidates(
-            parts, init, self.switches, data, fold, context, budget, cut
+            parts, init, self.switches, data, fold, context, watch, cut
         )
         chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
         heeded.count_reads(*(path for name in chosen for path in read[name]))
         members, weights = zip(*chosen.values(), strict=True)
         self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
-        self.site, self.init_s = data.site, budget.by_clock.wall
+        self.site, self.init_s = data.site, watch.seconds
         self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
             self.condition(data, known)
         log.info("%d Gaussians from init=%s", self.count_gaussians, self.description)
-        seconds = budget.by_clock.wall
-        if several:
-            context.log_curve(seconds, "final")
+        seconds = watch.seconds
         stages |= {name: report.seconds for name, report in reports.items()}
         # Not below 0: searches of a resumed run count what they took before.
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages["final weights"] = seconds - self.init_s
         unused = {name: spent for name, spent in stages.items() if name in reports and name not in chosen}
         notes = [note for name in chosen for note in reports[name].notes]
-        limited = worst_clock(budget.limited_by, *(report.limited_by for report in reports.values()))
-        return FitReport(seconds, tuple(notes), limited).with_cost(Cost(stages, unused))
+        return FitReport(seconds, tuple(notes)).with_cost(Cost(stages, unused))
 
     def _explained_share(self, data: Measurements, fold: Fold, is_conditioned: bool) -> float | None:
         """What Gaussians explain of validation rows; conditions on training rows, unless apart already."""
@@ -332,6 +323,6 @@ def _estimate_run_factors(data: Measurements, known: np.ndarray, context: FitCon
     if not RunFactors.has_several_runs(data, known):
         return RunFactors.identity()
     # Validation rows too: candidates are weighed by them in the phase of the same run.
-    result = estimate_run_factors(data, known, context.time_budget())
+    result = estimate_run_factors(data, known, context.counts)
     log.info("channels of %d runs: the factor of each was estimated by waves of all runs", len(result))
     return result

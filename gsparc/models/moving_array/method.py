@@ -36,7 +36,6 @@ from gsparc.physics.lags import BLOCK, SpectrumLags
 from gsparc.physics.separable import Separable, fit_separable
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
 
 UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
 
@@ -79,7 +78,7 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     effects = "moving_array"
     stored = ("found", "exponent", "residual", "positions", "errors")
-    takes_budget = True
+    takes_effort = True
     found: PowerTrend  # sources and their powers
 
     def __init__(
@@ -93,7 +92,6 @@ class MovingArrayField(Differentiable, ClosedForm):
         self.rest_rows, self.components = rest_rows, components
         self.seed, self.name = seed, name
         self.rows = np.zeros(0, np.int64)  # that it was conditioned on; none where it was restored
-        self._budget = TimeBudget()
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Find sources, fit their powers and the residual.
@@ -104,11 +102,11 @@ class MovingArrayField(Differentiable, ClosedForm):
         problem = site_problem(data)
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
-        self._budget, self._lags = context.time_budget(), None
+        self._lags, self._steps = None, round(context.effort * self.search.steps)
         report = super().fit(data, fold, context)
         # The rows of `super().fit` in its order: `left_out` names its images by them.
         self.rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
-        return replace(report, limited_by=self._budget.limited_by)
+        return report
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -176,8 +174,8 @@ class MovingArrayField(Differentiable, ClosedForm):
         still = self.site.static_position
         first = None if still is None else torch.from_numpy(np.asarray(still)).float()
         return find_sources(
-            few.lags, few.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
-            self.seed, self._budget.is_spent,
+            few.lags, few.receivers, first, self.rotation(), self.lags(), self.site.grid,
+            replace(self.search, steps=self._steps), self.seed,
         )  # fmt: skip
 
     def _fit_powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +87,7 @@ def sum_lags(power: Tensor, atoms: Tensor) -> Tensor:
 
 def find_sources(
     lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: SpectrumLags,
-    grid: SphereGrid, settings: ArraySearch, seed: int, is_spent: Callable[[], bool],
+    grid: SphereGrid, settings: ArraySearch, seed: int,
 ) -> Tensor:  # fmt: skip
     """Return positions (K, 3) float32 [m] of sources.
 
@@ -101,7 +100,6 @@ def find_sources(
         grid: of the spectra; candidates are scored at their nearest pixel.
         settings: how.
         seed: of the candidates.
-        is_spent: asked between steps, which end when it says so.
     """
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
@@ -126,7 +124,7 @@ def find_sources(
         positions = torch.cat([positions, new[: settings.sources - len(positions)]])
         residual = residual_lags(lags, receivers, positions)
         before, energy = energy, float(residual.square().sum())
-        if energy > (1 - settings.least_gain) * before or is_spent():
+        if energy > (1 - settings.least_gain) * before:
             break
     if settings.steps == 0 or len(positions) == len(known):
         return positions
@@ -134,8 +132,6 @@ def find_sources(
     free = positions[len(known) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
     for step in range(settings.steps):
-        if is_spent():
-            break
         progress = step / settings.steps
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         # As many receivers a step on every site, so that its time is bounded.

@@ -34,7 +34,7 @@ from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import from_config, known_scene, load_tracer
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 Start = Literal["generic", "scene"]
 
@@ -94,7 +94,7 @@ class CalibratedRayTracer(Checked, Method):
         fault = self.why_not(data)
         if fault is not None:
             raise ValueError(fault)
-        begin = TimeBudget()
+        begin = Stopwatch()
         self.site = data.site
         try:
             scene = known_scene(self.scene, data.provenance, float(data.site.carrier_hz or 0.0))
@@ -122,7 +122,7 @@ class CalibratedRayTracer(Checked, Method):
         # Powers tell a gain in decibels; channels need its phase too.
         if data.site.kind == "csi":
             self._factor = self._best_factor(data, rows)
-        return FitReport(begin.spent, self._describe_fit(len(rows) - int(reached.sum())))
+        return FitReport(begin.seconds, self._describe_fit(len(rows) - int(reached.sum())))
 
     def _describe_fit(self, dark: int) -> tuple[str, ...]:
         assert self.learned is not None

@@ -76,7 +76,7 @@ class Fire(UplinkMethod, TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0125}
+    usual_steps: ClassVar[dict[Kind, int]] = {"csi": 4_800}
     makes = Coder
     name: str = "fire"
     hidden: int = 256

@@ -126,7 +126,7 @@ class GSRF(GaussianPeer):
         others: see `TrainedPeer`.
     """
 
-    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.042, "csi": 0.027}
+    usual_steps: ClassVar[dict[Kind, int]] = {"spectrum": 1_429, "csi": 2_222}
     rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
     makes = ComplexGaussians
     name: str = "gsrf"

@@ -112,7 +112,7 @@ class NeRF2(TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.13}
+    usual_steps: ClassVar[dict[Kind, int]] = {"spectrum": 462}
     makes = MarchedField
     name: str = "nerf2"
     width: int = 64

@@ -112,7 +112,7 @@ class NeWRF(TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.091}
+    usual_steps: ClassVar[dict[Kind, int]] = {"csi": 659}
     makes = DirectedRays
     name: str = "newrf"
     width: int = 128

@@ -90,7 +90,7 @@ class NGRF(TrainedPeer):
         others: see `TrainedPeer`.
     """
 
-    step_s: ClassVar[dict[Kind, float]] = {"csi": 0.0038, "spectrum": 0.020}
+    usual_steps: ClassVar[dict[Kind, int]] = {"csi": 15_789, "spectrum": 3_000}
     rates: ClassVar[dict[str, float]] = {"means": 3e-3, "gains": 1e-2}
     makes = Radiators
     name: str = "ngrf"

@@ -116,7 +116,7 @@ class PlanarGaussians(GaussianNetwork):
 class SwiftWRF(DeformedPeer):
     """Spectra; settings as of `DeformedPeer`."""
 
-    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.031}
+    usual_steps: ClassVar[dict[Kind, int]] = {"spectrum": 1_935}
     rates: ClassVar[dict[str, float]] = {"centres": 2e-3, "strengths": 1e-2}
     makes = PlanarGaussians
     name: str = "swiftwrf"

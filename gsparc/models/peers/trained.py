@@ -1,4 +1,4 @@
-"""Peers trained by gradient: what a network knows of a scene, training under a time budget, stored state."""
+"""Peers trained by gradient: what a network knows of a scene, counted steps, stored state."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget, worst_clock
+from gsparc.training.effort import Effort
+from gsparc.training.stopwatch import Stopwatch
 
-DEFAULT_BUDGET_S = 60.0
 FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
-SLACK = 3.0  # times the seconds that are wanted, after which a schedule of a table's steps is cut
 WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
 DIRECTIONS = torch.tensor([[-1.0], [1.0]]).repeat(1, 3)  # box (2, 3) of unit vectors
@@ -106,9 +105,7 @@ class TrainedPeer(Method):
     """Learns from `fold.train` and `fold.val` together in counted steps; nothing is chosen on `val`.
 
     Args:
-        budget_s: seconds of training in processor time per thread. None takes 60.
-        max_steps: of the learning-rate schedule, which the seconds cut. None takes as many as the seconds
-            hold by `step_s`: a run repeats exactly unless its steps take `SLACK` times as long.
+        max_steps: of the learning-rate schedule. None takes `usual_steps`, times the effort.
         batch_size: samples per step.
         rate: Adam's learning rate where `rates` names no other.
         seed: of initial weights and order of the samples.
@@ -117,13 +114,12 @@ class TrainedPeer(Method):
 
     no_gradient = "its network answers in float32 and keeps no graph"
     resumable: ClassVar[bool] = True  # type: ignore[misc]
-    takes_budget: ClassVar[bool] = True  # type: ignore[misc]
+    takes_effort: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
-    step_s: ClassVar[dict[Kind, float]]  # processor seconds of a step [s] (docs/results/compare)
+    usual_steps: ClassVar[dict[Kind, int]]  # a minute of one core at its usual batches (docs/results/compare)
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
-    budget_s: float | None = None
     max_steps: int | None = None
     batch_size: int = 8
     rate: float = 2e-3
@@ -133,37 +129,35 @@ class TrainedPeer(Method):
     steps: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        budget_s = self.budget_s = DEFAULT_BUDGET_S if self.budget_s is None else self.budget_s
-        if not budget_s > 0 or self.batch_size < 1:
-            raise ValueError(
-                f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
-            )
+        if self.batch_size < 1:
+            raise ValueError(f"{self.name}: batch_size >= 1 is needed, got {self.batch_size}")
 
-    def _steps_in_budget(self, kind: Kind) -> int:
-        """As many as the seconds hold on the idle processor that `step_s` was measured on."""
-        assert self.budget_s is not None
-        own = self.budget_s / self.step_s[kind] * type(self).batch_size / self.batch_size
+    def _count_steps(self, kind: Kind, effort: Effort, asked: int | None) -> int:
+        """Steps that are asked for, else of as many samples as usual, times the effort."""
+        if asked is not None:
+            return asked
+        own = effort.factor * self.usual_steps[kind] * type(self).batch_size / self.batch_size
         return max(round(own), 1)
 
-    def describe_time_limit(self, site: Site, budget_s: float | None) -> str:
-        """See `MethodFactory.describe_time_limit`; steps stand for the seconds."""
-        told = self.max_steps is None and site.kind in self.step_s
-        steps = f"{self._steps_in_budget(site.kind)} steps, " if told else ""
-        return f"{steps}about {self.budget_s:g} s of an idle processor"
+    def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
+        """See `MethodFactory`."""
+        asked, kind = self.max_steps if steps is None else steps, data.site.kind
+        if asked is None and kind not in self.usual_steps:
+            return ""  # `fit` says why
+        return f"{self._count_steps(kind, effort, asked)} steps of {self.batch_size} samples"
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return tensors computed from the training rows (n,) before training; stored with the weights."""
         return {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Train to the end of the schedule, or of the seconds; steps of the Trainer win over the model's.
+        """Train to the end of the schedule; steps of the Trainer win over the model's.
 
         Raises:
             ValueError: a kind of data the method does not serve, no rows, or a run of others to resume.
             RuntimeError: the loss became NaN or infinite.
         """
-        assert self.budget_s is not None
-        kinds, kind = tuple(self.step_s), data.site.kind
+        kinds, kind = tuple(self.usual_steps), data.site.kind
         rows = np.sort(np.concatenate([fold.train, fold.val]))
         if kind not in kinds:
             raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
@@ -172,24 +166,23 @@ class TrainedPeer(Method):
         origin = Origin.from_fit(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
         asked = requested_steps(context, len(rows), self.max_steps)
-        budget = TimeBudget(self.budget_s * (SLACK if asked is None else 1), "processor")
+        watch = Stopwatch()
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
         self.network = self.makes(_make_scene(data, rows), self)
         if context.resume is not None:
             origin.require_same(read_interrupted(context.resume))
-        module = self.module(self._steps_in_budget(kind) if asked is None else asked, context.run_dir)
+        module = self.module(self._count_steps(kind, context.counts, asked), context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
         all_rows = Fold(rows, rows[:0], fold.test)
-        trainer, batches = make_trainer(module, data, all_rows, context, files, budget)
+        trainer, batches = make_trainer(module, data, all_rows, context, files, watch)
         with interruptible(trainer, batches):
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
-        result = read_trainer_result(trainer, budget)
+        result = read_trainer_result(trainer, watch)
         self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        limited_by = worst_clock(budget.limited_by, "wall" if result.timed_out else None)
-        return FitReport(budget.by_clock.wall, (note,), limited_by)
+        return FitReport(watch.seconds, (note, *result.notes))
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:
         """Return what Lightning trains, with a schedule of `steps`."""

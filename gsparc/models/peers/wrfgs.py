@@ -70,7 +70,7 @@ class DeformedGaussians(GaussianNetwork):
 class WRFGSPlus(DeformedPeer):
     """Spectra; settings as of `DeformedPeer`."""
 
-    step_s: ClassVar[dict[Kind, float]] = {"spectrum": 0.022}
+    usual_steps: ClassVar[dict[Kind, int]] = {"spectrum": 2_727}
     rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
     makes = DeformedGaussians
     name: str = "wrfgs"

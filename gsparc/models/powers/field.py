@@ -43,7 +43,8 @@ from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.effort import Effort
+from gsparc.training.stopwatch import Stopwatch
 
 
 class PowerField(ClosedForm):
@@ -77,20 +78,20 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: no rows.
         """
-        budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
+        watch, rows = Stopwatch(), np.concatenate([fold.train, fold.val])
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
         self.site, self.fringes = data.site, None
-        notes = self._choose_priors(data, rows, budget)
+        notes = self._choose_priors(data, rows, context.counts)
         self.condition(data, rows)
         own = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
             notes = (*describe_weights(self.powers.posterior, own), *notes)
-        return FitReport(budget.by_clock.wall, notes, budget.limited_by)
+        return FitReport(watch.seconds, notes)
 
-    def _choose_priors(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
+    def _choose_priors(self, data: Measurements, rows: np.ndarray, effort: Effort) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
-        seen, site, chosen_on = power_rows(data, rows), data.site, budget.effort.chosen_on
+        seen, site, chosen_on = power_rows(data, rows), data.site, effort.chosen_on
         # Checked once: a query has no time for it, nor has `torch.func`.
         own = tuple(UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places)) for t in self.own_terms)
         if self.walls is not None:
@@ -113,7 +114,7 @@ class PowerField(ClosedForm):
             order = np.argsort(rows)
             assert site.wavelength is not None
             self.fringes, note = fit_fringes(
-                seen.subset(order), rows[order], found[0].prior, site.wavelength, self.seed, budget
+                seen.subset(order), rows[order], found[0].prior, site.wavelength, self.seed, effort.fringes
             )
             said.append(note)
             if self.fringes is not None:  # their share was learned beside this process

@@ -28,7 +28,6 @@ from gsparc.processes.powers import PowerRows, condition_on_powers
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.stored import Stored
 from gsparc.processes.trend import TINY_M
-from gsparc.training.time_budget import TimeBudget
 
 FOLDS = 5  # of squares; each solution is blind to one
 SIDES = 8  # squares along the longer side
@@ -137,7 +136,7 @@ def nearest_distances(places: np.ndarray) -> np.ndarray:
 
 
 def fit_fringes(
-    rows: PowerRows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, budget: TimeBudget
+    rows: PowerRows, numbers: np.ndarray, plain: Prior, wavelength: float, seed: int, most: int
 ) -> tuple[Fringes | None, str]:
     """Return fringes where they pay beside a process, and what must be said of them.
 
@@ -147,7 +146,7 @@ def fit_fringes(
         plain: of the process.
         wavelength: [m].
         seed: of starts, folds and rows that are drawn.
-        budget: how many are sought, and when none is any longer.
+        most: solutions that are sought.
     """
     rng, total = np.random.default_rng(seed), len(rows.places)
     order, probes = rng.permutation(total), total // PROBES
@@ -171,7 +170,7 @@ def fit_fringes(
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain = 0.0  # mean of the squared errors at places left out, of the process less those of both [dB^2]
-    while len(weights) < budget.effort.fringes and not budget.is_spent():
+    while len(weights) < most:
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
             seen = (fold != k) & (fold >= 0)

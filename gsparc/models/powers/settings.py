@@ -31,8 +31,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import out_of_time
-from gsparc.training.time_budget import Effort
+from gsparc.training.effort import Effort
 
 MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
@@ -189,20 +188,20 @@ def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows:
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_fit_one_length(few, *law) for law in trends]
     scores = [one.score for one in candidates]
-    if both and not out_of_time():
+    if both:
         weighed = _select_doubtful(weighed, candidates[-1])
         scores = [_fit_by_evidence(weighed, one, REFINED).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
-    if len(few.places) >= TWO_LENGTHS_NEED and not out_of_time():
+    if len(few.places) >= TWO_LENGTHS_NEED:
         two = _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0)
         best = max(best, two, key=lambda one: one.score)
         if has_both_ends(few.places):
             ends = _search_kernel(few, best, _end_starts(few, best.kernel), 4.0)
             best = max(best, ends, key=lambda one: one.score)
-    if len(loud.places) > len(few.places) and not out_of_time():
+    if len(loud.places) > len(few.places):
         # A look at all rows costs several at few: what was found on these is near already.
         best = _search_kernel(loud, best, [best.kernel], limit=REFINED)
-    if both and not out_of_time():  # one walk: each look factors several covariances
+    if both:  # one walk: each look factors several covariances
         best = _fit_by_evidence(weighed, best, EVIDENCE_LOOKS)
     count = len((weighed if both else loud).places)
     if count < len(rows.places):

@@ -18,7 +18,7 @@ class ArrayField(LearnedField):
     """
 
     effects = "array"
-    takes_budget = takes_weights = resumable = False  # it is solved in closed form
+    takes_effort = takes_weights = resumable = False  # it is solved in closed form
 
     def __init__(
         self, field: FieldSettings = FieldSettings(count=128), refit: bool = True, name: str = "array"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -47,7 +47,8 @@ from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.ops import Pose
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import Clock, Effort, Spent, TimeBudget, worst_clock
+from gsparc.training.effort import Effort
+from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
@@ -102,11 +103,10 @@ class LearnedField(Method):
     effects = "image"
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
-    takes_budget = takes_weights = True
+    takes_effort = takes_weights = True
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
-    # Whether a process beside it has all the weight: another stage is worth no seconds.
-    _is_process_alone = False
-    _limited_by: Clock | None = None
+    _is_process_alone = False  # whether a process beside it has all the weight: another stage gains nothing
+    _ended: tuple[str, ...] = ()
     # Of a version, with what an array sees or without, in float64.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
 
@@ -164,25 +164,26 @@ class LearnedField(Method):
         if left is not None:
             origin.require_same(left)
         marks = {} if left is None else left.extra
-        budget = context.time_budget(before=Spent(*marks.get("spent", ())))
+        watch = Stopwatch(float(marks.get("spent_s", 0.0)))
         self._begin_fit(data, fold, marks)
-        for stage in self._plan_stages(data, fold, context, budget, left):
-            module = self._start_stage(stage, data, budget)
+        for stage in self._plan_stages(data, fold, context, left):
+            module = self._start_stage(stage, data, watch)
             if module is None:
                 continue
-            files = GsparcCheckpointIO(self, context.config_yaml, self._extra(stage, budget, origin))
+            files = GsparcCheckpointIO(self, context.config_yaml, self._extra(stage, watch, origin))
             heeded.count_reads("dataset.batch_size")
-            began = budget.by_clock
+            began = watch.seconds
             trainer, batches = gradient_stage.make_trainer(
-                module, data, stage.fold, stage.context, files, budget, self._stage_callbacks(stage)
+                module, data, stage.fold, stage.context, files, watch, self._stage_callbacks(stage)
             )
             with gradient_stage.interruptible(trainer, batches):
                 trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
-            self._end_stage(stage, gradient_stage.read_trainer_result(trainer, budget), began, budget)
+            result = gradient_stage.read_trainer_result(trainer, watch)
+            self._end_stage(stage, result, watch.seconds - began)
         self.frozen = self._doubled = None
         what, count = f"final, {self.steps} of {self.steps_taken} steps kept", self.count_components()
-        context.log_curve(budget.by_clock.wall, what, step=self.steps_taken, num_gaussians=count)
-        return FitReport(budget.by_clock.wall, limited_by=self._limited_by)
+        context.log_curve(watch.seconds, what, step=self.steps_taken, num_gaussians=count)
+        return FitReport(watch.seconds, self._ended)
 
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """See `MethodFactory`."""
@@ -231,10 +232,10 @@ class LearnedField(Method):
         self.steps_taken, self._earlier_s = int(extra.get("taken", 0)), float(extra.get("earlier_s", 0.0))
         self.spent, self._apart = {}, _validation_distance(data, fold)
         self._left_out = from_plain(extra.get("left_out"))  # an interrupted run's start is not repeated
-        self._limited_by = extra.get("limited_by")
+        self._ended = tuple(extra.get("ended", ()))
 
     def _plan_stages(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget, resumed: Stored | None
+        self, data: Measurements, fold: Fold, context: FitContext, resumed: Stored | None
     ) -> Iterator[Stage]:
         """Yield one stage after the other, each decided by what came of those before.
 
@@ -245,7 +246,7 @@ class LearnedField(Method):
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _hold_out_third(data, fold, context) if few else fold
         asked = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
-        usual = budget.effort.steps_after_solving if solved else budget.effort.steps
+        usual = context.counts.steps_after_solving if solved else context.counts.steps
         steps = usual if asked is None else asked
         log.info(
             "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
@@ -271,20 +272,18 @@ class LearnedField(Method):
                 yield Stage("train", watched, context, 0)
             self._calibrate_errors(data, watched)
             self._weigh_process(data, watched)
-        if self.refit and len(watched.val) and not self._is_process_alone and not budget.is_spent():
-            kept, resume = (self.model, self.steps, self._prior), context.resume if refits else None
+        if self.refit and len(watched.val) and not self._is_process_alone:
+            resume = context.resume if refits else None
             yield Stage("refit", _train_on_all(watched), context.for_part("refit", resume=resume), steps)
-            if budget.limited and not refits:  # its schedule is cut: the first stage ended its own
-                self.model, self.steps, self._prior = kept
 
-    def _start_stage(self, stage: Stage, data: Measurements, budget: TimeBudget) -> GaussianModule | None:
+    def _start_stage(self, stage: Stage, data: Measurements, watch: Stopwatch) -> GaussianModule | None:
         """Make a fresh model, or read one back; return what trains it, None where no step is taken.
 
         What an earlier stage learned of errors is kept by `refit`, which learns from the rows that told it.
         """
         context, folder = stage.context, stage.context.run_dir
         L.seed_everything(context.seed, verbose=False)
-        started, before = budget.by_clock, self.model
+        started, before = watch.seconds, self.model
         assert self.choices is not None
         if context.init_from is not None and context.resume is None:
             self._start_from(data.site, context.init_from)
@@ -293,7 +292,7 @@ class LearnedField(Method):
                 InitTask(
                     apply_choices(self.settings, self.choices), self.choices.closed_form, data,
                     stage.fold.train, self._static_receiver(), self._ends.get("tx_position"),
-                    context.seed, folder, budget,
+                    context.seed, folder, watch,
                 )
             )  # fmt: skip
             self._prior = start.prior
@@ -307,15 +306,11 @@ class LearnedField(Method):
             self.fitted_model().confidence, self.fitted_model().error = before.confidence, before.error
             if before.confidence is not None:
                 before.confidence.requires_grad_(False)
-        prepared = (budget.by_clock - started).wall
+        prepared = watch.seconds - started
         self.init_s, self._earlier_s = (self.init_s or 0.0) + prepared, self._earlier_s + prepared
         self.spent["initialiser" + stage.cost_suffix] = prepared
         if not stage.steps:
             return None
-        if budget.is_spent():
-            log.warning("budget_s=%.3g: none is left for gradient steps", context.asked_s)
-            blind = stage.name == "train" and self.choices.closed_form  # nothing shows that steps would gain
-            self._paying = 0 if blind else self._paying
         if self._paying == 0:
             self.steps = 0
             return None
@@ -324,11 +319,11 @@ class LearnedField(Method):
         module.start = f"init={self.choices.init}" + (", closed form" if module.solved else "")
         return module
 
-    def _extra(self, stage: Stage, budget: TimeBudget, origin: Origin) -> dict[str, Any]:
+    def _extra(self, stage: Stage, watch: Stopwatch, origin: Origin) -> dict[str, Any]:
         """What `_begin` reads of a run that is interrupted in a stage."""
         return {
-            "stage": stage.name, "earlier_s": self._earlier_s, "spent": astuple(budget.by_clock),
-            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
+            "stage": stage.name, "earlier_s": self._earlier_s, "spent_s": watch.seconds,
+            "ended": [*self._ended], "paying": self._paying, "init_s": self.init_s,
             "taken": self.steps_taken,
             "left_out": to_plain(self._left_out), **origin.to_extra(),
         }  # fmt: skip
@@ -339,17 +334,12 @@ class LearnedField(Method):
             return [KeepBest(stage.patience)] if self.keep_best else []
         return [] if self._paying is None else [StopAt(self._paying)]
 
-    def _end_stage(
-        self, stage: Stage, result: gradient_stage.TrainerResult, began: Spent, budget: TimeBudget
-    ) -> None:
+    def _end_stage(self, stage: Stage, result: gradient_stage.TrainerResult, seconds: float) -> None:
         """Note what the steps of a stage were worth."""
-        seconds = (budget.by_clock - began).wall
         self._earlier_s += seconds
         self.steps = result.taken if result.kept is None else result.kept
         self.spent["gradient steps" + stage.cost_suffix] = seconds
-        if result.timed_out or budget.limited:
-            clock: Clock = "wall" if result.timed_out else budget.clock
-            self._limited_by = worst_clock(self._limited_by, clock)
+        self._ended += result.notes
         if stage.name == "train":
             self._paying, self.steps_taken = result.kept, result.taken
 

@@ -21,7 +21,7 @@ from gsparc.models.uplink.search import SnapshotSearch, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, mean_delay, phasor, planar_places
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 CHUNK = 32  # snapshots searched together
 LEAKAGES = (1e-4, 3e-4, 1e-3)
@@ -56,7 +56,7 @@ class UplinkField(UplinkMethod):
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the leakage on validation rows, fit the error model on training rows."""
-        started = TimeBudget()
+        started = Stopwatch()
         self.site = self._require_uplink(data)
         self.error_model = None
         rng = np.random.default_rng(context.seed if self.seed is None else self.seed)
@@ -72,7 +72,7 @@ class UplinkField(UplinkMethod):
         pairs = self._features_and_errors(data, rows, rng, PIECES)
         self.error_model = RelativeErrorRegression.from_rows(*pairs)
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
-        return FitReport(started.spent, (note,))
+        return FitReport(started.seconds, (note,))
 
     @torch.no_grad()
     def _features_and_errors(

@@ -58,7 +58,7 @@ def of_sources(tones, antennas=1, clutter=False):
     settings = {"searches": 1, "clutter": clutter, "search_rows": 80}
     return gsparc.fit(
         rx=rx, tx=tx, csi=csi, frequency_hz=frequency, model="image_source_gp", settings=settings,
-        budget_s=2, rx_rotation=np.eye(3), **given,
+        effort=0.3, rx_rotation=np.eye(3), **given,
     )  # fmt: skip
 
 

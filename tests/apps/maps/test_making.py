@@ -235,7 +235,7 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
 def test_channels_have_a_power(tmp_path):
     data = load_own(channels(tmp_path / "own.npz"))
     method, rows = method_class("image_source_gp")(), np.arange(len(data))
-    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, budget_s=1.0))
+    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, effort=0.1))
     found = predict_map(Predictor(method, data.site), step_m=0.5, height_m=1.2)
     assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
     assert (found.expected_error_db > 0).all() and not found.extra

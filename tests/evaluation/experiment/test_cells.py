@@ -6,16 +6,15 @@ import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
 
-from gsparc.evaluation.experiment.cells import Budget, Contender, plan_cells
+from gsparc.evaluation.experiment.cells import Contender, plan_cells
 from gsparc.evaluation.experiment.problem import SplitChoice, read_entries
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
-    "fast": Contender("fast", ("model=gsrf",), ("model.budget_s={budget_s}",)),
-    "slow": Contender("slow", ("model=nerf2",), ("model.budget_s={budget_s}",), only_longest=True),
-    "waves": Contender("waves", ("model=ngrf",), ("model.budget_s={budget_s}",), ("csi",)),
+    "fast": Contender("fast", ("model=gsrf",), True),
+    "waves": Contender("waves", ("model=ngrf",), True, ("csi",)),
 }
-BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
+COUNTED = (1, 0.3), (0, 1)  # efforts and seeds
 
 
 def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> SimpleNamespace:
@@ -24,35 +23,32 @@ def problem(dataset: str, split: str = "random", kind: str = "spectrum", **other
 
 
 def names(*only: str, kind: str = "spectrum") -> list[str]:
-    return [str(cell) for _, cell in plan_cells([problem("rfid", kind=kind)], METHODS, BUDGETS, only)]
+    return [str(cell) for _, cell in plan_cells([problem("rfid", kind=kind)], METHODS, *COUNTED, only)]
 
 
-def test_a_whole_table_comes_before_further_seeds_and_budgets():
+def test_a_whole_table_comes_before_further_efforts_and_seeds():
     assert names() == [
-        "rfid/random/gp/any/any", "rfid/random/fast/60/0",
-        "rfid/random/fast/300/0", "rfid/random/slow/300/0", "rfid/random/fast/60/1",
+        "rfid/random/gp/any/any", "rfid/random/fast/1/0", "rfid/random/fast/0.3/0",
+        "rfid/random/fast/1/1", "rfid/random/fast/0.3/1",
     ]  # fmt: skip
-    assert "rfid/random/waves/60/1" in names(kind="csi")
+    assert "rfid/random/waves/1/1" in names(kind="csi")
 
 
 def test_every_room_has_its_first_table_before_any_has_a_second():
-    rooms = [problem("a"), problem("b"), problem("a", "grouped")]
-    budgets = [Budget(60, (0, 1), ("random",)), Budget(12, (0,), ("grouped",))]
-    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, budgets)]
+    rooms = [problem("a"), problem("b")]
+    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, [1], [0, 1])]
     assert found == [
-        "a/random/gp/any/any", "b/random/gp/any/any", "a/grouped/gp/any/any",
-        "a/random/fast/60/0", "a/random/slow/60/0", "b/random/fast/60/0", "b/random/slow/60/0",
-        "a/grouped/fast/12/0", "a/random/fast/60/1", "b/random/fast/60/1",
+        "a/random/gp/any/any", "b/random/gp/any/any", "a/random/fast/1/0", "b/random/fast/1/0",
+        "a/random/fast/1/1", "b/random/fast/1/1",
     ]  # fmt: skip
 
 
 def test_a_draw_of_a_split_is_the_seed_of_every_method():
     draws = [problem("a", "blocks", draw=n) for n in range(2)]
-    found = [(p.draw, str(cell)) for p, cell in plan_cells(draws, METHODS, [Budget(60, (5, 6))])]
+    found = [(p.draw, str(cell)) for p, cell in plan_cells(draws, METHODS, [1], [5, 6])]
     assert found == [
         (0, "a/blocks/gp/any/0"), (1, "a/blocks/gp/any/1"),
-        (0, "a/blocks/fast/60/0"), (0, "a/blocks/slow/60/0"),
-        (1, "a/blocks/fast/60/1"), (1, "a/blocks/slow/60/1"),
+        (0, "a/blocks/fast/1/0"), (1, "a/blocks/fast/1/1"),
     ]  # fmt: skip
 
 
@@ -60,11 +56,11 @@ def test_a_draw_of_a_split_is_the_seed_of_every_method():
 def test_a_method_takes_part_where_what_it_needs_is_there(needed):
     methods = {"one": Contender("one", ("model=gp",), **{needed: True})}
     problems = [problem("a"), problem("b", **{needed: True})]
-    assert [cell.dataset for _, cell in plan_cells(problems, methods, [])] == ["b"]
+    assert [cell.dataset for _, cell in plan_cells(problems, methods, [], [])] == ["b"]
 
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
-    assert names("*/gp/*", "*/fast/300/*") == ["rfid/random/gp/any/any", "rfid/random/fast/300/0"]
+    assert names("*/gp/*", "*/fast/0.3/0") == ["rfid/random/gp/any/any", "rfid/random/fast/0.3/0"]
     with pytest.raises(ValueError, match="only: 'rfid/rndom/\\*' matches no cell"):
         names("rfid/rndom/*")
 
@@ -72,7 +68,7 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
 def test_every_method_of_the_default_comparison_composes():
     config = OmegaConf.to_container(compose(config="compare"), resolve=True)
     for contender in read_entries("methods", Contender, config["methods"]).values():
-        assert compose(*contender.overrides(60)).model
+        assert compose(*contender.overrides(0.3)).model
     assert config["ours"] in config["methods"]
     for split in read_entries("splits", SplitChoice, config["splits"]).values():
         assert set(split.datasets) <= set(config["datasets"])
@@ -83,21 +79,14 @@ def test_one_model_of_a_network_was_fitted_under_four_names():
     """Sectors are learned together whatever `gsparc_together`, `gaussians`, `residual` ask for."""
     methods = read_entries("methods", Contender, OmegaConf.to_container(compose(config="compare"))["methods"])
     network = problem("city", kind="rssi", stations=True, network=True)
-    there = {cell.method for _, cell in plan_cells([network], methods, [Budget(60, (0,))])}
+    there = {cell.method for _, cell in plan_cells([network], methods, [1], [0])}
     assert "gsparc" in there and not there & {"gsparc_together", "gaussians", "residual"}
 
 
 @pytest.mark.parametrize(("group", "of", "entry", "message"), [
-    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x\.chose: no such setting; there are budget"),
+    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x\.chose: no such setting; there are choose"),
     ("splits", SplitChoice, {"draw": 3}, r"splits\.x\.draw: no such setting; there are choose, datasets"),
 ])  # fmt: skip
 def test_a_wrong_entry_is_named(group, of, entry, message):
     with pytest.raises(ValueError, match=message):
         read_entries(group, of, {"x": entry})
-
-
-def test_a_split_that_no_budget_names_had_no_row_of_ours():
-    rooms = [problem("a"), problem("a", "drawn")]
-    budgets = [Budget(60, (0,), ("random",)), Budget(12, (0,), ("grouped",))]
-    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, budgets)]
-    assert "a/drawn/fast/60/0" in found and "a/drawn/fast/12/0" not in found

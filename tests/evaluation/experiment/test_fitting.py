@@ -23,10 +23,10 @@ def test_a_cell_whose_model_is_gone_is_not_timed(tmp_path):
     assert time_by_dataset([gone], {}).empty
 
 
-def prepared(problem, folder, model="gsparc", budget_s=5.0, seed=0, settings=None, choose=()):
+def prepared(problem, folder, model="gsparc", effort=0.5, seed=0, settings=None, choose=()):
     """A cell as it is before it is filled."""
-    contender = Contender(model, (f"model={model}", *choose), ("budget_s={budget_s}",))
-    cell = Cell("own", "random", model, budget_s, seed)
+    contender = Contender(model, (f"model={model}", *choose), True)
+    cell = Cell("own", "random", model, effort, seed)
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         return prepare_cell(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
 
@@ -34,23 +34,20 @@ def prepared(problem, folder, model="gsparc", budget_s=5.0, seed=0, settings=Non
 @pytest.mark.parametrize(
     "changes",
     [
-        # A model was trained as if there were no budget: one of 5 s was found again as one of 60 s.
-        [{"model": "gsparc"}, {"model": "gsparc", "budget_s": 60.0}],
-        [{"model": "moving_array"}, {"model": "moving_array", "budget_s": 60.0}],
+        [{"model": "gsparc"}, {"model": "gsparc", "effort": 1.0}],
         # The first seed of gsparc stood for all three: a spread of 0.00.
         [{"model": "gsparc", "seed": seed} for seed in range(3)],
         [{"model": "moving_array", "seed": seed} for seed in range(3)],
         # These settings stand beside the model's: a table of batches of 4 showed cells of batches of 16.
         [{}, {"settings": {"batch_size": 4}}],
-        [{}, {"choose": ("budget_clock=processor",)}],
         [{}, {"choose": ("init_from=model.ckpt",)}],
     ],
 )
-def test_a_cell_was_taken_for_one_of_another_batch_clock_or_start(changes, tmp_path, problem):
+def test_a_cell_was_taken_for_one_of_another_batch_effort_or_start(changes, tmp_path, problem):
     found = [prepared(problem, tmp_path, **change) for change in changes]
     states = [one.state for one in found]
     assert all(one not in states[:number] for number, one in enumerate(states))
-    assert found[0].config.budget_s == 5
+    assert found[0].config.effort == 0.5
 
 
 def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
@@ -58,7 +55,7 @@ def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
     one = prepared(problem, tmp_path, "mean")
     facts = {"program": one.state.program, "git": "0123456789"}
     assert one.filled(facts).earlier == "" and one.filled({**facts, "program": "q"}).earlier == "01234567"
-    assert one.folder == tmp_path / "own" / "random" / "mean" / "5" / "0" and one.result() is None
+    assert one.folder == tmp_path / "own" / "random" / "mean" / "0.5" / "0" and one.result() is None
 
 
 def test_a_full_disk_ends_a_comparison(problem, tmp_path):

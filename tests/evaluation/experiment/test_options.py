@@ -71,7 +71,7 @@ TRAINING = {
     "trainer.val_check_interval": 2, "callbacks.densify.min_gaussians": 5, "callbacks.reset.ceiling": 0.02,
     "dataset.batch_size": 7,
 }  # fmt: skip
-OF_RUN = {"budget_s": 4, "stations": "each", "split.redraw": "true", **TRAINING}
+OF_RUN = {"effort": 0.4, "stations": "each", "split.redraw": "true", **TRAINING}
 SPLIT = {"split.test_fraction": 0.25, "split.thin": 0.9}
 FIELD = {
     "trainer.max_steps": 4, "model.field.count": 40, "model.field.near": 1.5, "model.field.margin": 1.0,
@@ -92,7 +92,7 @@ PLAIN = {
 PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 OTHER = {  # values to perturb options by
     "trainer.val_check_interval": 3, "callbacks.densify.min_gaussians": 8, "callbacks.reset.ceiling": 0.04,
-    "dataset.batch_size": 5, "budget_s": 5, "stations": "auto", "split.redraw": "false", "split.thin": 0.7,
+    "dataset.batch_size": 5, "effort": 0.5, "stations": "auto", "split.redraw": "false", "split.thin": 0.7,
     "trainer.max_steps": 3, "model.field.count": 30, "model.field.near": 1.2, "model.field.margin": 2.5,
     "model.emission.encoding.anchors": 10, "model.emission.init_scale": 0.3, "model.attenuation.gain": 2.5,
     "model.raster.low_pass": 0.5, "model.loss.ssim_weight": 0.1, "model.optimizer.emission": 0.02,

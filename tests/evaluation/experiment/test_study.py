@@ -18,7 +18,7 @@ from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext, FitReport
 
 STATE = State({}, {}, "", "", "")
-CLOCK = ClockSettings(rounds=10, budget_s=2)
+CLOCK = ClockSettings(rounds=10, rounds_s=2)
 WATCH = WoundClock()
 
 
@@ -31,7 +31,7 @@ def run(monkeypatch, tmp_path):
     )
     monkeypatch.setattr(study.checkpoint, "read", kept.get)
     monkeypatch.setattr(study.loading, "rebuild_method", lambda factory, stored: stored)
-    context = FitContext(tmp_path, seed=5, budget_s=7.0)
+    context = FitContext(tmp_path, seed=5, effort=7.0)
     return lambda of, data, split: of.run(data, split, context, STATE)
 
 
@@ -92,7 +92,7 @@ def test_every_fit_gets_the_context_and_every_round_another_seed_once(run):
     for _ in range(2):  # the second time every round is done
         run(Study(dict(quick=Quick), rounds=2, seed=3, clock=CLOCK), invent(), divide(48, 2))
     assert [one.seed for one in Quick.contexts] == [3, 3, 4, 4]
-    assert {one.budget_s for one in Quick.contexts} == {7.0}
+    assert {one.effort for one in Quick.contexts} == {7.0}
     assert len({one.run_dir for one in Quick.contexts}) == 4
 
 

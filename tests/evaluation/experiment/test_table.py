@@ -9,7 +9,7 @@ import pytest
 
 from gsparc.evaluation.experiment import latency, pictures
 from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.pictures import draw_budgets
+from gsparc.evaluation.experiment.pictures import draw_efforts
 from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.experiment.table import (
     average_cells,
@@ -23,16 +23,16 @@ from gsparc.evaluation.experiment.table import (
 from gsparc.evaluation.paired import lead_over_rows
 
 
-def filled(method, value, seed=None, budget=None, split="random", kind="spectrum", **more):
+def filled(method, value, seed=None, effort=None, split="random", kind="spectrum", **more):
     """A cell with the figure that decides, and other facts."""
     figures = {"spectrum": ("psnr_db", "ssim"), "rssi": ("rmse_db", "mae_db")}[kind]
     facts = {f"test/{name}": number for name, number in zip(figures, (value, 0.9), strict=True)}
     facts |= {
         "split/sha256": f"{split}{seed if more.get('drawn') else ''}",
-        "dataset/kind": kind, "time/train_s": budget or 1.0, "time/train_cpu_s": 1.0, "machine/load": 0.1,
+        "dataset/kind": kind, "time/train_s": 1.0, "time/train_cpu_s": 1.0, "machine/load": 0.1,
     }  # fmt: skip
     drawn, earlier = more.pop("drawn", False), more.pop("earlier", "")
-    cell = Cell("rfid", split, method, budget, seed)
+    cell = Cell("rfid", split, method, effort, seed)
     return CellResult(cell, Path("absent"), facts | {"dataset/kind": kind} | more, drawn, earlier)
 
 
@@ -47,9 +47,9 @@ def said_of(cells, ours="gsparc"):
 
 
 FOUND = [
-    filled("gp", 30.0), *(filled("gsparc", 29.0 + s, s, 60.0) for s in (0.0, 1.0)),
-    *(filled("gsrf", 20.0 + s, s, 60.0, **{"machine/load": 3.0}) for s in (0.0, 2.0)),
-    filled("gsrf", 25.0, 0, 300.0), filled("gp", 31.0, split="grouped"),
+    filled("gp", 30.0), *(filled("gsparc", 29.0 + s, s, 1.0) for s in (0.0, 1.0)),
+    *(filled("gsrf", 20.0 + s, s, 1.0, **{"machine/load": 3.0}) for s in (0.0, 2.0)),
+    filled("gsrf", 25.0, 0, 3.0), filled("gp", 31.0, split="grouped"),
 ]  # fmt: skip
 TIMED = pd.DataFrame(
     [["rfid", "random", "gp", 2.0, 3.0, 1.5], ["rfid", "random", "gsparc", 0.5, 0.6, 0.4]],
@@ -60,8 +60,8 @@ TIMED = pd.DataFrame(
 def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
     found = split_by_problem(average_cells(FOUND, TIMED))
     assert [(title_of(block), list(block.method)) for block in found] == [
-        ("rfid, split random, a budget of 60 processor seconds per model", ["gp", "gsparc", "gsrf"]),
-        ("rfid, split random, a budget of 300 processor seconds per model", ["gp", "gsrf"]),
+        ("rfid, split random, effort 1", ["gp", "gsparc", "gsrf"]),
+        ("rfid, split random, effort 3", ["gp", "gsrf"]),
         ("rfid, split grouped", ["gp"]),
     ]
     _, gsparc, gsrf = found[0].itertuples()
@@ -103,7 +103,7 @@ def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monk
     """The legend drew every mark with an error bar, also of points without one."""
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
-    draw_budgets(average_cells(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
+    draw_efforts(average_cells(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
     (legend,) = figures[0].legends
     marks = {
         text.get_text(): line.get_marker()
@@ -120,14 +120,14 @@ def test_losers_are_not_hidden():
     assert "gsparc is 0.50 dB behind gp" in said
     assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
     assert "busy (load 0.1 to 3.0 per core)" in said
-    far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
+    far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 1.0)]
     said = said_of(far)
     assert "2.00 dB behind gp" in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
 
 
 def test_what_an_earlier_program_measured_is_said():
-    old = filled("gsrf", 29.0, 0, 60.0, earlier="0123abcd")
+    old = filled("gsrf", 29.0, 0, 1.0, earlier="0123abcd")
     found = split_by_problem(average_cells([*FOUND[:1], old]))[0]
     assert list(found.earlier) == ["", "0123abcd"]
     assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
@@ -135,7 +135,7 @@ def test_what_an_earlier_program_measured_is_said():
 
 def test_how_a_method_approximates_stands_behind_its_name():
     labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
-    found = [filled("gp", 30.0, i, 60.0, **{"model/label": label}) for i, label in enumerate(labels)]
+    found = [filled("gp", 30.0, i, 1.0, **{"model/label": label}) for i, label in enumerate(labels)]
     (block,) = split_by_problem(average_cells(found))
     assert list(block.label) == [" (Vecchia 30)"] and "gp (Vecchia 30)" in markdown([block], "gsparc")
 
@@ -152,11 +152,11 @@ def test_lists_were_compared_by_their_listed_rows_alone():
 def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
     """Its figure had no heading; that of errors was `-RMSE dB`, with negative numbers."""
     facts = {"test/rmse_db_with_silent": 4.2, "test/reduced_chi2": 25.0}
-    found = average_cells([filled("gp", 5.0, 0, 9.0, kind="rssi", **facts)])
+    found = average_cells([filled("gp", 5.0, 0, 1.0, kind="rssi", **facts)])
     page = markdown(split_by_problem(found), "gsparc")
     assert "| RMSE dB, silent too (less is better) |" in page and "gp, RMSE dB, silent too 4.20" in page
     assert "std of gp is 5 times too small" in page and "gsparc map" in page
-    draw_budgets(found, tmp_path / "compare.png", "gsparc")
+    draw_efforts(found, tmp_path / "compare.png", "gsparc")
 
 
 def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
@@ -187,7 +187,7 @@ def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, m
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
     near = [filled("gp", 30.0), filled("gsparc", 29.0, **{"time/train_cpu_s": 4.0})]
-    draw_budgets(average_cells(near, TIMED), tmp_path / "compare.png", "gsparc")
+    draw_efforts(average_cells(near, TIMED), tmp_path / "compare.png", "gsparc")
     figures[0].canvas.draw()
     axes = figures[0].axes[:2]
     assert [axis.get_title() for axis in axes] == ["rfid, random", "rfid, queries"]
@@ -217,21 +217,10 @@ def test_a_simple_baseline_won_by_chance():
     assert "wins" not in said and "beats" not in said
 
 
-def test_budgets_called_equal_were_spent_by_half():
-    """newrf spent 6.43 of 12 processor seconds, gsparc 14.2, under a title that gave 12 to each."""
-    cpu = {"gsparc": 14.2, "newrf": 6.43, "blind": 12.5}
-    found = [filled(name, 20.0, 0, 12.0, **{"time/train_cpu_s": own}) for name, own in cpu.items()]
-    said = said_of(found)
-    more = "newrf used 54% of its budget: budgets=[{seconds: 22, seeds: [0]}] gives it as much, unless"
-    assert f"spent of 12 processor seconds: gsparc 14.2, newrf 6.43; {more} it ended by itself" in said
-    said = said_of(found[1:2])
-    assert "newrf 6.43" in said and "as much" not in said
-
-
 def test_the_csv_file_had_other_signs_than_the_console():
     """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws, a spread was an error."""
     draws = drawn("gp", 5.0, 6.0, 7.0, kind="rssi", split="drawn")
-    seeds = [filled("gsparc", 5.0 + seed, seed, 60.0, kind="rssi") for seed in range(2)]
+    seeds = [filled("gsparc", 5.0 + seed, seed, 1.0, kind="rssi") for seed in range(2)]
     gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*draws, *seeds]))).itertuples()
     assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
     assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
@@ -239,7 +228,7 @@ def test_the_csv_file_had_other_signs_than_the_console():
 
 
 def test_what_methods_were_given_besides_places_was_not_said():
-    assert "gsparc were given directions of arrival" in said_of([*FOUND[:1], filled("newrf", 29.0, 0, 60.0)])
+    assert "gsparc were given directions of arrival" in said_of([*FOUND[:1], filled("newrf", 29.0, 0, 1.0)])
     assert "were given" not in said_of(FOUND[:1])
 
 

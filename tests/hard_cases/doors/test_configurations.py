@@ -27,7 +27,7 @@ SLIPS = {
 }  # fmt: skip
 VALUES = {
     "seed=abc": "seed='abc': a whole number of at least 0", "seed=-1": "seed=-1: a whole number",
-    "budget_s=1min": "budget_s='1min': a number above 0, or null is needed",
+    "effort=1min": "effort='1min': a number above 0 is needed",
     "trainer.accelerator=gpu": "trainer.accelerator=gpu: there is no GPU here; say trainer=cpu",
     "threads=0": "threads=0: a whole number of at least 1, or null",
     "baselines=gp": "a list of methods is needed",

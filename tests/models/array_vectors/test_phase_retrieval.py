@@ -14,7 +14,7 @@ from gsparc.models.array_vectors import phase_retrieval, vector_cache
 from gsparc.models.array_vectors.phase_retrieval import recover_vectors
 from gsparc.models.array_vectors.vector_gp import index_mirror_elements, twin_vectors
 from gsparc.ops import SphereGrid
-from gsparc.training.time_budget import Spent, TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 
 def _agreement(found, truth, partner):
@@ -85,9 +85,9 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
     asked, inner = [], vector_cache.recover_vectors
     monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
     monkeypatch.setattr(vector_cache, "recover_vectors", lambda *a: asked.append(len(a[1])) or inner(*a))
-    budget = TimeBudget()  # of one fit, which pays once
-    first = vector_cache.recover_cached(data, np.arange(10), budget=budget)
-    again = vector_cache.recover_cached(data, np.arange(5, 25), budget=budget)
+    watch = Stopwatch()  # of one fit, which pays once
+    first = vector_cache.recover_cached(data, np.arange(10), watch=watch)
+    again = vector_cache.recover_cached(data, np.arange(5, 25), watch=watch)
     assert asked == [10, 8, 7]
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
     assert not any("computed before" in said for said in caplog.messages)
@@ -102,15 +102,13 @@ def test_seconds_of_vectors_that_another_fit_had_solved_were_not_counted(known_c
     caplog.set_level("INFO", "gsparc")
     data, rows = known_campaign[0], np.arange(6)
     data = replace(data, site=replace(data.site, sha256="sweep"))
-    first, second = TimeBudget(), TimeBudget()
+    first, second = Stopwatch(), Stopwatch()
     inner = vector_cache.recover_vectors
-    monkeypatch.setattr(
-        vector_cache, "recover_vectors", lambda *given: first.charge(Spent(60.0, 30.0)) or inner(*given)
-    )
-    vector_cache.recover_cached(data, rows, budget=first)
-    vector_cache.recover_cached(data, rows[:3], budget=second)
-    vector_cache.recover_cached(data, rows, budget=second)
-    assert 60 < second.by_clock.wall < 70 and 30 < second.by_clock.processor < 40
+    monkeypatch.setattr(vector_cache, "recover_vectors", lambda *given: first.charge(60.0) or inner(*given))
+    vector_cache.recover_cached(data, rows, watch=first)
+    vector_cache.recover_cached(data, rows[:3], watch=second)
+    vector_cache.recover_cached(data, rows, watch=second)
+    assert 60 < second.seconds < 70
     assert caplog.messages[0].startswith(
         "array vectors of 3 spectra were computed before, by a fit whose 30."
     )

@@ -244,7 +244,7 @@ def test_the_conference_room_from_43_receivers():
     assert len(fold.train) + len(fold.val) == 43
     assert error(method, data, fold.test) < 0.08
     searched = ImageSourceGP(searches=1, clutter=False)
-    searched.fit(data, fold, FitContext(budget_s=5))
+    searched.fit(data, fold, FitContext(effort=0.3))
     assert error(searched, data, fold.test) > 0.5
 
 

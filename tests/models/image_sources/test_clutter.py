@@ -221,7 +221,7 @@ def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
 
 
 def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
-    """It looked at neither clock nor interrupt: `budget_s=60` was at 150 s and going."""
+    """It looked at neither clock nor interrupt: it was at 150 s and going."""
     left, _ = _beside_a_table(60)
     spent: list[float] = []
 

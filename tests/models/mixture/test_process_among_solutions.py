@@ -1,21 +1,16 @@
 """The plain process as one of the solutions that are weigh_candidates."""
 
 import numpy as np
-import pytest
 import torch
 from boxes import room_of_spectra
 from closed import fitted_to
 
 from gsparc.data.inner_folds import cut_folds
 from gsparc.data.splits import Fold
-from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.mixture.fit_candidates import fit_candidates, weigh_candidates
+from gsparc.models.mixture.fit_candidates import weigh_candidates
 from gsparc.models.mixture.methods import Channels
-from gsparc.models.terms import EffectSettings
-from gsparc.training.context import FitContext
-from gsparc.training.time_budget import TimeBudget
 
 
 def test_sources_of_few_rows_lost_a_decibel_to_the_process():
@@ -28,19 +23,6 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
     cut = cut_folds(data, fold, None, 3, 0)
     assert [*weigh_candidates({"bearings": spoilt, "process": good}, data, fold, cut)] == ["process"]
-
-
-@pytest.mark.parametrize(("seconds", "held"), [(1e-9, False), (1e9, True)])
-def test_groups_were_fitted_without_each_other_after_the_seconds(seconds, held):
-    """`budget_s=8` took 46 s, 24 of them for weights that validation rows tell as well."""
-    data, few = room_of_spectra(), np.arange(24)
-    fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
-    cut, budget = cut_folds(data, fold, None, 3, 0), TimeBudget(seconds)
-    parts = {name: lambda *unused: GaussianProcess() for name in ("one", "other")}
-    choice = parts, InitSettings(), EffectSettings()
-    found, _, _ = fit_candidates(*choice, data, fold, FitContext(), budget, cut)
-    assert [one.held is not None for one in found.values()] == [held, held] and budget.limited != held
-    assert weigh_candidates(found, data, fold, cut)
 
 
 class Said(ClosedForm):

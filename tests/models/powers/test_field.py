@@ -79,8 +79,8 @@ def test_left_out_rows_are_predicted_without_them():
 
 def test_settings_are_chosen_on_rows_that_no_clock_counts():
     """A busy machine chose on fewer rows: 5.573 dB beside two loops, 5.580 alone."""
-    chosen = [FitContext(effort=effort, budget_s=1e-9).time_budget() for effort in (1e-3, 1.0, 8.0)]
-    assert [each.effort.chosen_on for each in chosen] == [150, 1000, 2000]
+    chosen = [FitContext(effort=effort).counts for effort in (1e-3, 1.0, 8.0)]
+    assert [each.chosen_on for each in chosen] == [150, 1000, 2000]
     assert all(each.is_spent() for each in chosen)
 
 

@@ -10,7 +10,7 @@ from scenes import fold_of
 from gsparc.data.load import load as load_data
 from gsparc.models.registry import build
 from gsparc.models.splat.method import LearnedField
-from gsparc.training.time_budget import Effort
+from gsparc.training.effort import Effort
 
 MAKERS = {
     "spectra": spectra,

@@ -27,9 +27,7 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
         "logger=none",
         "threads=1",
     ]
-    facts, objects = train(
-        compose(*said, "budget_s=4", "budget_clock=processor", "baselines=[complex_gp]"), tmp_path / "run"
-    )
+    facts, objects = train(compose(*said, "effort=.3", "baselines=[complex_gp]"), tmp_path / "run")
     assert facts["test/nmse"] < 1.1 * facts["baseline/complex_gp/nmse"] < 0.5
     data, method = objects.data, objects.methods[0]
     rows = objects.split.folds[0].test

@@ -23,7 +23,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.physics.mirror_planes import Reflections
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import Cancelled, cancel_when, out_of_time, raise_if_cancelled
+from gsparc.processes.worker import Cancelled, cancel_when, out_of_steps, raise_if_cancelled
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ def find_clutter(rows: Rows, scene: SourceScene, generator: torch.Generator) -> 
     """Return the scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `out_of_time`, what
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `out_of_steps`, what
     was found so far is the result.
 
     Args:
@@ -120,7 +120,7 @@ class _ClutterSearcher:
         start = self.nll
         best = self.whole = start, self.scene
         try:
-            with cancel_when(out_of_time):  # within a step, too
+            with cancel_when(out_of_steps):  # within a step, too
                 for epoch in range(EPOCHS):
                     before = self.nll
                     self._run_round()

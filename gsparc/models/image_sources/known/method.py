@@ -23,8 +23,7 @@ from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, dir
 from gsparc.models.image_sources.search import NOISE, Found, SearchSettings
 from gsparc.physics.mirror_planes import Reflections, hesse_form
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.worker import end_when
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.effort import Effort
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +57,7 @@ class KnownWallsGP(ImageSourceGP):
         return ImageSourceGP
 
     def _run_searches(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget,
+        self, row_sets: list[Rows], settings: SearchSettings, effort: Effort,
         look: Look | None = None, start: Found | None = None,
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search, so that nothing is looked at or started from."""
@@ -70,11 +69,10 @@ class KnownWallsGP(ImageSourceGP):
             near = walls_prior_cost(given.planes, given.sequences, scene.planes, scene.log_amplitude)
             return near + prior.negative_log_density(scene.phase, given.sequences)
 
-        with end_when(budget.is_spent):
-            scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
-            scene = learn_visibility(rows, scene, self.kernel)
-            prior = ReflectionPhasePrior.from_scene(scene)
-            scene = refine_scene(rows, scene, settings.final_steps, negative_log_prior)
+        scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
+        scene = learn_visibility(rows, scene, self.kernel)
+        prior = ReflectionPhasePrior.from_scene(scene)
+        scene = refine_scene(rows, scene, settings.final_steps, negative_log_prior)
         error = left_out_nmse(rows, scene)
         log.info(
             "known walls: %d sources over %d planes, error %.3f",

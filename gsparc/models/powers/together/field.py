@@ -44,7 +44,7 @@ from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
 from gsparc.processes.shared import SharedTermsPosterior
 from gsparc.processes.trend import TINY_M
 from gsparc.training.context import FitContext, FitReport
-from gsparc.training.time_budget import TimeBudget
+from gsparc.training.stopwatch import Stopwatch
 
 NEVER = -1  # in place of a station's number: one that was never heard
 MEMORY = 3e9  # bytes of all stations' factors
@@ -82,27 +82,27 @@ class JointPowerField(ClosedForm):
         Raises:
             ValueError: not several stations, or no rows.
         """
-        budget, rows = context.time_budget(), np.concatenate([fold.train, fold.val])
+        watch, rows = Stopwatch(), np.concatenate([fold.train, fold.val])
         if data.site.stations is None or len(data.site.stations) < 2:
             raise ValueError("a process of many stations' powers needs several stations")
         if not len(rows):
             raise ValueError("a process of many stations' powers needs at least one row")
         self.site, self.inflation = data.site, 1.0
-        notes = self._learn(data, rows, budget)
+        notes = self._learn(data, rows)
         self.condition(data, rows)
-        return FitReport(budget.by_clock.wall, notes, budget.limited_by)
+        return FitReport(watch.seconds, notes)
 
-    def _learn(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> tuple[str, ...]:
+    def _learn(self, data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
         """Set the processes and what they share; what must be said of them."""
         assert data.site.stations is not None
         self.places, notes = places_and_notes(data, rows)
         used = rows_of_stations(data, rows, self.places)
         network = find_sectors(data, self.places)
         if network is None:
-            self.own, remarks = learn_station_priors(used, self.seed, budget)
+            self.own, remarks = learn_station_priors(used, self.seed)
         else:
             used = relabel_by_site(used, network)
-            prior, remarks = learn_network(used, network, data.site.stations.shown, self.seed, budget)
+            prior, remarks = learn_network(used, network, data.site.stations.shown, self.seed)
             self.own = StationPriors(prior, {})
         self.asks_visibility = network is None and len(used.stations) >= LEAST_STATIONS
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
@@ -111,7 +111,7 @@ class JointPowerField(ClosedForm):
         self.heard = self.unheard = SharedTerms.from_rows(used, self.own.never.known_trend, 1.0, 0, self.seed)
         if not self.shared or network is not None:
             return (*notes, *remarks)
-        terms, self.inflation, remark = learn_shared_terms(used, self.own, self.seed, budget)
+        terms, self.inflation, remark = learn_shared_terms(used, self.own, self.seed)
         if terms.place_db:
             self.unheard = terms.set_inducing(used, PLACES, self.seed)
         return (*notes, *remarks, remark)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,8 +26,6 @@ from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
 from gsparc.processes.trend import Trend
-from gsparc.processes.worker import end_when, out_of_time
-from gsparc.training.time_budget import TimeBudget
 
 START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
 SETTLED = 1e-6  # of settings that all stations have alike
@@ -89,40 +86,31 @@ class StationPriors:
         return self.never.kernel.amplitude * (1 + self.never.kernel.noise)
 
 
-def learn_station_priors(
-    rows: StationRows, seed: int, budget: TimeBudget | None = None
-) -> tuple[StationPriors, list[str]]:
-    """Return the law and settings of own processes, and what must be said of them.
-
-    Searches end with what they have when the budget is over; single stations then have no settings of
-    their own.
-    """
+def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, list[str]]:
+    """Return the law and settings of own processes, and what must be said of them."""
     trend, notes = _fit_site_law(rows, seed)
     heard, some_silent = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
     whole = rows.select_complete_places() if some_silent else heard
     numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
-    with nullcontext() if budget is None else end_when(budget.is_spent):
-        kernel, priors = _fit_common_kernel(heard, trend, seed)
-        if some_silent and not out_of_time():
-            each = min(WEIGHED_EACH, max(MOST_ROWS // len(whole.stations), 1))
-            parts = [whole.select_station(n).draw_stretches(each, seed) for n in whole.stations]
-            # What lists hold spreads less than what they were drawn from.
-            narrow, (_, kernel) = kernel, fit_kernel_by_evidence(parts, trend, kernel, EVIDENCE_LOOKS)
-            wider = kernel.amplitude / narrow.amplitude
-            for number, one in priors.items():
-                own = replace(kernel, amplitude=wider * one.kernel.amplitude)
-                priors[number] = Prior(own, trend)
-        if budget is not None and budget.is_spent():
-            numbers = []
-        for number in numbers:
-            if some_silent:
-                some = whole.select_station(number).draw_stretches(ENDS_FROM, seed)
-                _, own = fit_kernel_by_evidence([some], trend, priors[number].kernel, EVIDENCE_LOOKS)
-            else:
-                some = heard.select_station(number).thin_rows(ENDS_ON, seed)
-                known = some.distances_terms_values(trend)
-                _, own = fit_kernel_by_left_out([kernel], *known, tolerance=SETTLED)
-            priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
+    kernel, priors = _fit_common_kernel(heard, trend, seed)
+    if some_silent:
+        each = min(WEIGHED_EACH, max(MOST_ROWS // len(whole.stations), 1))
+        parts = [whole.select_station(n).draw_stretches(each, seed) for n in whole.stations]
+        # What lists hold spreads less than what they were drawn from.
+        narrow, (_, kernel) = kernel, fit_kernel_by_evidence(parts, trend, kernel, EVIDENCE_LOOKS)
+        wider = kernel.amplitude / narrow.amplitude
+        for number, one in priors.items():
+            own = replace(kernel, amplitude=wider * one.kernel.amplitude)
+            priors[number] = Prior(own, trend)
+    for number in numbers:
+        if some_silent:
+            some = whole.select_station(number).draw_stretches(ENDS_FROM, seed)
+            _, own = fit_kernel_by_evidence([some], trend, priors[number].kernel, EVIDENCE_LOOKS)
+        else:
+            some = heard.select_station(number).thin_rows(ENDS_ON, seed)
+            known = some.distances_terms_values(trend)
+            _, own = fit_kernel_by_left_out([kernel], *known, tolerance=SETTLED)
+        priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
 
@@ -170,16 +158,13 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
     }
 
 
-def learn_shared_terms(
-    rows: StationRows, priors: StationPriors, seed: int, budget: TimeBudget | None = None
-) -> tuple[SharedTerms, float, str]:
+def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> tuple[SharedTerms, float, str]:
     """Return shared terms for stations that were never heard, of least squared error at left-out stations.
 
     Args:
         rows: of all stations.
         priors: of the stations' own processes.
         seed: of rows and places drawn.
-        budget: no further length is tried when it is over.
 
     Returns:
         The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
@@ -194,8 +179,6 @@ def learn_shared_terms(
     processes = priors.condition(few, bare, seed).processes
     best = plain = bare, *_left_out_errors(processes, bare)
     for length in LENGTHS:
-        if length != LENGTHS[0] and budget is not None and budget.is_spent():
-            break
         for share in PLACE:
             terms = replace(bare, length=length * short, place_db=math.sqrt(share * priors.variance))
             result = _left_out_errors(processes, terms)

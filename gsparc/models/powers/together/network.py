@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import cast
 
@@ -40,8 +39,6 @@ from gsparc.processes.sectors import (
     sector_of,
 )
 from gsparc.processes.trend import LEAST_SPREAD
-from gsparc.processes.worker import end_when
-from gsparc.training.time_budget import TimeBudget
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
 SAME_NAME_M = 100.0  # the same of those whose names differ in their last part alone
@@ -115,7 +112,7 @@ def relabel_by_site(rows: StationRows, network: Sectors) -> StationRows:
 
 
 def learn_network(
-    rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int, budget: TimeBudget | None
+    rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
 ) -> tuple[Prior, list[str]]:
     """Return the prior of every site of a network, and what must be said of it.
 
@@ -124,7 +121,6 @@ def learn_network(
         network: of the stations.
         names: (T,) of the stations.
         seed: of rows drawn.
-        budget: searches end with what they have when it is over.
     """
     few = rows.subset(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
@@ -138,18 +134,17 @@ def learn_network(
     piles = find_noise(sector_of(loud.places), loud.decibels).values()
     top = max((top for top, _ in piles), default=-math.inf)
     quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side))
-    with nullcontext() if budget is None else end_when(budget.is_spent):
-        rough, gains, scale = _fit_rough(quiet, start)
-        # A wrong azimuth bends what all sectors share, by which right ones are doubted: the surest first.
-        for _ in range(TURNED):
-            turned = _correct_azimuths(quiet, rough, gains, scale)
-            if torch.equal(turned.table, rough.table):
-                break
-            rough, gains, scale = _fit_rough(quiet, turned)
-        notes = _note_turned(network.table[:, 0], rough.table[:, 0], names)
-        if piles:
-            rough, gains, scale = _fit_rough(few, rough)
-        trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
+    rough, gains, scale = _fit_rough(quiet, start)
+    # A wrong azimuth bends what all sectors share, by which right ones are doubted: the surest first.
+    for _ in range(TURNED):
+        turned = _correct_azimuths(quiet, rough, gains, scale)
+        if torch.equal(turned.table, rough.table):
+            break
+        rough, gains, scale = _fit_rough(quiet, turned)
+    notes = _note_turned(network.table[:, 0], rough.table[:, 0], names)
+    if piles:
+        rough, gains, scale = _fit_rough(few, rough)
+    trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
     shadowing = cast(SectorShadowing, kernel.terms[0])
     variances = (kernel.amplitude * float(part) for part in (*shadowing.shares, kernel.noise))
     (site, own, bearing, gain, noise), (wide, near) = map(math.sqrt, variances), shadowing.lengths

@@ -25,7 +25,7 @@ def room(tmp_path_factory):
 
 
 def fitted(name: str, data, rows: np.ndarray, **init):
-    context = FitContext(budget_s=60.0)
+    context = FitContext()
     method = CANDIDATES[name](InitSettings(name, searches=1, **init), True, context)
     return method, method.fit(data, Fold(np.sort(rows), rows[:0], rows[:0]), context)
 
@@ -56,5 +56,5 @@ def test_without_visibility_every_image_is_seen_everywhere(room):
     _, data, fold, file = room
     settings = InitSettings("scene", file=str(file), order=1)
     field = CANDIDATES["scene"](settings, False, FitContext())
-    fitted_to(field, data, fold.train[:40], budget_s=30.0)
+    fitted_to(field, data, fold.train[:40])
     assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count_gaussians == 7

@@ -1,0 +1,61 @@
+"""What a fit counts, its seconds, and that none of these end it."""
+
+import pickle
+
+import pytest
+import yaml
+from campaigns import compose
+from clocks import wound
+from doors import knock
+
+import gsparc
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.shared.continued import add_settings_of_run
+from gsparc.commands.shared.settings import RunSettings
+from gsparc.training.context import FitContext
+from gsparc.training.effort import INSTEAD, Effort
+from gsparc.training.stopwatch import Stopwatch
+
+
+def test_an_effort_multiplies_every_count_and_rows_by_its_cube_root():
+    usual, more = Effort(), Effort().scale_by(8.0)
+    assert Effort().scale_by(1.0) == usual and more.evaluations == 8 * usual.evaluations
+    assert more.chosen_on == 2 * usual.chosen_on and Effort().scale_by(1e-6).chosen_on == 150
+    assert more.factor == 8.0 and Effort().scale_by(0.3).factor == 0.3
+    with pytest.raises(ValueError, match="effort=0: a number above 0 is needed"):
+        FitContext(effort=0)
+
+
+def test_what_was_spent_before_and_elsewhere_counts(monkeypatch):
+    """Processes of several devices are given a watch of theirs, by pickling."""
+    clock, watch = wound(monkeypatch).monotonic, Stopwatch(before=70.0)
+    clock.wind(2.0)
+    watch.charge(8.0)
+    assert watch.seconds == pytest.approx(80.0, abs=0.01)
+    assert pickle.loads(pickle.dumps(watch)).seconds == pytest.approx(80.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("command", "word"), [
+    ("train", "budget_s=60"), ("train", "+budget_clock=wall"), ("train", "model.budget_s=3"),
+    ("compare", "budgets=[{seconds: 5, seeds: [0]}]"), ("map", "promise.budget_s=1"),
+])  # fmt: skip
+def test_seconds_on_the_command_line_are_refused_with_what_to_say_instead(command, word):
+    answer = knock(COMMANDS[command].run, command, [word])
+    assert answer.status == 1 and answer.err == [f"error: {word.lstrip('+')}: {INSTEAD}"]
+    assert "effort=" in INSTEAD and "efforts=" in INSTEAD and "trainer.max_time=" in INSTEAD
+
+
+def test_seconds_of_a_file_or_in_python_are_refused():
+    with pytest.raises(ValueError, match="budget_s=60: no seconds end a fit"):
+        RunSettings.from_config(compose("+budget_s=60", "logger=none"))
+    with pytest.raises(ValueError, match="budget_s=1: no seconds end a fit"):
+        gsparc.fit(rx=[[0.0, 0, 0]], rssi=[1.0], budget_s=1)
+
+
+def test_a_run_that_seconds_ended_goes_on_without_them(tmp_path):
+    notes = {"overrides.yaml": ["budget_s=9", "seed=3"], "hydra.yaml": {"hydra": {"runtime": {"cwd": "/"}}}}
+    (tmp_path / ".hydra").mkdir()
+    for name, told in notes.items():
+        (tmp_path / ".hydra" / name).write_text(yaml.safe_dump(told))
+    words = [f"ckpt_path={tmp_path}"]
+    assert add_settings_of_run(words) == ["seed=3", "hydra.mode=RUN", *words]
