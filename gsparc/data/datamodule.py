@@ -169,6 +169,14 @@ class DataModule(pl.LightningDataModule, ABC):
         """Return validation rows in order, all of them on every device."""
         return RowsLoader(self.measurements, self._rows().val, self.batch_size)
 
+    def test_dataloader(self) -> RowsLoader:
+        """Return test rows in order, all of them on every device."""
+        return RowsLoader(self.measurements, self._rows().test, self.batch_size)
+
+    def predict_dataloader(self) -> RowsLoader:
+        """Return the test rows; `Trainer.predict` asks for them."""
+        return self.test_dataloader()
+
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """Move the batch, a frozen dataclass, which Lightning does not move itself."""
         return batch.to(device)

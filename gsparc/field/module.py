@@ -130,10 +130,22 @@ class NetworkModule(L.LightningModule):
             for name in looks[0][1]
         }
 
+    def predict_step(self, batch: Batch, step: int) -> Tensor:
+        """Return targets (B, ...) in stored units, spectra within [0, 1]."""
+        mean = self.mean(batch)
+        return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
+
+    def test_step(self, batch: Batch, step: int) -> None:
+        """Log the squared error of test rows; `gsparc evaluate` has all figures."""
+        error = squared_error(self.mean(batch), batch, self.site.kind).mean()
+        self.log("test/error", error, batch_size=len(batch))
+
     @classmethod
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
         """Raise `NotImplementedError`, which says what reads our checkpoints: they hold whole models."""
-        raise NotImplementedError("a checkpoint holds a whole model: say gsparc.load(FILE)")
+        raise NotImplementedError(
+            "a checkpoint holds a whole model: say gsparc.models.loading.load_module(FILE)"
+        )
 
     def configure_optimizers(self) -> Any:
         """Return one Adam group per tensor, rates as pure functions of the step."""

@@ -1,4 +1,4 @@
-"""The model in a checkpoint: of whatever class it is, with its stations."""
+"""The model in a checkpoint: of whatever class it is, with its stations, or as a module of Lightning's."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from pathlib import Path
 
 from hydra.utils import get_class
 
+from gsparc.field.module import GaussianModule
 from gsparc.models import checkpoint
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import all_methods, build
+from gsparc.models.splat.method import LearnedField
 
 
 def method_from_checkpoint(stored: checkpoint.Stored) -> Method:
@@ -58,3 +60,15 @@ def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
     """
     stored = checkpoint.read(path)
     return method_from_checkpoint(stored), stored
+
+
+def load_module(path: str | Path) -> GaussianModule:
+    """Return the LightningModule in a `model.ckpt` or `last.ckpt` of a splatted field, on the CPU.
+
+    Raises:
+        CheckpointError: unreadable, or another method's.
+    """
+    method, stored = load(path)
+    if not isinstance(method, LearnedField):
+        raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
+    return method.module()

@@ -9,12 +9,17 @@ import pytest
 import torch
 from campaigns import FROZEN, brief, compose, plain, short, spectra, weights
 from doors import assert_refused, knock
+from lightning.pytorch import Trainer
 
+import gsparc
 from gsparc.commands.train import main, train
+from gsparc.data.datamodule import Loaded
+from gsparc.data.load import datamodule
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.fitting import Origin
+from gsparc.models.loading import load_module
 from gsparc.training.context import FitContext
 
 ROOT = Path(__file__).parents[2]
@@ -155,6 +160,24 @@ def test_what_cannot_be_trained_is_refused_in_one_line(spectra_file, others, tmp
     with pytest.raises(ValueError, match=message) as error:
         train(compose(*settings, *(change.format(**others) for change in changes)), tmp_path)
     assert "\n" not in str(error.value) and not (tmp_path / "model.ckpt").exists()
+
+
+@pytest.mark.parametrize("name", ["model.ckpt", "last.ckpt"])
+def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra_file, halfway):
+    path = halfway.checkpoints[0].with_name(name)
+    module = load_module(path)
+    data = datamodule({"name": "own", "file": str(spectra_file)}).measurements
+    rows = np.arange(20)
+    loaded = Loaded(data, 8).use(Fold(rows, rows[:0], rows))
+    trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_checkpointing=False)
+    predicted = torch.cat(trainer.predict(module, loaded))
+    expected = gsparc.load(path).spectrum(tx=data.tx[rows] + data.site.origin)
+    assert predicted.shape == (20, 16, 32) and np.abs(predicted.numpy() - expected).max() < 1e-5
+
+
+def test_a_method_without_a_field_has_no_module(others):
+    with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
+        load_module(others["nearest"])
 
 
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):

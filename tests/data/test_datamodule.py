@@ -152,6 +152,7 @@ def test_a_subclass_needs_load_alone(csi_arrays, tmp_path):
     recorder = _Recorder()
     _fit(module.use(FOLD, seed=3), tmp_path, recorder, steps=2)
     assert recorder.seen == [rows_of_step(3, s, 4, FOLD.train).tolist() for s in range(2)] and Mine.reads == 1
+    assert [b.index.tolist() for b in module.test_dataloader()] == [FOLD.test.tolist()]
 
 
 @pytest.mark.parametrize(("batch", "devices"), [(4, 2), (3, 2), (1, 2), (2, 3)])

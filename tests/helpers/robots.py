@@ -84,5 +84,6 @@ def drive(
         (folder / f"csi_{tx}_{name}.dat").write_bytes(
             b"".join(other[size * k : size * k + size] for k in kept)
         )
-    (folder / f"csi_rx_{name}.dat").write_bytes(b"".join(robot))
+    log = np.frombuffer(b"".join(robot), RECORD)
+    (folder / f"csi_rx_{name}.dat").write_bytes(log[np.argsort(log["tick_us"], kind="stable")].tobytes())
     return where

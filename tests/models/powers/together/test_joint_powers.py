@@ -9,8 +9,10 @@ import pytest
 import torch
 from closed import fitted_to
 from known_fields import known_field
+from releases import real
 from scenes import fold_of
 
+from gsparc.data.datasets.ble import BLE
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
@@ -23,6 +25,7 @@ from gsparc.models.powers.together import learning
 from gsparc.models.powers.together.field import JointPowerField, rows_per_station
 from gsparc.models.powers.together.learning import StationPriors, learn_shared_terms, learn_station_priors
 from gsparc.models.powers.together.terms import SharedTerms, StationRows, places_and_notes, rows_of_stations
+from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.kernel import Kernel
@@ -324,6 +327,18 @@ def test_stations_at_one_place_are_told_apart_by_their_numbers():
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
     batch = data.batch(np.flatnonzero(data.station < 2))
     assert np.abs(db(method.predict(batch).mean) - db(batch.target)).max() < 2
+
+
+def test_halls_gain_over_a_process_of_each_sensor():
+    data = BLE(file=str(real("real/ble-hall-1.npz"))).load()
+    fold = fold_of(data, name="blocks", side_m=3.0)
+    errors = []
+    for make, stations in ((Gsparc, "together"), (method_class("gp"), "each")):
+        method = wrap_per_station(make(), data)
+        method.fit(data, fold, FitContext(stations=stations))
+        batch = data.batch(fold.test)
+        errors.append(np.mean((db(method.predict(batch).mean) - db(batch.target)) ** 2))
+    assert errors[0] < errors[1], errors
 
 
 def test_the_error_of_a_gain_is_that_of_stations():
