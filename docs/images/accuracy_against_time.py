@@ -50,8 +50,7 @@ def main() -> None:
             axis.plot(*zip(*places, strict=True), **style.marked, markersize=15 if ours else 7)
             axis.annotate(
                 text, places[-1], (right, up), textcoords="offset points",
-                ha="left" if right > 0 else "right",
-                va="center", color=style.colour,
+                ha="left" if right > 0 else "right", va="center", color=style.colour,
                 fontsize=12 if ours else 9.5, fontweight="bold" if ours else None,
             )  # fmt: skip
     labels = ("training, seconds of one processor", "one query [ms], one thread")

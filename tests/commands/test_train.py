@@ -137,6 +137,13 @@ def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monke
     assert error_in_one_line(error.value).startswith(message)
 
 
+def test_the_curve_of_a_closed_form_had_no_held_out_error(spectra_file, tmp_path):
+    train(plain(spectra_file, "nearest"), tmp_path)
+    (row,) = curve.read_curve(tmp_path)
+    told = json.loads((tmp_path / "summary.json").read_text())
+    assert row["what"] == "test rows" and float(row["error"]) == pytest.approx(told["test/mse"])
+
+
 def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monkeypatch, caplog):
     """`effects.array=true effort=.5`, or `trainer.max_steps=3` of a plain method, went without a word."""
     given = {name: f"{name}=3" for name in ("trainer.max_steps", "effort", "split.folds", "seed")}

@@ -20,7 +20,6 @@ from gsparc.models.moving_array.triangulate import (
     nonnegative_powers,
     site_problem,
 )
-from gsparc.ops import SphereGrid
 from gsparc.physics.lags import SpectrumLags
 from gsparc.simulate.shoebox import mirror_images
 from gsparc.training.context import FitContext
@@ -105,31 +104,25 @@ def test_the_strong_images_are_found(data):
     power = torch.from_numpy(data.target[:60].astype(np.float32) / 255) ** 2
     receivers = torch.from_numpy(data.moving[:60]).float()
     given = space.to_lags(power), receivers, None, torch.eye(3), space, site.grid, SEARCH, 0
-    found = find_sources(*given, lambda: False)
+    found = find_sources(*given)
     mirrored = mirror_images(ROOM, 1).mirror_points(TRANSMITTER)
     above = mirrored[mirrored[:, 2] > 0] - site.origin
     distance = np.linalg.norm(above[:, None] - found.numpy()[None], axis=-1).min(1)
     assert distance[0] < 0.1 and (distance < 0.25).sum() >= 3
 
 
-def test_a_search_ends_with_its_seconds():
-    """One of 60 sources took 13 s of 4: sources are then fewer, and not refined."""
-    rng = np.random.default_rng(0)
-    grid = SphereGrid.hemisphere(15, 60)
-    array = np.c_[np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4), np.zeros(16)] * 0.06
-    space = SpectrumLags(array, grid, 0.125)
-    power = torch.from_numpy(rng.uniform(size=(20, 15, 60)).astype(np.float32))
-    receivers = torch.from_numpy(rng.uniform(size=(20, 3)).astype(np.float32))
-    settings = dataclasses.replace(SEARCH, sources=40, per_round=4, least_gain=0.0)
-    looks = iter([False, False, True] + 9 * [True])
+def test_an_effort_multiplies_the_steps_of_a_search(data, split, tmp_path, monkeypatch):
+    steps = []
 
-    def search(over):
-        return find_sources(
-            space.to_lags(power), receivers, None, torch.eye(3), space, grid, settings, 0, over
-        )
+    def found(*given):
+        steps.append(given[6].steps)
+        raise StopIteration
 
-    assert len(search(lambda: next(looks))) == 12  # of three rounds, and no step of the refinement
-    assert torch.isfinite(search(lambda: True)).all() and len(search(lambda: True)) == 4
+    monkeypatch.setattr("gsparc.models.moving_array.method.find_sources", found)
+    for effort in (0.5, 2.0):
+        with pytest.raises(StopIteration):
+            MovingArrayField(search=SEARCH).fit(data, split.folds[0], FitContext(tmp_path, effort=effort))
+    assert steps == [SEARCH.steps / 2, 2 * SEARCH.steps]
 
 
 def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted, tmp_path):

@@ -81,7 +81,6 @@ def test_settings_are_chosen_on_rows_that_no_clock_counts():
     """A busy machine chose on fewer rows: 5.573 dB beside two loops, 5.580 alone."""
     chosen = [FitContext(effort=effort).counts for effort in (1e-3, 1.0, 8.0)]
     assert [each.chosen_on for each in chosen] == [150, 1000, 2000]
-    assert all(each.is_spent() for each in chosen)
 
 
 def test_two_rows_behind_known_walls_were_known_to_a_thousandth_of_a_decibel(tmp_path):

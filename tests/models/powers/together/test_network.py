@@ -145,7 +145,7 @@ def notes_of_azimuths(data: Measurements, monkeypatch) -> list[str]:
     sectors = find_sectors(data, places)
     rows = relabel_by_site(rows_of_stations(data, every, places), sectors)
     with pytest.raises(StopIteration):
-        learn_network(rows, sectors, data.site.stations.shown, 0, None)
+        learn_network(rows, sectors, data.site.stations.shown, 0)
     return said
 
 
