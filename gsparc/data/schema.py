@@ -169,7 +169,7 @@ class Site:
     unit: str | None = None
     freedom: Freedom = "none"
     phase_reference: Literal["carrier", "neighbours"] | None = None
-    device_names: tuple[str, ...] | None = field(default=None, compare=False)
+    device_names: tuple[str, ...] | None = None
     device_levels: np.ndarray | None = field(default=None, compare=False)
 
     @property

@@ -28,11 +28,11 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, suitable_threads
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import ArraySearch as BearingSearchSettings
+from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import build, built_in_methods, method_class
 from gsparc.models.splat.array import ArrayField
-from gsparc.models.uplink.search import SnapshotSearch as UplinkSearch
+from gsparc.models.uplink.search import SearchSettings as UplinkSearch
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext

@@ -30,7 +30,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import ArraySearch as BearingSearchSettings
+from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose

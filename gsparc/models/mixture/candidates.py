@@ -16,7 +16,7 @@ from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.known.method import KnownWallsGP
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import ArraySearch as BearingSearchSettings
+from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.powers.field import PowerField
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.training.context import FitContext

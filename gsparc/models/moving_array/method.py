@@ -25,7 +25,7 @@ from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, redu
 from gsparc.models.moving_array.residual import error_and_likeliest_kernel, fit_residual
 from gsparc.models.moving_array.triangulate import (
     MAX_UNEXPLAINED,
-    ArraySearch,
+    SearchSettings,
     find_sources,
     nonnegative_powers,
     pixel_exponent,
@@ -82,7 +82,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     found: PowerTrend  # sources and their powers
 
     def __init__(
-        self, search: ArraySearch = ArraySearch(), trend: TrendSettings = TrendSettings(),
+        self, search: SearchSettings = SearchSettings(), trend: TrendSettings = TrendSettings(),
         rest_rows: int = 1500, components: int = 512, seed: int = 0, name: str = "moving_array",
     ) -> None:  # fmt: skip
         super().__init__()

@@ -25,7 +25,7 @@ SEEN_AT_ONCE = 64  # receivers of a step of refinement
 
 
 @dataclass(frozen=True)
-class ArraySearch:
+class SearchSettings:
     """Source search.
 
     Attributes:
@@ -87,7 +87,7 @@ def sum_lags(power: Tensor, atoms: Tensor) -> Tensor:
 
 def find_sources(
     lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: SpectrumLags,
-    grid: SphereGrid, settings: ArraySearch, seed: int,
+    grid: SphereGrid, settings: SearchSettings, seed: int,
 ) -> Tensor:  # fmt: skip
     """Return positions (K, 3) float32 [m] of sources.
 
@@ -147,7 +147,7 @@ def find_sources(
 
 def _best_separated(
     candidates: Tensor, images: Tensor, receivers: Tensor, rotation: Tensor, grid: SphereGrid,
-    settings: ArraySearch,
+    settings: SearchSettings,
 ) -> Tensor:  # fmt: skip
     """Candidates of the largest amplitude (n, P) in their direction over all receivers, no near doubles."""
     score = torch.zeros(len(candidates))

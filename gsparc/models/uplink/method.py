@@ -17,7 +17,7 @@ from gsparc.models.method import Prediction
 from gsparc.models.relative_error import RelativeErrorRegression
 from gsparc.models.uplink.error_model import SearchedSnapshots, estimate_noise
 from gsparc.models.uplink.interface import UplinkMethod, mean_power
-from gsparc.models.uplink.search import SnapshotSearch, Sources, SourceSearch
+from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, mean_delay, phasor, planar_places
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext, FitReport
@@ -44,7 +44,7 @@ class UplinkField(UplinkMethod):
     name = "uplink"
 
     def __init__(
-        self, search: SnapshotSearch = SnapshotSearch(), teachers: int = 1200,
+        self, search: SearchSettings = SearchSettings(), teachers: int = 1200,
         shrink: bool = True, seed: int | None = None,
     ) -> None:  # fmt: skip
         if teachers < 50:
@@ -145,7 +145,7 @@ class UplinkField(UplinkMethod):
             replace(sources, delay=sources.delay + mean[:, None]), torch.cat(left), uplink, noise
         )
 
-    def _set_search(self, site: Site, settings: SnapshotSearch) -> None:
+    def _set_search(self, site: Site, settings: SearchSettings) -> None:
         assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
         assert site.subcarriers_hz is not None and site.carrier_hz is not None
         self._middle_hz = float(site.uplink_hz.mean())
@@ -168,7 +168,7 @@ class UplinkField(UplinkMethod):
     def restore(self, site: Site, state: Mapping[str, Any]) -> None:
         """See `Method.restore`."""
         self.site = site
-        self._set_search(site, SnapshotSearch(**state["search"]))
+        self._set_search(site, SearchSettings(**state["search"]))
         said = state["error_model"]
         self.error_model = None if said is None else RelativeErrorRegression.read(said)
 

@@ -81,7 +81,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class SnapshotSearch:
+class SearchSettings:
     """Source search.
 
     Attributes:
@@ -111,7 +111,7 @@ class SourceSearch:
         settings: see there.
     """
 
-    def __init__(self, aperture: Aperture, settings: SnapshotSearch) -> None:
+    def __init__(self, aperture: Aperture, settings: SearchSettings) -> None:
         self.aperture, self.settings = aperture, settings
         self.cosines, self.delays, self.shape = _make_grid(aperture, settings)
         self._over_antennas = antenna_responses(self.cosines[None], aperture)[0].conj()
@@ -241,7 +241,7 @@ def _dilate(cube: Tensor) -> Tensor:
     return cube
 
 
-def _make_grid(aperture: Aperture, s: SnapshotSearch) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+def _make_grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
     """Cosines (G, 2), delays (T,), and the shape of both together; one cosine where the array is a line."""
     axes = []
     for axis in range(2):

@@ -21,7 +21,7 @@ from gsparc.apps.link.study import beam_facts, beam_gain, beam_loss_db, find_cro
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.models.uplink.method import UplinkField
-from gsparc.models.uplink.search import SnapshotSearch
+from gsparc.models.uplink.search import SearchSettings
 from gsparc.prediction.channels import centred_grid, interpolate_tones, resource_grid
 from gsparc.prediction.risk import binomial_interval
 from gsparc.training.context import FitContext
@@ -46,7 +46,7 @@ def drawn():
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     data = city("all")
-    method = UplinkField(SnapshotSearch(rounds=4, picks=4, final=2), teachers=60)
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
     method.fit(data, fold(), FitContext())
     file = tmp_path_factory.mktemp("link") / "model.ckpt"
     checkpoint.save(file, method)

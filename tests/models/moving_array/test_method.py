@@ -15,7 +15,7 @@ from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import (
-    ArraySearch,
+    SearchSettings,
     find_sources,
     nonnegative_powers,
     site_problem,
@@ -25,7 +25,7 @@ from gsparc.simulate.shoebox import mirror_images
 from gsparc.training.context import FitContext
 
 ROWS = np.arange(0, 160, 2)
-SEARCH = ArraySearch(sources=17, rows=50, candidates=4000, steps=80)
+SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from gsparc.models.baselines.mean import Mean
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import ArraySearch as BearingSearchSettings
+from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.splat.array import ArrayField
 from gsparc.training.context import FitContext
 

@@ -16,7 +16,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
-from gsparc.models.uplink.search import SnapshotSearch, Sources, SourceSearch
+from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, Columns, antenna_responses, tone_responses
 from gsparc.training.context import FitContext
 
@@ -35,7 +35,7 @@ def _three() -> Sources:
 
 def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
     aperture, truth = _aperture(), _three()
-    search = SourceSearch(aperture, SnapshotSearch(rounds=3, picks=1, final=6, leakage=1e-6))
+    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=6, leakage=1e-6))
     heard = truth.channels(aperture)
     found, left = search(heard, torch.tensor([1e-6]))
     assert left.abs().square().mean() < 1e-5 * heard.abs().square().mean()
@@ -59,7 +59,7 @@ def test_noise_is_read_off_empty_delays() -> None:
 @pytest.fixture(scope="module")
 def fitted():
     data = city("all")
-    method = UplinkField(SnapshotSearch(rounds=4, picks=4, final=2), teachers=60)
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
     method.fit(data, fold(), FitContext())
     return method, data
 
@@ -116,7 +116,7 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
         assert error[sure].median() < factor * error[~sure].median()
 
 
-SEARCH = SnapshotSearch(rounds=2, picks=4, final=2)
+SEARCH = SearchSettings(rounds=2, picks=4, final=2)
 MAKES = {
     "ridge": Ridge, "of all antennas": lambda: Ridge("all"), "fire": lambda: Fire(max_steps=5),
     "uplink": lambda: UplinkField(SEARCH, teachers=60),
@@ -168,7 +168,7 @@ def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None
     (tmp_path / "base-station.yml").write_text("\n".join(kept))
     data = load_argos(tmp_path)
     assert data.noise_variance is None and data.uplink.shape[1] == 8
-    method = UplinkField(SnapshotSearch(rounds=3, picks=4, final=2), teachers=60)
+    method = UplinkField(SearchSettings(rounds=3, picks=4, final=2), teachers=60)
     method.fit(data, fold(), FitContext())
     assert method.search.shape[1] == 1
     assert float(_errors(method, data).median()) < 0.3
@@ -205,7 +205,7 @@ def test_posterior_tells_the_error_of_the_other_band() -> None:
     generator = torch.Generator().manual_seed(0)
     heard = truth.channels(aperture).expand(count, -1, -1)
     heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
-    search = SourceSearch(aperture, SnapshotSearch(rounds=3, picks=1, final=4, leakage=1e-6))
+    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
     found, _ = search(heard, torch.full((count,), noise))
     other = replace(aperture, tones=aperture.tones + 27)
     for where in (other, Aperture(other.places[:1], other.tones[:5])):
