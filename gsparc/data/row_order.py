@@ -94,7 +94,7 @@ def content_order(data: Measurements) -> np.ndarray:
     """Return the numbers (S,) of rows in the order of `order_rows`."""
     row = hash_rows(
         *(data.tx, data.rx_position, data.rx_rotation, data.target, data.mask, data.noise_variance),
-        *(data.censored, data.position_std, data.uplink),
+        *(data.censored, data.position_std, data.uplink, data.device),
     )
     moment = number_moments(data, np.arange(len(data)))
     together = np.zeros(len(data), np.uint64)

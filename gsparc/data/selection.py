@@ -144,13 +144,17 @@ def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selec
 
 
 def _copies(arrays: Arrays, measured: str) -> np.ndarray:
-    rows, number = len(arrays[measured]), arrays.get("station")
+    rows, number, device = len(arrays[measured]), arrays.get("station"), arrays.get("device")
     ends = [arrays.get(f"{end}_position", np.zeros(0)) for end in ("rx", "tx")]
     places = [end.astype(np.float64) for end in ends if end.shape == (rows, 3) and end.dtype.kind in "iuf"]
     if not places:  # one that repeats is no row's own
         return np.zeros(rows, bool)
     place = hash_rows(*places)
-    return find_copies(place, place if number is None else hash_rows(place, number), arrays[measured])
+    # Two devices that read the same level at one place are two measurements.
+    if device is not None:
+        alike = np.unique(device.astype(str), return_inverse=True)[1].reshape(-1)
+        device = alike if len(alike) == rows else None
+    return find_copies(place, hash_rows(place, number, device), arrays[measured])
 
 
 def _there(stations: Stations | None, name: str, source: str) -> Stations:

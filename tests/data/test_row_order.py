@@ -96,6 +96,17 @@ def test_equal_whole_decibels_of_visits_are_measurements():
     assert find_copies(place[twice], place[twice], level[twice]).sum() == 200
 
 
+def test_two_devices_that_read_the_same_level_are_two_measurements():
+    """The second phone's row of equal whole decibels was left out as a copy of the first's."""
+    arrays = rows_of("powers")
+    twice = np.repeat(np.arange(60), 2)
+    rows = {name: a if name[0] == "_" else a[twice] for name, a in arrays.items()}
+    rows["device"] = np.tile(["first", "second"], 60)
+    assert len(measurements(rows, np.arange(120))) == 120
+    rows["device"] = np.full(120, "first")
+    assert len(measurements(rows, np.arange(120))) == 60
+
+
 def test_a_drive_reversed_is_answered_alike(caplog):
     """Rows that validate were drawn by number."""
     caplog.set_level(logging.ERROR)
