@@ -27,7 +27,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     predictor = load(path)
     where = {
         "area": settings["area"], "height_m": config.height_m, "sites": config.sites, "count": config.count,
-        "station_height_m": config.station_height_m, "antenna": placing.Antenna(**settings["antenna"]),
+        "station_height_m": config.station_height_m, "antenna": placing.NewAntenna(**settings["antenna"]),
     }  # fmt: skip
     placing.lay_candidates(predictor, **where)  # refuses before anything is fitted
     promise, error = read_or_gather(path, settings), placing.NewStationError()

@@ -39,7 +39,7 @@ def task(config: DictConfig) -> None:
         raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
-    from gsparc.apps.export.serving import Limits, Server, build_application
+    from gsparc.apps.export.serving import LimitedServer, Limits, build_application
 
     limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
     needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]
@@ -55,4 +55,4 @@ def task(config: DictConfig) -> None:
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then
-        Server(app, limits, host=config.host, port=config.port).run()
+        LimitedServer(app, limits, host=config.host, port=config.port).run()

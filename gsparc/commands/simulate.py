@@ -24,20 +24,20 @@ from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.report import choice_table, closing_sentences, summary_facts
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.scenes.solid import write_walls
-from gsparc.simulate.settings import Campaign
+from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 OTHERS = "ours: conference_room, shoebox; your own: osm (scene.file=TOWN.osm), xml (scene.xml=FILE)"
 
 
-def campaign(config: DictConfig) -> Campaign:
+def campaign(config: DictConfig) -> CampaignSettings:
     """Return the campaign that a composed configuration describes.
 
     Raises:
         ValueError: a setting that does not exist or cannot be.
     """
     settings = to_dict(config)
-    return Campaign(
+    return CampaignSettings(
         scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
         from_settings(SpectrumSettings, settings["spectrum"], "spectrum"),
         from_settings(ArraySettings, settings["csi"], "csi"),

@@ -68,9 +68,9 @@ def view_of(settings: dict[str, Any]) -> SiteView:
 def serve(view: SiteView, host: str, port: int) -> str:
     """Serve until Ctrl-C; return what is said then."""
     # Imported here, as viser is an extra that splat files do without.
-    from gsparc.apps.view.server.serve import Server
+    from gsparc.apps.view.server.serve import PageServer
 
-    server = Server(view, host, port)
+    server = PageServer(view, host, port)
     log.info("open %s in a browser; Ctrl-C ends it", server.address)
     server.run()
     return f"{server.address} is closed"

@@ -66,7 +66,7 @@ class Opened:
     """
 
     methods: list[Method]
-    stored: list[checkpoint.Stored]
+    stored: list[checkpoint.StoredModel]
     data: Measurements
     split: Split
     foreign: str | None = None
@@ -154,7 +154,7 @@ def open_files(
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
 
 
-def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measurements, bool]:
+def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[Measurements, bool]:
     """Return the measurements of another file, read as a model's data were, in its coordinates.
 
     Returns:
@@ -181,7 +181,7 @@ def read_like_stored(stored: checkpoint.Stored, path: str | Path) -> tuple[Measu
     return align_to_site(module_of(stored, settings).measurements, site), not apart
 
 
-def module_of(stored: checkpoint.Stored, dataset: Mapping[str, Any] | None) -> DataModule:
+def module_of(stored: checkpoint.StoredModel, dataset: Mapping[str, Any] | None) -> DataModule:
     """Return what reads a model's data with settings that replace those stored; nothing is read yet.
 
     How they are read is said unless training said it.
@@ -201,7 +201,9 @@ def check_dataset(path: str | Path, dataset: Mapping[str, Any]) -> None:
         module_of(checkpoint.read(path), dataset)
 
 
-def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any] | None) -> dict[str, Any]:
+def _settings(
+    group: str, stored: checkpoint.StoredModel, overrides: Mapping[str, Any] | None
+) -> dict[str, Any]:
     """The checkpoint's settings of a config group under the ones given now (those that are not null).
 
     Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
@@ -222,7 +224,7 @@ def _settings(group: str, stored: checkpoint.Stored, overrides: Mapping[str, Any
     return settings
 
 
-def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
+def _folds(split: Split, stored: Sequence[checkpoint.StoredModel]) -> Split:
     """The folds the checkpoints were trained on: all of them in order, or those each file names."""
     # Files of some folds can be opened alone where each says its number; older ones are counted.
     named = all("fold" in one.extra for one in stored)
@@ -237,7 +239,7 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     return replace(split, folds=tuple(split.folds[number] for number in numbers))
 
 
-def were_trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
+def were_trained_on(stored: Sequence[checkpoint.StoredModel], split: Split) -> bool | None:
     """Return whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
 
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
@@ -252,7 +254,7 @@ def were_trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool |
 
 
 def _foreign(
-    stored: Sequence[checkpoint.Stored], data: Measurements, chosen: Split
+    stored: Sequence[checkpoint.StoredModel], data: Measurements, chosen: Split
 ) -> tuple[str | None, int | None, tuple[Measurements, Split] | None]:
     """What was trained on instead, how many of these test rows the models learned from, and `_trained`."""
     same = data.site.sha256 == stored[0].site.sha256
@@ -289,7 +291,9 @@ def _foreign(
     return f"{what}: {learned or 'none'} of these {len(tested)} test rows{listed} {how}", learned, trained
 
 
-def _trained(stored: Sequence[checkpoint.Stored], data: Measurements) -> tuple[Measurements, Split] | None:
+def _trained(
+    stored: Sequence[checkpoint.StoredModel], data: Measurements
+) -> tuple[Measurements, Split] | None:
     """What checkpoints were trained on (`data` where it is that) and its folds; None where these are gone."""
     site = stored[0].site
     try:

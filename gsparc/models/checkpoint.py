@@ -33,7 +33,7 @@ class CheckpointError(ValueError):
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredModel:
     """What a checkpoint file holds.
 
     Attributes:
@@ -128,7 +128,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
         raise CheckpointError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
-def read(path: str | Path) -> Stored:
+def read(path: str | Path) -> StoredModel:
     """Read a checkpoint onto the CPU; runs no code from the file.
 
     Raises:
@@ -220,9 +220,9 @@ def _drop_unknown_places(part: Any) -> Any:
     return {**part, "stations": {**stations, **known}}
 
 
-def _stored_from_content(content: Mapping[str, Any], path: Path) -> Stored:
+def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
     try:
-        return Stored(
+        return StoredModel(
             method=str(content["method"]), target=str(content["target"]), config=str(content["config"]),
             site=_site_from(content["site"]), state=dict(content["state"]), extra=dict(content["extra"]),
             path=path,

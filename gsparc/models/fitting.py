@@ -25,7 +25,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
 from gsparc.models.aligned_rows import align_phases
-from gsparc.models.checkpoint import Stored
+from gsparc.models.checkpoint import StoredModel
 from gsparc.models.device_offsets import take_off_devices
 from gsparc.models.method import Method, MethodFactory
 from gsparc.training.context import FitContext, FitReport
@@ -171,7 +171,7 @@ class Origin:
     def _hashes(self) -> dict[str, str]:
         return {"data": self.site.sha256, "auxiliary": self.auxiliary, "rows": self.rows}
 
-    def require_same(self, stored: Stored) -> None:
+    def require_same(self, stored: StoredModel) -> None:
         """Tell whether training may go on from `stored`; settings of its schedule that changed are logged.
 
         Raises:

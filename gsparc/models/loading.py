@@ -15,7 +15,7 @@ from gsparc.models.registry import all_methods, build
 from gsparc.models.splat.method import LearnedField
 
 
-def method_from_checkpoint(stored: checkpoint.Stored) -> Method:
+def method_from_checkpoint(stored: checkpoint.StoredModel) -> Method:
     """Return the fitted method a checkpoint holds; only classes of gsparc are built.
 
     Raises:
@@ -43,7 +43,7 @@ def method_from_checkpoint(stored: checkpoint.Stored) -> Method:
         ) from error
 
 
-def rebuild_method(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
+def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Method:
     """Return what `factory` makes of the stored class, or one for each station, with a stored state."""
     several = "per_station" in stored.state
     method = PerStation(factory) if several else factory.create_as(stored.target)
@@ -52,7 +52,7 @@ def rebuild_method(factory: MethodFactory, stored: checkpoint.Stored) -> Method:
     return method
 
 
-def load(path: str | Path) -> tuple[Method, checkpoint.Stored]:
+def load(path: str | Path) -> tuple[Method, checkpoint.StoredModel]:
     """Return `restore(read(path))`, with what else the file holds.
 
     Raises:

@@ -53,7 +53,7 @@ def planar_places(array: np.ndarray, wavelength: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Columns:
+class SourceColumns:
     """Responses of N sources and their derivatives on an aperture: 4 N columns, each antennas times tones.
 
     The slopes are of an atom of gain 1, by its first cosine, its second and its delay, in that order.
@@ -67,13 +67,13 @@ class Columns:
     tones: Tensor
 
     @staticmethod
-    def from_sources(direction: Tensor, delay: Tensor, aperture: Aperture) -> Columns:
+    def from_sources(direction: Tensor, delay: Tensor, aperture: Aperture) -> SourceColumns:
         """Return columns of sources with direction cosines (B, N, 2) and delays (B, N)."""
         over_antennas = antenna_responses(direction, aperture)[:, None]
         over_tones = tone_responses(delay, aperture)[:, None]
         by_cosine = over_antennas * aperture.cosine_slope
         by_delay = over_tones * aperture.delay_slope
-        return Columns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
+        return SourceColumns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
 
     def gram(self) -> Tensor:
         """Return inner products (B, 4 N, 4 N) of all columns."""

@@ -71,7 +71,7 @@ QUERIES = 16  # at places drawn in the scene's box
 
 
 def choose_within_budget(
-    method: Method, stored: checkpoint.Stored, budget_ms: float
+    method: Method, stored: checkpoint.StoredModel, budget_ms: float
 ) -> tuple[Method, Operating]:
     """Choose the most accurate stored operating point that takes at most `budget_ms` on this machine.
 

@@ -24,7 +24,7 @@ SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
 
 
-class Asked(NamedTuple):
+class PlacedQuery(NamedTuple):
     """A query, whether one position was given, and whether torch was."""
 
     query: Query
@@ -40,7 +40,7 @@ class Queries:
         # The pose of a receiver that never moved, made once.
         self._still = None if still is None else Pose(_float(still), _float(self._rx_rotation(None, 1)))
 
-    def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> Asked:
+    def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> PlacedQuery:
         """Check both ends as they were given, and return what is asked."""
         receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
@@ -54,7 +54,7 @@ class Queries:
         common = self._still is not None and len(places) == 1 and dtype == torch.float32
         if self._still is not None and common:  # with nothing to look up
             sender = _float(np.atleast_2d(places[moving] - self.site.origin))
-            return Asked(Query(sender, self._still), single, isinstance(tx, Tensor))
+            return PlacedQuery(Query(sender, self._still), single, isinstance(tx, Tensor))
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
         # One place of an end goes with any number of the other's.
         count = max(len(place) for place in local.values())
@@ -70,7 +70,7 @@ class Queries:
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return Asked(Query(sender, pose), single, any(isinstance(v, Tensor) for v in (tx, receiver)))
+        return PlacedQuery(Query(sender, pose), single, any(isinstance(v, Tensor) for v in (tx, receiver)))
 
     def _static_place(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""

@@ -20,7 +20,7 @@ from gsparc.data.datasets.campaign import make_once, write_split
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.streets import Rays, Streets, trace_streets
+from gsparc.simulate.streets import StreetPaths, Streets, trace_streets
 
 TONES = np.array(argos.TONES)
 FFT = 64  # 20 MHz in 64 tones, of which 52 are used
@@ -89,7 +89,7 @@ class World:
     """
 
     users: np.ndarray
-    rays: Rays
+    rays: StreetPaths
     noise_power: float
 
     def response(self, frequency_hz: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:

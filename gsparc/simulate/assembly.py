@@ -14,17 +14,17 @@ from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.paths import ARRAYS, TracedPaths, group_offsets
-from gsparc.simulate.settings import Campaign
+from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import render_spectra
-from gsparc.simulate.survey import Engine, Survey
+from gsparc.simulate.survey import Survey, TracingEngine
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are not listed in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
 
 
-def shard_arrays(paths: TracedPaths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
+def shard_arrays(paths: TracedPaths, campaign: CampaignSettings, wavelength: float) -> dict[str, np.ndarray]:
     """Return what a shard keeps of some receivers."""
     frequency = campaign.scene.frequency_hz
     images, peak = render_spectra(paths, campaign.spectrum, frequency, wavelength)
@@ -45,13 +45,13 @@ def shard_arrays(paths: TracedPaths, campaign: Campaign, wavelength: float) -> d
 
 
 def assemble_dataset(
-    campaign: Campaign,
+    campaign: CampaignSettings,
     survey: Survey,
     choice: Choice | None,
     convergence: Convergence | None,
     seconds: float,
     shards: Shards,
-    rows: Rows,
+    rows: ShardRows,
 ) -> tuple[Measurements, dict[str, float]]:
     """Write the file from what the shards hold (`join_shards`), drop the shards; as `load_own` reads it.
 
@@ -92,14 +92,14 @@ def assemble_dataset(
     return data, facts
 
 
-class Rows(NamedTuple):
+class ShardRows(NamedTuple):
     """What all shards hold: arrays with a row for each of the survey's, by name, and their paths."""
 
     arrays: dict[str, np.ndarray]
     paths: TracedPaths
 
 
-def join_shards(shards: Shards, rows: int) -> Rows:
+def join_shards(shards: Shards, rows: int) -> ShardRows:
     """Return what the shards, all of them there, hold of so many rows, in their order.
 
     One shard is in memory at a time; what is large is put together on disk.
@@ -119,10 +119,10 @@ def join_shards(shards: Shards, rows: int) -> Rows:
             if name not in whole:
                 whole[name] = allocate((int(length), *values.shape[1:]), values.dtype)
             whole[name][at] = values
-    return Rows(whole, TracedPaths(offsets, *(whole.pop(name) for name in ARRAYS)))
+    return ShardRows(whole, TracedPaths(offsets, *(whole.pop(name) for name in ARRAYS)))
 
 
-def _arrays(campaign: Campaign, survey: Survey, rows: Rows) -> dict[str, np.ndarray]:
+def _arrays(campaign: CampaignSettings, survey: Survey, rows: ShardRows) -> dict[str, np.ndarray]:
     scene, wavelength, snr_db = campaign.scene, survey.engine.wavelength, campaign.decided.noise_snr_db
     (whole, paths), csi = rows, rows.arrays["csi"]
     order = np.random.default_rng(scene.seed).permutation(len(survey.places))
@@ -173,7 +173,7 @@ def _ends(survey: Survey) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _provenance(campaign: Campaign, engine: Engine) -> dict[str, Any]:
+def _provenance(campaign: CampaignSettings, engine: TracingEngine) -> dict[str, Any]:
     """Attributes of the file: what it is and how it was made."""
     return {
         "name": campaign.scene.name,

@@ -69,7 +69,7 @@ class Deliverable:
 
 
 @dataclass(frozen=True)
-class Probe:
+class SurveyProbe:
     """A full simulation of some receivers, and how channels and spectra are made of it.
 
     Attributes:

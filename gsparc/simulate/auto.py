@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import binom
 
 from gsparc.data.limits import SHARE, Checked, number, setting, whole
-from gsparc.simulate.attribution import Deliverable, Probe, list_effect_sets, list_removals
+from gsparc.simulate.attribution import Deliverable, SurveyProbe, list_effect_sets, list_removals
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
 
@@ -134,7 +134,7 @@ class Choice:
         return Choice(**{**stored, "effects": effects, "table": table, "verdict": verdict})
 
 
-def choose_effects(probe: Probe, settings: AutoSettings) -> Choice:
+def choose_effects(probe: SurveyProbe, settings: AutoSettings) -> Choice:
     """Return the cheapest effects that meet the requirement, by receivers traced with everything.
 
     Raises:
@@ -174,7 +174,7 @@ def verify_choice(choice: Choice, settings: AutoSettings, errors: np.ndarray) ->
 
 
 def choose_rays(
-    choice: Choice, settings: AutoSettings, probe: Probe, traced: TracedPaths, samples: int
+    choice: Choice, settings: AutoSettings, probe: SurveyProbe, traced: TracedPaths, samples: int
 ) -> Choice:
     """Return the choice with so many `samples` where those are enough, or without; a row says which.
 
@@ -233,7 +233,7 @@ def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effec
     return min(enough, key=lambda s: (len(s.enabled), s.polarisation, s.depth), default=full)
 
 
-def _row(name: str, probe: Probe, less: Effects | TracedPaths, required: Deliverable) -> EffectRow:
+def _row(name: str, probe: SurveyProbe, less: Effects | TracedPaths, required: Deliverable) -> EffectRow:
     """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
     share, error = (
         part[probe.reached] for part in (np.abs(probe.lost_power_shares(less)), probe.errors(less, required))

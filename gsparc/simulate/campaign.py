@@ -13,13 +13,13 @@ import numpy as np
 from gsparc.data.executor import run_each
 from gsparc.data.schema import Measurements
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import SECONDS, Rows, assemble_dataset, join_shards, shard_arrays
+from gsparc.simulate.assembly import SECONDS, ShardRows, assemble_dataset, join_shards, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.convergence import Convergence, measure_convergence
 from gsparc.simulate.deciding import Decision
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import build_survey
-from gsparc.simulate.settings import Campaign
+from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.survey import Survey
 
@@ -44,7 +44,7 @@ class Outcome:
 
     data: Measurements
     facts: dict[str, float]
-    rows: Rows
+    rows: ShardRows
     survey: Survey
     effects: Effects
     decision: Decision | None
@@ -52,7 +52,7 @@ class Outcome:
     seconds: dict[str, float]
 
 
-def simulate(campaign: Campaign, out: Path) -> Outcome:
+def simulate(campaign: CampaignSettings, out: Path) -> Outcome:
     """Make the dataset, or go on where an interrupted run stopped.
 
     Raises:
@@ -90,7 +90,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     return Outcome(data, facts, rows, survey, campaign.decided, decision, error, seconds)
 
 
-def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:
+def _decided(campaign: CampaignSettings, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:
     """The decision of `auto`, taken once; what it traced is the first shard."""
     stored = shards.read_note()
     if stored is not None:
@@ -110,7 +110,7 @@ def _decided(campaign: Campaign, settings: AutoSettings, survey: Survey, shards:
 class _Tracing:
     """Traces and stores shards; where it is sent to, it builds the scene once, which cannot be pickled."""
 
-    campaign: Campaign
+    campaign: CampaignSettings
     shards: Shards
     survey: Survey | None
 
@@ -128,7 +128,7 @@ class _Tracing:
         self.shards.write(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
 
 
-def _trace_all(campaign: Campaign, survey: Survey, shards: Shards) -> None:
+def _trace_all(campaign: CampaignSettings, survey: Survey, shards: Shards) -> None:
     """Trace what is missing."""
     left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
     parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]

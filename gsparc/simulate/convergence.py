@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from gsparc.simulate.settings import Campaign
+from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey
 
@@ -39,7 +39,7 @@ class Convergence:
 
 
 def measure_convergence(
-    campaign: Campaign, survey: Survey, traced: Mapping[str, np.ndarray], left_out: np.ndarray
+    campaign: CampaignSettings, survey: Survey, traced: Mapping[str, np.ndarray], left_out: np.ndarray
 ) -> Convergence | None:
     """Compare rows of a file with a second seed's; None where none is asked for, or without rays.
 

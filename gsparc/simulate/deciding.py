@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsparc.simulate import auto
-from gsparc.simulate.attribution import Probe
+from gsparc.simulate.attribution import SurveyProbe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.scenes.receivers import nearest_rows
-from gsparc.simulate.settings import Campaign
+from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class Decision:
 class Decider:
     """Chooses the effects of one campaign; probes and held-back rows, rows of the file, have everything."""
 
-    def __init__(self, campaign: Campaign, settings: AutoSettings, survey: Survey) -> None:
+    def __init__(self, campaign: CampaignSettings, settings: AutoSettings, survey: Survey) -> None:
         self.campaign, self.settings, self.survey = campaign, settings, survey
         self.full = survey.engine.supported_effects(settings.full)
         self.nearest = settings.required.kind == "spectrum"  # whether errors are shares of their error
@@ -119,11 +119,13 @@ class Decider:
     def _paths_of_rows(self, rows: np.ndarray) -> TracedPaths:
         return self.paths.select_receivers(np.searchsorted(self.rows, rows))
 
-    def _probe(self, rows: np.ndarray) -> Probe:
+    def _probe(self, rows: np.ndarray) -> SurveyProbe:
         near = self._paths_of_rows(self._nearest(rows)) if self.nearest else None
         campaign, wavelength = self.campaign, self.survey.engine.wavelength
         array, tones = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
-        return Probe(self._paths_of_rows(rows), self.full, tones, wavelength, array, campaign.spectrum, near)
+        return SurveyProbe(
+            self._paths_of_rows(rows), self.full, tones, wavelength, array, campaign.spectrum, near
+        )
 
     def _verified(self, choice: Choice, less: Effects | TracedPaths) -> tuple[Choice, Changed]:
         held = self._probe(self.held_back)

@@ -27,7 +27,7 @@ from gsparc.simulate.paths import TracedPaths, join_receivers
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
 from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
-from gsparc.simulate.survey import Engine
+from gsparc.simulate.survey import TracingEngine
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class Sampling:
         return math.ceil(self.batch / 3)
 
 
-class RayTracer(Engine):
+class RayTracer(TracingEngine):
     """One scene with one transmitter, ready to trace.
 
     Args:

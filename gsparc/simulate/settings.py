@@ -15,7 +15,7 @@ from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 
 @dataclass(frozen=True)
-class Campaign(Checked):
+class CampaignSettings(Checked):
     """One dataset.
 
     Attributes:

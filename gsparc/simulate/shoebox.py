@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.effects import SPECULAR, Effects
 from gsparc.simulate.paths import TracedPaths
-from gsparc.simulate.survey import Engine
+from gsparc.simulate.survey import TracingEngine
 
 WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
 
@@ -65,7 +65,7 @@ class Room:
 
 
 @dataclass(frozen=True)
-class Images:
+class RoomImages:
     """The mirror images of a room up to some order: the image of p is `signs * p + offsets`.
 
     Attributes:
@@ -90,7 +90,7 @@ class Images:
         return points[..., None, :] * self.signs + self.offsets
 
 
-def mirror_images(room: Room, max_order: int) -> Images:
+def mirror_images(room: Room, max_order: int) -> RoomImages:
     """Return all images of order <= `max_order`, sorted by order; the first is the point itself.
 
     >>> mirror_images(Room.from_size((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # itself, one in each wall
@@ -106,7 +106,7 @@ def mirror_images(room: Room, max_order: int) -> Images:
     high = np.where(cell > 0, (steps + 1) // 2, steps // 2)
     walls = np.stack([steps - high, high], axis=-1).reshape(-1, 6)
     gain = np.prod(np.asarray(room.reflection, dtype=np.complex128) ** walls, axis=1)
-    return Images(cell, signs, offsets, gain)
+    return RoomImages(cell, signs, offsets, gain)
 
 
 def _mirror(room: Room, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +117,7 @@ def _mirror(room: Room, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(even, 1.0, -1.0), np.where(even, 0.0, 2.0 * room.lower + size) + cell * size
 
 
-def visible_images(room: Room, images: Images, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
+def visible_images(room: Room, images: RoomImages, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
     """Tell whether each observer sees each image of a source, exactly: (S, I) bool.
 
     The straight line from the observer to the image runs through mirrored copies of the room; it is
@@ -171,7 +171,7 @@ class Trace:
     rx: np.ndarray
     frequency_hz: np.ndarray
     array: np.ndarray
-    images: Images
+    images: RoomImages
     visible: np.ndarray
     noise_variance: float
 
@@ -233,8 +233,8 @@ def trace_room(
     return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
 
 
-class ShoeboxEngine(Engine):
-    """A shoebox room with one transmitter (3,) [m] as an `Engine`: line of sight and mirror reflections."""
+class ShoeboxEngine(TracingEngine):
+    """A shoebox room with one transmitter (3,) [m] as a `TracingEngine`: direct path and mirrors."""
 
     name = "gsparc-shoebox"
     random = False

@@ -64,7 +64,7 @@ class Streets:
 
 
 @dataclass(frozen=True)
-class Rays:
+class StreetPaths:
     """The strongest P paths of U users; silent ones have gain 0.
 
     Attributes:
@@ -77,9 +77,9 @@ class Rays:
     delay: np.ndarray
     direction: np.ndarray
 
-    def select_users(self, users: np.ndarray) -> Rays:
+    def select_users(self, users: np.ndarray) -> StreetPaths:
         """Return the paths of some users (n,)."""
-        return Rays(self.gain[users], self.delay[users], self.direction[users])
+        return StreetPaths(self.gain[users], self.delay[users], self.direction[users])
 
     def response(self, array: np.ndarray, carrier_hz: float, frequency_hz: np.ndarray) -> np.ndarray:
         """Return channels (U, A, K) complex128 at (K,) [Hz] of elements (A, 3) [m] about the base."""
@@ -98,7 +98,7 @@ class _Route:
     gain: np.ndarray
 
 
-def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> Rays:
+def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> StreetPaths:
     """Trace paths from the base to users (U, 3) [m]: direct, two reflections, scatterers and edges."""
     routes = list(_routes(streets, users, wavelength))
     gain = np.zeros((len(users), 2 * len(routes)), complex)
@@ -116,7 +116,7 @@ def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> Ray
             direction[at] = np.concatenate([flat, (climb / length)[:, None]], axis=1)
     keep = np.argsort(-np.abs(gain), axis=1)[:, :STRONGEST]
     rows = np.arange(len(users))[:, None]
-    return Rays(gain[rows, keep], delay[rows, keep], direction[rows, keep])
+    return StreetPaths(gain[rows, keep], delay[rows, keep], direction[rows, keep])
 
 
 def _routes(streets: Streets, users: np.ndarray, wavelength: float) -> Iterator[_Route]:

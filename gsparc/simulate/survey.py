@@ -26,7 +26,7 @@ class Survey:
         georeference: of the world's origin; None where the scene is nowhere on Earth.
     """
 
-    engines: Sequence[Engine]
+    engines: Sequence[TracingEngine]
     places: np.ndarray
     names: tuple[str, ...] = ("tx",)
     time_s: np.ndarray | None = None
@@ -36,7 +36,7 @@ class Survey:
         return len(self.engines) * len(self.places)
 
     @property
-    def engine(self) -> Engine:
+    def engine(self) -> TracingEngine:
         """Return that of the first transmitter, for what all share."""
         return self.engines[0]
 
@@ -79,7 +79,7 @@ class Survey:
         return join_receivers(parts).select_receivers(np.argsort(order, kind="stable"))
 
 
-class Engine(Protocol):
+class TracingEngine(Protocol):
     """A scene with one transmitter, ready to trace.
 
     Attributes:

@@ -77,7 +77,7 @@ def small_campaign(rows: int):
     """`rows` receivers in a box, four to a shard; spectra of 18 x 36."""
     from gsparc.simulate.effects import Effects
     from gsparc.simulate.scenes.build import SceneSettings
-    from gsparc.simulate.settings import Campaign
+    from gsparc.simulate.settings import CampaignSettings
     from gsparc.simulate.spectrum import SpectrumSettings
 
     scene = SceneSettings(
@@ -89,7 +89,7 @@ def small_campaign(rows: int):
         refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
     )
     spectrum = SpectrumSettings(height=18, width=36, rows=4, columns=4)
-    return Campaign(scene=scene, effects=effects, spectrum=spectrum, shard=4)
+    return CampaignSettings(scene=scene, effects=effects, spectrum=spectrum, shard=4)
 
 
 class Limited:

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from gsparc.simulate import auto
-from gsparc.simulate.attribution import Deliverable, Probe
+from gsparc.simulate.attribution import Deliverable, SurveyProbe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.deciding import Decision
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings
-from gsparc.simulate.survey import Engine
+from gsparc.simulate.survey import TracingEngine
 
 FULL = Effects(depth=2, polarisation=False)
 RECORD = [(0, 0, 1.0), (SPECULAR, 1, 0.5), (REFRACTION, 1, 0.6), (DIFFRACTION, 1, 0.01),
           (SPECULAR | DIFFUSE, 2, 0.02), (SPECULAR, 2, 0.05)]  # fmt: skip
 
 
-class Invented(Engine):
+class Invented(TracingEngine):
     """An engine whose receivers all hear the same record of paths: (mechanisms, order, power)."""
 
     name, random, wavelength, transmitter = "invented", False, 0.125, np.zeros(3)
@@ -50,7 +50,7 @@ def heard(count, record=RECORD):
 
 def probe_of(paths, nearest=None, tones=(2.4e9,)):
     small = SpectrumSettings(height=18, width=36)
-    return Probe(paths, FULL, np.array(tones), 0.125, np.zeros((1, 3)), small, nearest)
+    return SurveyProbe(paths, FULL, np.array(tones), 0.125, np.zeros((1, 3)), small, nearest)
 
 
 def with_odd_receiver(paths):

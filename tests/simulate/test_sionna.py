@@ -19,7 +19,7 @@ from gsparc.simulate.scenes.build import SceneSettings, build_survey, from_confi
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.receivers import draw_places, stands_clear_of
 from gsparc.simulate.scenes.shipped import shipped_scene_settings
-from gsparc.simulate.settings import Campaign
+from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.spectrum import SpectrumSettings
 
 pytestmark = pytest.mark.slow
@@ -208,7 +208,9 @@ def test_town_with_sectors_in_degrees(tmp_path):
         name="town", file=str(TOWN), transmitters=masts, over="ground", open_sky=True, num_receivers=0,
         receivers={"kind": "streets", "spacing_m": 12}, carrier_hz=3.5e9, bandwidth_hz=100e6, subcarriers=2,
     )  # fmt: skip
-    plan = Campaign(town, PLAIN, sampling=QUICK, check=0, spectrum=SpectrumSettings(height=18, width=36))
+    plan = CampaignSettings(
+        town, PLAIN, sampling=QUICK, check=0, spectrum=SpectrumSettings(height=18, width=36)
+    )
     outcome = simulate(plan, tmp_path / "town.h5")
     power, places = outcome.rows.arrays["received_power"].reshape(3, -1), outcome.survey.places
     east = (places[:, 0] > 30) & (np.abs(places[:, 1] - 11) < 5)  # on High Street, where the first looks
@@ -237,7 +239,7 @@ def test_scene_file_of_the_user(tmp_path):
 
 def test_auto_in_the_conference_room(tmp_path):
     asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
-    plan = Campaign(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
+    plan = CampaignSettings(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
     outcome = simulate(plan, tmp_path / "room.h5")
     assert outcome.decision is not None and outcome.decision.choice.verdict is not None
     assert outcome.effects.line_of_sight and outcome.effects.specular

@@ -100,7 +100,7 @@ class Connection(H11Protocol):
         super().connection_lost(exc)
 
 
-class Server(uvicorn.Server):
+class LimitedServer(uvicorn.Server):
     """uvicorn within limits: of requests nothing is logged, and the log is the command's, which is open."""
 
     def __init__(self, app: ASGIApp, limits: Limits, **listen: Any) -> None:
@@ -117,7 +117,7 @@ class Server(uvicorn.Server):
                 same.listen(QUEUE)
 
 
-class Asked(NamedTuple):
+class WaitingRequest(NamedTuple):
     """A request that waits: how many places its body holds if it is sound, and where its answer comes."""
 
     size: int
@@ -139,12 +139,12 @@ class Batcher:
     def __init__(self, predictor: Predictor, what: str, delay_s: float, most: int) -> None:
         self.predictor, self.delay_s, self.most = predictor, delay_s, most
         self.what = what
-        self.waiting: list[Asked] = []
+        self.waiting: list[WaitingRequest] = []
         self.some = asyncio.Event()
 
     async def ask(self, size: int, body: bytes, raw: bool) -> np.ndarray:
         """Answers (n, ...) at the world places (n, 3) [m] of a body; raises what reading and the model do."""
-        self.waiting.append(Asked(size, body, raw, asyncio.get_running_loop().create_future()))
+        self.waiting.append(WaitingRequest(size, body, raw, asyncio.get_running_loop().create_future()))
         self.some.set()
         return await self.waiting[-1].answer
 
@@ -161,7 +161,7 @@ class Batcher:
                     failed = isinstance(found, Exception)
                     (one.answer.set_exception if failed else one.answer.set_result)(found)  # type: ignore[arg-type]
 
-    def _next(self) -> list[Asked]:
+    def _next(self) -> list[WaitingRequest]:
         """The request that waits longest, and the smallest others: few places do not wait for many."""
         waiting = [one for one in self.waiting if not one.answer.done()]
         batch, left = waiting[:1], self.most
@@ -174,7 +174,7 @@ class Batcher:
             self.some.clear()
         return batch
 
-    def _answers(self, batch: list[Asked]) -> list[np.ndarray | Exception]:
+    def _answers(self, batch: list[WaitingRequest]) -> list[np.ndarray | Exception]:
         """Of each request, or its own fault."""
         site = self.predictor.site
         try:
@@ -287,7 +287,7 @@ def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
     return guard
 
 
-def _read(end: str, asked: Asked) -> np.ndarray:
+def _read(end: str, asked: WaitingRequest) -> np.ndarray:
     """World places (n, 3) float64 [m] of a body; raises ValueError."""
     try:
         if not asked.raw and asked.body.count(b'"') != 2:  # of one key: of two alike the last would count

@@ -29,7 +29,7 @@ CHUNK = 32
 
 
 @dataclass(frozen=True)
-class Channels:
+class BandChannels:
     """One band at n positions.
 
     Attributes:
@@ -46,11 +46,11 @@ class Channels:
     confidence: Tensor
     source: str
 
-    def select_positions(self, index: np.ndarray) -> Channels:
+    def select_positions(self, index: np.ndarray) -> BandChannels:
         """Return some of the positions."""
         at = torch.from_numpy(index)
         rest = self.variance[at], self.confidence[at], self.source
-        return Channels(self.true[at], self.predicted[at], *rest)
+        return BandChannels(self.true[at], self.predicted[at], *rest)
 
     def band(self) -> Band:
         """Return the first antenna's band; what states no variance is taken for exact."""
@@ -60,7 +60,7 @@ class Channels:
 def predict_channels(
     method: Method, data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray,
     antennas: slice = slice(None),
-) -> Channels:  # fmt: skip
+) -> BandChannels:  # fmt: skip
     """Return true and predicted channels of rows (n,) at absolute frequencies (K,) [Hz],
     of some of the antennas.
 
@@ -85,7 +85,7 @@ def predict_channels(
         parts.append((answer.mean, variance, confidence))
     true, source = true_channels(data, rows, frequency_hz)
     predicted, variance, confidence = map(torch.cat, zip(*parts, strict=True))
-    return Channels(true[:, antennas], predicted, variance, confidence, source)
+    return BandChannels(true[:, antennas], predicted, variance, confidence, source)
 
 
 def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
@@ -97,7 +97,7 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
     return interpolate_tones(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
 
 
-def band_evidence(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+def band_evidence(band: BandChannels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Return evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     said = Prediction(band.predicted, band.variance, 1 - band.confidence)
     return judge_answers(said, band.true, rows, data.moving[rows], data, fold)

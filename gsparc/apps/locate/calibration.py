@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.search import Search
+from gsparc.apps.locate.search import PlaceSearch
 
 # Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
@@ -17,7 +17,7 @@ SPREADS, SPREAD = (1e-3, 1.0), 0.2  # of the edge of a coarse cell
 LOOKS = 100  # trials
 
 
-def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, start: Trust) -> Trust:
+def calibrate_trust(snapshots: Sequence[PlaceSearch], places: np.ndarray, start: Trust) -> Trust:
     """Return the trust under which held-out places are most likely: of the highest mean log density there.
 
     Args:
@@ -44,7 +44,9 @@ def calibrate_trust(snapshots: Sequence[Search], places: np.ndarray, start: Trus
     return decode_trust(minimize(surprise, first, method="Nelder-Mead", options=how).x)
 
 
-def calibrate_level(trust: Trust, snapshots: Sequence[Search], places: np.ndarray, share: float) -> Trust:
+def calibrate_level(
+    trust: Trust, snapshots: Sequence[PlaceSearch], places: np.ndarray, share: float
+) -> Trust:
     """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit.
 
     The level is the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.apps.locate.judging import Report, columns_of_places, report, sample_rows
 from gsparc.apps.locate.neighbours import locate_by_neighbours
-from gsparc.apps.locate.snapshots import Snapshots
+from gsparc.apps.locate.snapshots import Scans
 from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
 from gsparc.data.limits import POSITIVE, SHARE
 
@@ -53,6 +53,6 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
     return report(run_dir, config, METHOD, *both, columns_of_places(place, heard.position), facts)
 
 
-def fingerprint_snapshots(rows: Fingerprints) -> Snapshots:
+def fingerprint_snapshots(rows: Fingerprints) -> Scans:
     """Return rows as snapshots of powers."""
-    return Snapshots("rssi", torch.from_numpy(rows.level).double(), None, rows.position)
+    return Scans("rssi", torch.from_numpy(rows.level).double(), None, rows.position)

@@ -22,7 +22,7 @@ from gsparc.apps.locate.locator import Located, Locator
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
-from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
+from gsparc.apps.locate.snapshots import Scans, group_snapshots
 from gsparc.data.errors import DataError
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import panels, save
@@ -52,7 +52,7 @@ def columns_of_places(
 
 
 def report(
-    run_dir: Path, config: DictConfig, method: str, heard: Snapshots, trained: Snapshots,
+    run_dir: Path, config: DictConfig, method: str, heard: Scans, trained: Scans,
     columns: dict[str, Any], facts: dict[str, Any], promise: str = "", group: np.ndarray | None = None,
 ) -> Report:  # fmt: skip
     """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
@@ -178,7 +178,7 @@ def locate_by_model(
     return report(run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, said, group)
 
 
-def _snapshots(config: DictConfig, run: Opened) -> tuple[Snapshots, bool]:
+def _snapshots(config: DictConfig, run: Opened) -> tuple[Scans, bool]:
     """The snapshots, NaN for unknown places, and whether these are known."""
     placed, rows = True, None
     if config.data is None:

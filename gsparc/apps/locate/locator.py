@@ -17,9 +17,9 @@ from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
 from gsparc.apps.locate.cells import Cells, beyond_box
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.posterior import PlacePosterior, densest_cells
-from gsparc.apps.locate.search import Nuisances, Search, compute_misfit
+from gsparc.apps.locate.search import Nuisances, PlaceSearch, compute_misfit
 from gsparc.apps.locate.site_field import HeardMoments, SiteField
-from gsparc.apps.locate.snapshots import Snapshots, group_snapshots
+from gsparc.apps.locate.snapshots import Scans, group_snapshots
 from gsparc.data.executor import run_all, run_each
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
@@ -91,12 +91,12 @@ class Locator:
         """Of the larger box; one, as what it says of its coarse grid takes as long."""
         return replace(self, cells=self.wider)
 
-    def search_cells(self, heard: Snapshots, trust: Trust, before: Search | None = None) -> Search:
+    def search_cells(self, heard: Scans, trust: Trust, before: PlaceSearch | None = None) -> PlaceSearch:
         """Return one snapshot's misfit at cells that are halved as long as few of them hold the mass.
 
         `before`: the same under another trust, whose cells are halved further.
         """
-        current = before or Search(self.cells, compute_misfit(heard, self._coarse, self.unknown))
+        current = before or PlaceSearch(self.cells, compute_misfit(heard, self._coarse, self.unknown))
         for _ in range(LEVELS):
             cells = current.cells
             likely = densest_cells(current.log_density(trust), cells.volume, KEPT)
@@ -108,10 +108,10 @@ class Locator:
             finer = cells.subset(chosen).halve()
             more = compute_misfit(heard, self.field.moments_at(torch.from_numpy(finer.centre)), self.unknown)
             rest = np.setdiff1d(np.arange(len(cells)), chosen)
-            current = Search(cells.subset(rest).join(finer), current.misfit.subset(rest) + more)
+            current = PlaceSearch(cells.subset(rest).join(finer), current.misfit.subset(rest) + more)
         return current
 
-    def locate(self, heard: Snapshots) -> Iterator[Located]:
+    def locate(self, heard: Scans) -> Iterator[Located]:
         """Yield where each of n snapshots was heard."""
         self._coarse  # noqa: B018 (not on the first snapshot's bill)
         box = self.cells.box()
@@ -147,7 +147,7 @@ def learn_trust(
     rows were; `locator` is that of the whole method, `share` that of places which areas hold, `cells` lays
     cells by trained places (n, 3) [m, local].
     """
-    pairs: list[tuple[Locator, Snapshots]] = []
+    pairs: list[tuple[Locator, Scans]] = []
     data, seed = learned.data, learned.context.seed
     inner_folds = learned.cut_folds(folds, seed).folds
     for number, inner in enumerate(inner_folds):
@@ -159,9 +159,9 @@ def learn_trust(
         pairs += [(without, heard.subset(np.array([row]))) for row in range(len(heard))]
     pairs = [pairs[number] for number in np.random.default_rng(seed).permutation(len(pairs))[:HELD_OUT]]
     places = np.concatenate([heard.place for _, heard in pairs])
-    found, trust = list[Search](), locator.trust
+    found, trust = list[PlaceSearch](), locator.trust
 
-    def search(count: int) -> list[Search]:
+    def search(count: int) -> list[PlaceSearch]:
         pieces = [(*pair, one) for pair, one in zip_longest(pairs[:count], found)]
         return run_all(lambda one: one[0].search_cells(one[1], trust, one[2]), pieces, "snapshots left out")
 

@@ -11,7 +11,7 @@ import numpy as np
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from gsparc.apps.locate.snapshots import Snapshots
+from gsparc.apps.locate.snapshots import Scans
 
 PLAIN = {"nearest": (1,), "weighted_knn": (1, 2, 3, 4, 5, 7, 9, 13)}  # numbers of neighbours that are tried
 FOLDS = 5  # of places, that choose the number where no groups are given
@@ -20,7 +20,7 @@ BELOW = 0.02  # of the range of values, that a silent one is put below the least
 
 
 def locate_by_neighbours(
-    name: str, trained: Snapshots, heard: Snapshots, group: np.ndarray | None = None
+    name: str, trained: Scans, heard: Scans, group: np.ndarray | None = None
 ) -> tuple[np.ndarray, float, float]:
     """Return places (n, 3) of snapshots by the nearest trained ones, weighed by their inverse distances.
 
@@ -50,7 +50,7 @@ def locate_by_neighbours(
     return place, (time.perf_counter() - fitted) / max(len(heard), 1) * 1e3, fitted - started
 
 
-def feature_vectors(heard: Snapshots) -> np.ndarray:
+def feature_vectors(heard: Scans) -> np.ndarray:
     """Return real rows (n, P), NaN where nothing was heard.
 
     Of channels the real and imaginary parts after the first value that was heard was turned to be real and

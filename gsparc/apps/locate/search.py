@@ -12,7 +12,7 @@ from gsparc.apps.locate.cells import Cells
 from gsparc.apps.locate.likelihood import Misfit, Trust
 from gsparc.apps.locate.posterior import PlacePosterior
 from gsparc.apps.locate.site_field import HeardMoments
-from gsparc.apps.locate.snapshots import Snapshots
+from gsparc.apps.locate.snapshots import Scans
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Nuisances:
 
 
 @dataclass(frozen=True)
-class Search:
+class PlaceSearch:
     """One snapshot's misfit at cells that were halved where it fits."""
 
     cells: Cells
@@ -49,7 +49,7 @@ class Search:
         return PlacePosterior(self.cells, self.log_density(trust), trust.spread)
 
 
-def compute_misfit(heard: Snapshots, there: HeardMoments, unknown: Nuisances) -> Misfit:
+def compute_misfit(heard: Scans, there: HeardMoments, unknown: Nuisances) -> Misfit:
     """Return the misfit of snapshots at places; see `gsparc.apps.locate.likelihood`."""
     if heard.kind == "spectrum":
         return likelihood.spectrum_misfit(heard.values, there.mean, there.variance)

@@ -15,7 +15,7 @@ PIXELS = 1_000  # about as many of a spectrum are compared: an array's have far 
 
 
 @dataclass(frozen=True)
-class Snapshots:
+class Scans:
     """What was heard at n places.
 
     Attributes:
@@ -35,15 +35,15 @@ class Snapshots:
     def __len__(self) -> int:
         return len(self.values)
 
-    def subset(self, chosen: np.ndarray) -> Snapshots:
+    def subset(self, chosen: np.ndarray) -> Scans:
         """Return the snapshots `chosen`."""
         index = torch.from_numpy(np.asarray(chosen))
         floor = None if self.floor is None else self.floor[index]
         row = None if self.row is None else self.row[chosen]
-        return Snapshots(self.kind, self.values[index], floor, self.place[chosen], row)
+        return Scans(self.kind, self.values[index], floor, self.place[chosen], row)
 
 
-def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
+def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
     """Return rows (m,) of measurements as snapshots: rows of one place at different stations are one.
 
     Of several visits of a station to a place the first is of the first snapshot there, and so on.
@@ -68,12 +68,12 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Snapshots:
     quiet[which, station] = (side > 0)[:, None]
     own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
     names = np.array([name.partition(", station")[0] for name in data.row_names])
-    return Snapshots(site.kind, *own, data.moving[rows][first], names[rows][first] if len(names) else None)
+    return Scans(site.kind, *own, data.moving[rows][first], names[rows][first] if len(names) else None)
 
 
 def snapshots_of_values(
     site: Site, values: np.ndarray | Tensor, silent: np.ndarray | Tensor | None = None
-) -> Snapshots:
+) -> Scans:
     """Return snapshots at unknown places from what predictions of the site look like.
 
     Args:
@@ -101,7 +101,7 @@ def snapshots_of_values(
     flat = (scaled if count is None or site.kind == "rssi" else scaled.flatten(0, 1)).contiguous()
     own = _decibels(flat) if site.kind == "rssi" else flatten_targets(flat).reshape(len(heard), -1)
     parts = _without_silence(own, None if silent is None else torch.as_tensor(silent))
-    return Snapshots(site.kind, *parts, np.full((len(heard), 3), np.nan))
+    return Scans(site.kind, *parts, np.full((len(heard), 3), np.nan))
 
 
 def flatten_targets(targets: Tensor) -> Tensor:

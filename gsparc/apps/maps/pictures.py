@@ -18,7 +18,7 @@ from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.field_map import OVERLAP_DB, REFUSED, FieldMap, best_server
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.placing import Placement
-from gsparc.apps.maps.planning import Plan
+from gsparc.apps.maps.planning import MeasurementPlan
 from gsparc.apps.maps.promise import Promise
 from gsparc.evaluation import from_above
 from gsparc.evaluation.drawing import panels, save
@@ -275,7 +275,11 @@ def draw_measured_places(axis: Any, field: FieldMap) -> None:
 
 
 def draw_measurement_plan(
-    batch: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
+    batch: MeasurementPlan,
+    path: Path,
+    promise: Promise | None,
+    predictor: Predictor | None,
+    plan: FloorPlan | None,
 ) -> None:
     """Draw the expected error before and after, the chosen places, and how it falls."""
     left, right, low, high = batch.grid.extent

@@ -34,10 +34,10 @@ NO_PATTERN = -1.0  # in place of an azimuth
 
 
 @dataclass(frozen=True)
-class Antenna(Checked):
+class NewAntenna(Checked):
     """What a station that is not there yet transmits with.
 
-    >>> str(Antenna())
+    >>> str(NewAntenna())
     'one antenna alike in all directions, 0 dB over the mean power of those that stand'
 
     Attributes:
@@ -130,8 +130,8 @@ class Placement:
 
 def place_station(
     predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0,
-    promise: Promise | None = None, error: NewStationError = NewStationError(), antenna: Antenna = Antenna(),
-    **where: Any,
+    promise: Promise | None = None, error: NewStationError = NewStationError(),
+    antenna: NewAntenna = NewAntenna(), **where: Any,
 ) -> Placement:  # fmt: skip
     """Try one more station at every candidate.
 
@@ -186,7 +186,7 @@ def place_station(
 
 def lay_candidates(
     predictor: Predictor, area: Any = None, *, height_m: float | None = None, sites: Any = None,
-    station_height_m: float | None = None, count: int = 100, antenna: Antenna = Antenna(),
+    station_height_m: float | None = None, count: int = 100, antenna: NewAntenna = NewAntenna(),
 ) -> tuple[Grid, np.ndarray, dict[str, np.ndarray]]:  # fmt: skip
     """Return the area, places (n, 3) [m] where a station is tried, and other columns (n,) of their table.
 
@@ -260,7 +260,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
 
-def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Antenna) -> Any:
+def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: NewAntenna) -> Any:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
     known = predictor.predict_new(cells, place, antenna.sectors())
     if known is None and antenna.azimuth is not None:
@@ -273,7 +273,7 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: An
     return np.nan_to_num(level + antenna.power_db, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 
-def assumption(site: Site, height: float, antenna: Antenna) -> str:
+def assumption(site: Site, height: float, antenna: NewAntenna) -> str:
     """Return in words what a new station is taken to be, `height` [m] high."""
     carrier = None if site.stations is None else site.stations.carrier_hz
     # The first band is the lowest: see `gsparc.processes.sectors.Sectors.add_sectors`.

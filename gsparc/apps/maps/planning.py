@@ -19,7 +19,7 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
-from gsparc.apps.maps.streets import Streets, Tour, Ways
+from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
 from gsparc.prediction.predictor import Predictor
@@ -32,7 +32,7 @@ WORTH = 0.02  # share of the expected error over an area, that places must take 
 
 
 @dataclass(frozen=True)
-class Plan:
+class MeasurementPlan:
     """Places to measure, the most telling first, or in the order of a walk.
 
     Attributes:
@@ -89,7 +89,7 @@ def plan_measurements(
     other_end: Sequence[float] | None = None, promise: Promise | None = None, least_gain_db: float = 0.0,
     route: bool = True, start: Sequence[float] | None = None, route_m: float | None = None,
     length_m: float | None = None,
-) -> Plan:  # fmt: skip
+) -> MeasurementPlan:  # fmt: skip
     """Choose places to measure next, as a batch.
 
     >>> plan = gsparc.apps.maps.plan_measurements(gsparc.load("model.ckpt"), count=20, route=True)
@@ -138,7 +138,7 @@ def plan_measurements(
     order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64)
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
-    return Plan(
+    return MeasurementPlan(
         places[first:][np.array(chosen, np.int64)[order]], np.array(expected)[order], before_db, order,
         float(tour.metres[-1:].sum()), grid, before[wanted], mean_error(unknown)[wanted], places[wanted],
         scatter, tour.metres if route else np.zeros(0), path, stopped,
@@ -168,7 +168,7 @@ def coarse_grid(
     return replace(fine, x=x, y=y, step=step, inside=inside)
 
 
-def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.ndarray, Streets | None]:
+def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.ndarray, StreetGraph | None]:
     """Return places (n, 3) in polygons or along lines of a file, and these lines; None: it holds none."""
     left, right, south, north = grid.extent
     area, lines = read_shapes(path, key, grid.origin, True, max(right - left, north - south))
@@ -183,7 +183,7 @@ def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.nd
         every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
         points.append(every[contains_xy(area, every)])
     if lines:
-        streets = Streets.from_lines(lines, grid.step / 2)
+        streets = StreetGraph.from_lines(lines, grid.step / 2)
         # One of each step's square: a street with many bends has no more of them.
         square = np.unique((streets.node / grid.step * 2).round(), axis=0, return_index=True)[1]
         points.append(streets.node[square])

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Streets:
+class StreetGraph:
     """Lines as a graph; where they cross or touch one may turn.
 
     Attributes:
@@ -60,10 +60,10 @@ class Ways:
     length: np.ndarray
     along: np.ndarray
     near: np.ndarray
-    streets: Streets | None
+    streets: StreetGraph | None
 
     @classmethod
-    def between(cls, places: np.ndarray, streets: Streets | None = None) -> Self:
+    def between(cls, places: np.ndarray, streets: StreetGraph | None = None) -> Self:
         """Return the ways between places (S, 2) [m].
 
         Two places off the streets, or on streets that do not meet, are joined by a straight line.

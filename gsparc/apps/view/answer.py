@@ -35,11 +35,11 @@ class Answer:
     confidence: float | None = None
     spectrum: np.ndarray | None = None
     response: np.ndarray | None = None
-    paths: Rays | None = None
+    paths: PlacePaths | None = None
 
 
 @dataclass(frozen=True)
-class Rays:
+class PlacePaths:
     """Propagation paths at one place, the strongest first, of those within `SILENT_DB` of it.
 
     Attributes:
@@ -82,7 +82,7 @@ def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
     return float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
 
 
-def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
+def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> PlacePaths | None:
     try:
         paths: Paths = predictor.paths(**ends)
     except ValueError:  # of another kind, or what was fitted has none
@@ -92,7 +92,7 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
     return merge_paths(paths.gain[0], delay, towards)
 
 
-def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
+def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> PlacePaths:
     """Return paths as they are shown; those that several searches found alike are one, of their summed gain.
 
     Args:
@@ -116,4 +116,6 @@ def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | No
     order = np.argsort(-level)
     order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
     chosen = np.array(firsts, np.int64)[order]
-    return Rays(10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen])
+    return PlacePaths(
+        10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen]
+    )

@@ -12,7 +12,17 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
-from gsparc.apps.view.scene import EXTENT, DrawingFrame, DrawnScene, Faces, Lines, Mark, Part, Points, Sheet
+from gsparc.apps.view.scene import (
+    EXTENT,
+    DrawingFrame,
+    DrawnScene,
+    Faces,
+    Lines,
+    Mark,
+    Part,
+    PlacedPicture,
+    Points,
+)
 from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import ENDS, LIGHT, Site
@@ -53,7 +63,7 @@ def build_scene(
     if plan is not None:
         corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
         edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(Sheet("floor plan", corners[0], *edges, plan.image))
+        parts.append(PlacedPicture("floor plan", corners[0], *edges, plan.image))
     if seen is not None:
         chosen = evenly_spaced(len(seen.places), MOST_POINTS)
         legends[VALUES] = legend = Legend.over(seen.label, seen.values[chosen])

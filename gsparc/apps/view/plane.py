@@ -11,7 +11,7 @@ import numpy as np
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.making import predict_levels
 from gsparc.apps.maps.pictures import Legend
-from gsparc.apps.view.scene import Sheet
+from gsparc.apps.view.scene import PlacedPicture
 from gsparc.prediction.predictor import Predictor
 
 FIRST = 400  # cells of the first, coarsest picture, about
@@ -64,7 +64,9 @@ def refine_plane(
         stride //= 2
 
 
-def plane_sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
+def plane_sheet(
+    name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0
+) -> PlacedPicture:
     """Return a picture of values (ny, nx) over the cells, clear where not finite, `beneath` [m] lower.
 
     Half a dot lower, dots of the same height are seen whole.
@@ -72,7 +74,7 @@ def plane_sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, benea
     clear = np.where(np.isfinite(values), round(255 * OPACITY), 0)[..., None].astype(np.uint8)
     image = np.concatenate([legend.to_colours(values), clear], axis=-1)
     left, right, low, high = grid.extent
-    return Sheet(
+    return PlacedPicture(
         name, np.array([left, high, grid.height - beneath]), np.array([right - left, 0.0, 0.0]),
         np.array([0.0, low - high, 0.0]), image[::-1],
     )  # fmt: skip

@@ -98,7 +98,7 @@ class Faces:
 
 
 @dataclass(frozen=True)
-class Sheet:
+class PlacedPicture:
     """A picture (h, w, 3 or 4) uint8 that lies in space: its upper left corner, its upper and its left edge.
 
     Attributes:
@@ -146,7 +146,7 @@ def node_path(name: str) -> str:
     return "/" + name.replace("/", " ")
 
 
-Part = Points | Lines | Faces | Sheet | Mark
+Part = Points | Lines | Faces | PlacedPicture | Mark
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ CHECKED = 64  # rows that this is tried at
 
 
 @dataclass(frozen=True)
-class Weights:
+class GroupWeights:
     """A group's rows, and what its predictions are made of.
 
     Attributes:
@@ -99,8 +99,8 @@ class ChannelField(ClosedForm):
 
     def __init__(self, settings: ChannelSettings | None = None) -> None:
         self.settings = settings or ChannelSettings()
-        self.weights: tuple[Weights, ...] = ()
-        self.stations: dict[int, list[Weights]] = {}
+        self.weights: tuple[GroupWeights, ...] = ()
+        self.stations: dict[int, list[GroupWeights]] = {}
         self.common: SharedGains | None = None
         self.rows = np.zeros(0, np.int64)
         self.runs = RunFactors.identity()
@@ -159,7 +159,9 @@ class ChannelField(ClosedForm):
         factors, told = fit_run_factors(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
-        self.weights = tuple(Weights(group, given, max(given.power, TINY), *rest) for group, given in told)
+        self.weights = tuple(
+            GroupWeights(group, given, max(given.power, TINY), *rest) for group, given in told
+        )
         self.stations = {}
         for known in self.weights:
             self.stations.setdefault(known.group.slot.station, []).append(known)
@@ -232,9 +234,9 @@ class ChannelField(ClosedForm):
                 add_slot(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
 
-    def _group_by_places(self, ends: QueryEnds) -> list[list[tuple[Weights, Tensor, Tensor]]]:
+    def _group_by_places(self, ends: QueryEnds) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
         """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
-        alike: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
+        alike: dict[tuple[Any, ...], list[tuple[GroupWeights, Tensor, Tensor]]] = {}
         for number in ends.station.unique().tolist():
             here = torch.nonzero(ends.station == number).flatten()
             for known in self.stations.get(number, ()):

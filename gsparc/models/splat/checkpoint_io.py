@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gsparc.models.method import Method
 
 
-def read_interrupted(path: Path) -> checkpoint.Stored:
+def read_interrupted(path: Path) -> checkpoint.StoredModel:
     """Return what an interrupted training left.
 
     Raises:

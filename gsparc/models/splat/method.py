@@ -35,7 +35,7 @@ from gsparc.field.module import GaussianModule, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint import Stored
+from gsparc.models.checkpoint import StoredModel
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.mixture.weights import LEAST_HELD
@@ -235,7 +235,7 @@ class LearnedField(Method):
         self._ended = tuple(extra.get("ended", ()))
 
     def _plan_stages(
-        self, data: Measurements, fold: Fold, context: FitContext, resumed: Stored | None
+        self, data: Measurements, fold: Fold, context: FitContext, resumed: StoredModel | None
     ) -> Iterator[Stage]:
         """Yield one stage after the other, each decided by what came of those before.
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsparc.data.limits import internal
 from gsparc.models.uplink.interface import mean_power
-from gsparc.physics.plane_waves import Aperture, Columns, antenna_responses, tone_responses
+from gsparc.physics.plane_waves import Aperture, SourceColumns, antenna_responses, tone_responses
 from gsparc.processes.factor import Factor
 
 LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
@@ -68,7 +68,7 @@ class Sources:
     def error_variance(self, aperture: Aperture) -> Tensor:
         """Return the expected squared error per entry (B,) of `response`, to first order in the places."""
         count = self.gain.shape[1]
-        gram = Columns.from_sources(self.direction, self.delay, aperture).gram()
+        gram = SourceColumns.from_sources(self.direction, self.delay, aperture).gram()
         own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
         # Derivatives by directions and delays: of the gains, and of the steering vectors times the gains.
         gains = repeat_per_coordinate(self.gain)
@@ -157,7 +157,7 @@ class SourceSearch:
     def _fit_gains(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
         """Best gains of given sources, and the gradient by their directions and delays."""
         n = delay.shape[1]
-        columns = Columns.from_sources(direction, delay, self.aperture)
+        columns = SourceColumns.from_sources(direction, delay, self.aperture)
         gram, inner = columns.gram(), columns.inner_products(y)
         torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
         cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
@@ -216,7 +216,7 @@ class _Fit:
         gain_slopes: (B, 3 N, N) what the slopes of unit gains have in common with the gains' inverse.
     """
 
-    columns: Columns
+    columns: SourceColumns
     gain: Tensor
     inverse: Tensor
     slope: Tensor

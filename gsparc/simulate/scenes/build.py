@@ -22,7 +22,7 @@ from gsparc.simulate.scenes.osm import Town, read_town
 from gsparc.simulate.scenes.receivers import Ground, Layout, place_receivers, stands_clear_of
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
-from gsparc.simulate.survey import Engine, Survey
+from gsparc.simulate.survey import Survey, TracingEngine
 
 log = logging.getLogger(__name__)
 
@@ -206,7 +206,7 @@ def _shoebox(scene: SceneSettings) -> Survey:
     masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
     if any(mast.antenna.pattern != "iso" for mast in masts):
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
-    engines: list[Engine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
+    engines: list[TracingEngine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
     placed = place_receivers(scene, area, Ground(room.contains))
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 

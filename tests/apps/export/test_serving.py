@@ -24,7 +24,7 @@ from gsparc.models import checkpoint
 
 pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
 pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
-from gsparc.apps.export.serving import RAW, Limits, Server, build_application
+from gsparc.apps.export.serving import RAW, LimitedServer, Limits, build_application
 
 TX = np.array([3.0, 2, 2])
 HOSTILE, HOSTILE_S = (
@@ -55,7 +55,7 @@ class Served:
     def __init__(self, predictor, token=None, **limits):
         limits = Limits(**{"most": 64, **limits})
         app = build_application(predictor, limits, token)
-        self.server = Server(app, limits, port=0)
+        self.server = LimitedServer(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
     def __enter__(self):

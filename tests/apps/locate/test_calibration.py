@@ -10,7 +10,7 @@ from gsparc.apps.locate import calibration
 from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
 from gsparc.apps.locate.cells import cover_box
 from gsparc.apps.locate.likelihood import Trust, level_misfit
-from gsparc.apps.locate.search import Search
+from gsparc.apps.locate.search import PlaceSearch
 
 STATIONS = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
 CORNERS = np.array([[0.0, 0, 0], [10.0, 10, 0]])
@@ -30,7 +30,7 @@ def snapshots(count, rng, wrong):
 def looked(values, cells):
     mean = torch.from_numpy(levels(cells.centre))
     return [
-        Search(cells, level_misfit(one[None], mean, torch.ones_like(mean)))
+        PlaceSearch(cells, level_misfit(one[None], mean, torch.ones_like(mean)))
         for one in torch.from_numpy(values)
     ]
 

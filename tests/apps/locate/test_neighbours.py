@@ -9,7 +9,7 @@ from releases import real
 from gsparc.apps.locate.fingerprints import fingerprint_snapshots
 from gsparc.apps.locate.judging import report
 from gsparc.apps.locate.neighbours import PLAIN, _count, feature_vectors, locate_by_neighbours
-from gsparc.apps.locate.snapshots import Snapshots
+from gsparc.apps.locate.snapshots import Scans
 from gsparc.data.datasets.fingerprints import read_fingerprints, split_fingerprints
 
 
@@ -26,7 +26,7 @@ def hall(count, seed):
 
 def heard(values, places):
     kind = "csi" if np.iscomplexobj(values) else "rssi"
-    return Snapshots(kind, torch.from_numpy(values), None, places)
+    return Scans(kind, torch.from_numpy(values), None, places)
 
 
 @pytest.mark.parametrize("name", PLAIN)

@@ -14,7 +14,7 @@ from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import (
-    Antenna,
+    NewAntenna,
     NewStationError,
     assumption,
     lay_candidates,
@@ -153,12 +153,12 @@ def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
     found = place_station(predictor, **how)
     named = dict(zip(found.given["name"].tolist(), found.places.tolist(), strict=True))
     assert named == {"A": [5, 5, 20], "B": [75, 5, 12]}
-    louder = place_station(predictor, **how, antenna=Antenna(power_db=10))
+    louder = place_station(predictor, **how, antenna=NewAntenna(power_db=10))
     assert louder.coverage[0] > found.coverage[0] + 0.05
     with pytest.raises(DataError, match="knows no patterns"):
-        place_station(predictor, **how, antenna=Antenna(azimuth=[0, 120]))
+        place_station(predictor, **how, antenna=NewAntenna(azimuth=[0, 120]))
     with pytest.raises(DataError, match="degrees from north"):
-        place_station(predictor, **how, antenna=Antenna(azimuth="north"))
+        place_station(predictor, **how, antenna=NewAntenna(azimuth="north"))
 
 
 def test_polygons_of_candidates_were_read_as_a_table(together, tmp_path):
@@ -200,9 +200,9 @@ def test_spoilt_wishes(together, said, how):
 
 def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
     site = gsparc.load(together[2]).site
-    assert "band" not in assumption(site, 8.0, Antenna())
+    assert "band" not in assumption(site, 8.0, NewAntenna())
     two = replace(site, stations=replace(site.stations, carrier_hz=np.array([2.6e9, 1.8e9])))
-    assert assumption(two, 8.0, Antenna([0, 120])).startswith(
+    assert assumption(two, 8.0, NewAntenna([0, 120])).startswith(
         "assumed: 8 m high in the band of 1800 MHz, sect"
     )
 

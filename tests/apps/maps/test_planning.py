@@ -12,7 +12,7 @@ from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances
 from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
-from gsparc.apps.maps.streets import Streets, Tour, Ways
+from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.models.method import JointLevels
 from gsparc.prediction.jointly import JointMixin
@@ -138,7 +138,7 @@ def test_a_walk_is_not_longer_than_it_must_be():
 def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
     shapely = pytest.importorskip("shapely", reason="shapely is not installed: pip install 'gsparc[maps]'")
     grid = [[[0, 0], [100, 0]], [[50, -50], [50, 50]], [[0, 40], [100, 40]], [[200, 0], [300, 0]]]
-    streets = Streets.from_lines([shapely.LineString(line) for line in grid], 10)
+    streets = StreetGraph.from_lines([shapely.LineString(line) for line in grid], 10)
     ways = Ways.between(np.array([[0.0, 0], [10, 40], [200, 0], [-5, 0]]), streets)
     # By the crossing at (50, 0) and that at (50, 40), though no corner of a line is there.
     assert ways.length[0, 1] == pytest.approx(50 + 40 + 40)

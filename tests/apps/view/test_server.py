@@ -24,7 +24,7 @@ from websockets.sync.client import connect  # noqa: E402
 
 from gsparc.apps.view.latest_job import LatestJobQueue  # noqa: E402
 from gsparc.apps.view.server.page import render_page  # noqa: E402
-from gsparc.apps.view.server.serve import Server  # noqa: E402
+from gsparc.apps.view.server.serve import PageServer  # noqa: E402
 from gsparc.apps.view.server.session import Session  # noqa: E402
 
 
@@ -202,7 +202,7 @@ def test_drags_leave_nothing_behind(visit, spectrum_view):
 
 
 def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
-    server = Server(power_view, port=0)
+    server = PageServer(power_view, port=0)
     try:
         one, two = Visitor(server), Visitor(server)
         texts = one.session.answer_text, two.session.answer_text

@@ -53,7 +53,7 @@ def payloads(mark: Path) -> dict[str, object]:
         "subprocess": Calls(subprocess.call, ["touch", str(mark)]), "Path.touch": Calls(Path.touch, mark),
         "torch.save": Calls(torch.save, {}, str(mark)), "numpy.save": Calls(np.save, str(mark), np.ones(1)),
         "getattr": Calls(getattr, Calls(__import__, "os"), "system"),
-        "a class of ours": checkpoint.Stored("m", "t", "", None, {}),
+        "a class of ours": checkpoint.StoredModel("m", "t", "", None, {}),
     }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
-from gsparc.physics.plane_waves import Aperture, Columns, antenna_responses, tone_responses
+from gsparc.physics.plane_waves import Aperture, SourceColumns, antenna_responses, tone_responses
 from gsparc.training.context import FitContext
 
 
@@ -189,7 +189,7 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
     step = 1e-6
     slopes = [(atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()]
     flat = torch.cat([atoms(torch.zeros(3).double()), *slopes])
-    columns = Columns.from_sources(three.direction, three.delay, aperture)
+    columns = SourceColumns.from_sources(three.direction, three.delay, aperture)
     assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
     snapshot = three.channels(aperture)
     wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)

@@ -17,7 +17,7 @@ from gsparc.apps.view.building import PATHS, SPHERE, draw_rays
 from gsparc.apps.view.panel import panel_image
 from gsparc.apps.view.plane import plane_sheet
 from gsparc.apps.view.reasons import legend_html, summarise_answer
-from gsparc.apps.view.scene import EXTENT, DrawnScene, Part, Points, Sheet
+from gsparc.apps.view.scene import EXTENT, DrawnScene, Part, PlacedPicture, Points
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView, walk_places
 from gsparc.data.schema import ENDS
@@ -110,12 +110,12 @@ def _still(
     return nodes, legends
 
 
-def _upright(image: np.ndarray, middle: np.ndarray, extent: float) -> Sheet:
+def _upright(image: np.ndarray, middle: np.ndarray, extent: float) -> PlacedPicture:
     """The panel of an answer, standing behind the site."""
     wide = 1.05 * extent
     tall = wide * image.shape[0] / image.shape[1]
     corner = middle + np.array([-0.5 * wide, 0.8 * extent, 0.18 * extent + tall])
-    return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
+    return PlacedPicture("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
 def _side_panel(scene: DrawnScene, notes: list[str], legends: list[Legend]) -> str:

@@ -17,7 +17,7 @@ from gsparc.data.errors import DataError
 log = logging.getLogger(__name__)
 
 
-class Server:
+class PageServer:
     """Serves a model until it is stopped.
 
     Args:
