@@ -54,7 +54,7 @@ def _short_trainings_end_at_once(tmp_path_factory):
 
         assert _native.use_instruction_set(kernels), f"this machine or build has no {kernels}"
     with pytest.MonkeyPatch.context() as patch:
-        for one in (quick.compose_once, quick.look_once, quick.time_and_draw_less):
+        for one in (quick.look_once, quick.time_and_draw_less):
             one(patch)
         patch.setenv("GSPARC_STAND_INS", str(tmp_path_factory.mktemp("stand-ins")))
         yield

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from omegaconf import OmegaConf
 from shoeboxes import scatter
 
 from gsparc.ops import SphereGrid
@@ -55,7 +56,6 @@ def powers(path: Path, rows: int = 80) -> Path:
 
 def compose(*overrides: str, config: str = "train"):
     """The configuration that `train.py` would see, with the command line's overrides."""
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
     from gsparc.models.registry import fill_defaults
@@ -63,7 +63,8 @@ def compose(*overrides: str, config: str = "train"):
     chosen = tuple(word for word in overrides if _chooses(word))
     composed = pickle.loads(_composed(config, *chosen))
     values = OverridesParser.create().parse_overrides([word for word in overrides if word not in chosen])
-    ConfigLoaderImpl._apply_overrides_to_config(values, composed)
+    for one in values:
+        OmegaConf.update(composed, one.key_or_group, one.value())
     if "model" in composed:
         fill_defaults(composed.model)
     return composed

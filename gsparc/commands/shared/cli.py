@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
 import signal
@@ -16,7 +17,6 @@ from types import FrameType
 
 import hydra
 import yaml
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -32,6 +32,11 @@ from gsparc.models import registry
 from gsparc.training.effort import refuse_seconds
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
+# Options of Hydra that a value follows, which is no override.
+VALUED = (
+    "--cfg -c", "--package -p", "--config-path -cp", "--config-name -cn", "--config-dir -cd",
+    "--experimental-rerun",
+)  # fmt: skip
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
 
 
@@ -62,9 +67,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         sys.argv[1:] = add_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
-    given, rest = get_args_parser().parse_known_args(sys.argv[1:])
+    given, words = _read_options(sys.argv[1:])
     # Hydra takes overrides in one piece alone, which options would cut.
-    words = given.overrides + [word for word in rest if not word.startswith("-")]
     sys.argv[1:] = words + [word for word in sys.argv[1:] if word not in words]
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
@@ -101,6 +105,17 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+def _read_options(words: list[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Options of Hydra, of which some are looked at before it runs, and the overrides among words."""
+    parser = argparse.ArgumentParser(add_help=False)
+    for name in VALUED:
+        parser.add_argument(*name.split())
+    parser.add_argument("--info", "-i", nargs="?")
+    parser.add_argument("--multirun", "-m", action="store_true")
+    given, rest = parser.parse_known_args(words)
+    return given, [word for word in rest if not word.startswith("-")]
 
 
 def _show_whole(main: Callable[[], object]) -> None:
