@@ -1,6 +1,7 @@
 """What a command refuses: one line that says what is wrong, status 1, nothing half-written."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -86,8 +87,9 @@ def prints(fingerprints, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(prints, spectra_gp, spectra_file) -> dict[str, Path]:
-    """What stands in braces above."""
-    return {"town": town_model(), "spectra": spectra_gp, "prints": prints, "file": spectra_file}
+    """What stands in braces above; a copy of the town's model, in which commands keep what they calibrated."""
+    town = Path(shutil.copy(town_model(), prints / "town.ckpt"))
+    return {"town": town, "spectra": spectra_gp, "prints": prints, "file": spectra_file}
 
 
 @pytest.mark.parametrize(("line", "message"), REFUSED)
