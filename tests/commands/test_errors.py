@@ -87,7 +87,7 @@ def prints(fingerprints, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(prints, spectra_gp, spectra_file) -> dict[str, Path]:
-    """What stands in braces above; a copy of the town's model, in which commands keep what they calibrated."""
+    """What stands in braces above; the town's model is a copy: commands keep calibrations in it."""
     town = Path(shutil.copy(town_model(), prints / "town.ckpt"))
     return {"town": town, "spectra": spectra_gp, "prints": prints, "file": spectra_file}
 

@@ -220,6 +220,26 @@ class GaussianProcess(Differentiable, ClosedForm):
         """Targets (B, ...) of components (B, P)."""
         return self._to_targets(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
 
+    def with_strongest(self, lost: float) -> GaussianProcess:
+        """Return it with the fewest components that leave out at most a share `lost` of what targets vary."""
+        if not isinstance(self.scores, Exact):
+            return self
+        energy, order = self.scores.given_values().square().sum(0).sort(descending=True)
+        beyond = energy.sum() - energy.cumsum(0)
+        count = min(int((beyond > lost * energy.sum()).sum()) + 1, len(order))
+        result = self._with_components(order[:count])
+        entries = len(self.scores.rows) * len(self.mean)
+        result.lost = self.lost + max(float(beyond[count - 1]), 0.0) / entries
+        return result
+
+    def _with_components(self, chosen: Tensor) -> GaussianProcess:
+        """The same of these components alone."""
+        assert isinstance(self.scores, Exact)
+        result = copy.copy(self)
+        result.scores = replace(self.scores, weights=self.scores.weights[:, chosen])
+        result.axes = self.axes[chosen]
+        return result
+
     def reduction_settings(self) -> tuple[str, ...]:
         """See `Method.reduce`."""
         if not isinstance(self.scores, Exact):
@@ -233,11 +253,9 @@ class GaussianProcess(Differentiable, ClosedForm):
         if not isinstance(self.scores, Exact):
             return MeanOnly(self, self.mean_at)
         stride, grid = int(settings.get("stride", 1)), self.fitted_site.grid
-        count, lean = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes))), copy.copy(self)
-        # A view where all are kept: the axes of thousands of images are hundreds of megabytes.
-        every, weights = slice(None), self.scores.weights
-        chosen = weights.square().sum(0).topk(count).indices if count < len(self.axes) else every
-        lean.scores, lean.axes = replace(self.scores, weights=weights[:, chosen]), self.axes[chosen]
+        count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
+        chosen = self.scores.weights.square().sum(0).topk(count).indices if count < len(self.axes) else None
+        lean = copy.copy(self) if chosen is None else self._with_components(chosen)
         if stride > 1:
             parts = (
                 part.unflatten(-1, self.shape)[..., ::stride, ::stride] for part in (lean.mean, lean.axes)

@@ -28,6 +28,7 @@ from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 
 log = logging.getLogger(__name__)
+BEYOND = 1e-3  # of the variance of targets, that an averaged process leaves out
 
 
 class ImageProcess(LearnedField):
@@ -81,6 +82,8 @@ class ImageProcess(LearnedField):
             known = np.sort(np.concatenate([fold.train, fold.val]))
             # It was weighed without validation rows, and answers with them.
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
+            if not self._is_process_alone:  # components are most of a query
+                self._average = method.with_strongest(BEYOND), self._average[1]
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)

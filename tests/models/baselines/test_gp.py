@@ -45,6 +45,23 @@ def test_components_are_the_principal_ones(campaign, kind):
     assert whole.lost == pytest.approx(0, abs=1e-9)
 
 
+def test_the_strongest_components_leave_out_a_stated_share(campaign, folds, tmp_path):
+    data, fold = campaign("spectrum", 40), folds(40).folds[0]
+    whole = GaussianProcess()
+    whole.fit(data, fold, FitContext(tmp_path))
+    less, batch = whole.with_strongest(0.1), data.batch(fold.test)
+    assert len(less.axes) < len(whole.axes)
+    target = whole.scores.given_values().square().sum()
+    rest = float(target - less.scores.given_values().square().sum())
+    assert 0 < rest <= 0.1 * float(target)
+    entries = len(whole.scores.rows) * len(whole.mean)
+    assert less.lost - whole.lost == pytest.approx(rest / entries, rel=1e-6)
+    one, other = whole.predict(batch), less.predict(batch)
+    assert float((one.mean - other.mean).square().mean()) < 0.2 * float(one.mean.var())
+    assert (other.variance > one.variance).all()
+    assert len(whole.with_strongest(0.0).axes) == len(whole.axes)
+
+
 def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     data, fold = campaign("csi", 40), folds(40).folds[0]
     gp = GaussianProcess()
