@@ -67,18 +67,20 @@ class HeldOutPair:
 def share_of_second(parts: Sequence[HeldOutPair]) -> float:
     """Return the weight in [0, 1] of the second of two predictors that makes the mean PSNR of rows largest.
 
-    0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained, but not where the
-    second alone is better than the first: a query may take longer rather than lose to it. Few rows that
-    do not tell the two apart weigh them alike (J. M. Bates and C. W. J. Granger, 1969).
+    0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB`, or twice its standard
+    error, is gained, but not where the second alone is better than the first: a query may take longer rather
+    than lose to it. Few rows that do not tell the two apart weigh them alike (J. M. Bates and C. W. J.
+    Granger, 1969).
     """
-    first, second = (np.concatenate([part.log_errors(share) for part in parts]) for share in (0.0, 1.0))
-    gain, unsure = mean_and_error(first - second, np.arange(len(first)))
-    if len(first) < FEW_ROWS and abs(gain) < 2 * unsure:
+    logs = np.stack([np.concatenate([part.log_errors(share) for part in parts]) for share in SHARES])
+    chosen, rows = int(logs.mean(1).argmin()), np.arange(logs.shape[1])
+    gain, unsure = mean_and_error(logs[0] - logs[-1], rows)
+    if len(rows) < FEW_ROWS and abs(gain) < 2 * unsure:
         return 0.5
-    means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
-    if means[0] <= means[-1] and RELATIVE_DB * (means[0] - min(means)) < LEAST_GAIN_DB:
+    mixed, unsure = mean_and_error(logs[0] - logs[chosen], rows)
+    if gain <= 0 and mixed < max(LEAST_GAIN_DB / RELATIVE_DB, 2 * unsure):
         return 0.0
-    best = float(SHARES[int(np.argmin(means))])
+    best = float(SHARES[chosen])
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
 
 
