@@ -10,7 +10,7 @@ import pytest
 from level_fields import ROWS, truths
 
 from gsparc.data.checks.column_effects import LevelsAtPlaces, find_effects
-from gsparc.data.tables.read import parse_table
+from gsparc.data.datasets.own import read_any
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -41,7 +41,7 @@ def test_the_advice_of_a_message_works_as_written(tmp_path, head):
     path = tmp_path / "log.csv"
     table = {"x": place[:, 0], "y": place[:, 1], "rssi_dbm": level, head: columns[head]}
     pd.DataFrame(table).to_csv(path, index=False)
-    said = [note for note in parse_table(path).notes if f"column '{head}' is not used and explains" in note]
+    said = [note for note in read_any(path).notes if f"column '{head}' is not used and explains" in note]
     assert len(said) == 1, said
     words = shlex.split(said[0].partition("? ")[2])[:1]
     assert words[0].startswith("dataset.columns.")
