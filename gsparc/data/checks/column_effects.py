@@ -98,7 +98,7 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
         if not known:
             break
         # Of columns that tell the same apart the first of the fewest values.
-        alike = (one for one in known if one.contrast < ALIKE * known[0].contrast)
+        alike = (one for one in known if one.contrast <= ALIKE * known[0].contrast)
         best = min(alike, key=lambda one: texts[one.head].max())
         found.append(best)
         value = values[best.head]
@@ -150,9 +150,13 @@ def _effect(
 ) -> Effect | None:  # fmt: skip
     """What one column explains; None: nothing, or it follows the level."""
     fits: dict[Kind, tuple[LevelField, float]] = {}
-    if 0 < code.max() < len(code) / REPEATED and (contrast := _contrast(links, pairs, code)) < 1:
-        fits["device"] = _devices(links, code), contrast
-        fits["transmitter"] = _fit(links, _pairwise(links.station, code)), contrast
+    if 0 < code.max() < len(code) / REPEATED:
+        offsets, contrast = _devices(links, code), _contrast(links, pairs, code)
+        if contrast < 1:
+            fits["transmitter"] = _fit(links, _pairwise(links.station, code)), contrast
+        # Few pairs are of one device, all are of known offsets: either may tell.
+        if (contrast := min(contrast, _contrast(links, pairs, offsets.regression, 1.0))) < 1:
+            fits["device"] = offsets, contrast
     if value is not None:
         fit = _fit(links, links.station, [value])
         exact = abs(fit.slope[0] / _power_of_ten(fit.slope[0]) - 1) < TOLERANCE and abs(fit.slope[0]) < 2
