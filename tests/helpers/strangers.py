@@ -65,6 +65,8 @@ CASES = {
         {}, "no such place on Earth", "refused"),
     "metres far away": (table("x,y,rssi", np.where(FIFTH, 4e6, PLACES[:, 0]), PLACES[:, 1], LEVELS[:, 0]), {},
         "line 6: no such place on Earth", "refused"),
+    "a fix that stands still": (table("x,y,rssi", *STUCK.T, ALONG), {},
+        "line 63 to line 181: one place for 119 rows, while levels", ""),
     "minutes": (table("lat,lon,rssi", *MINUTES, LEVELS[:, 0]), {}, "north of 48.20", "refused"),
     "NMEA": (table("lat,lon,rssi", *NMEA, LEVELS[:, 0]), {}, "as NMEA writes them (ddmm.mmmm)", "more rows"),
     "ten millionths": (table("lat,lon,rssi", *(np.c_[NORTH, EAST] * 1e7).astype(int).T, LEVELS[:, 0]), {},
