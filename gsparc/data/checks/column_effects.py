@@ -189,14 +189,15 @@ def _contrast(
         code: (n,) the column's values, or numbers.
         slope: that multiplies numbers; 0: none.
     """
-    level, stations = links.level, np.unique(links.station)
+    level, which = links.level, np.unique(links.station, return_inverse=True)[1].reshape(-1)
     left = level - slope * code if slope else level
-    for own in (links.station == one for one in stations):
-        within = left[own] if slope else _centred(left[own], code[own])
-        if (
-            np.var(within) < (1 - COPY[len(stations) > 1]) * np.var(level[own])
-            and own.sum() >= LEAST_ROWS / 3
-        ):
+    # Stations of few rows are looked at together, about their own means.
+    few = np.bincount(which)[which] < LEAST_ROWS / 3
+    for one in np.unique(part := np.where(few, -1, which)):
+        own = part == one
+        whole, within = (_centred(value[own], which[own]) for value in (level, left))
+        within = within if slope else _centred(within, code[own])
+        if np.var(within) < (1 - COPY[int(which.max() > 0)]) * np.var(whole) and own.sum() >= LEAST_ROWS / 3:
             return 1.0
     rest = []
     for first, second in (pair.T for pair in pairs):
