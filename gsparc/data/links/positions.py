@@ -40,6 +40,8 @@ def _without_fix(check: Checker, measured: str) -> None:
         rows, kinds = len(arrays[measured]), {p.dtype.kind for p in pair}
         if any(p.ndim != 2 - degrees or len(p) != rows for p in pair) or not kinds <= {*"iuf"}:
             continue
+        if len(pair) < 1 + degrees:  # refused where degrees are read
+            continue
         place = np.column_stack(pair)[:, :2].astype(np.float64)
         null, off = (place == 0).all(axis=1), _impossible(place, degrees)
         known = place[~(null | off)]
