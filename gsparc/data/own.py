@@ -202,7 +202,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)  # `**` may overflow
     site = replace(data.site, target_scale=scale)
     data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
-    return Reading(data, tuple(check.notes), raw.arrays["file_row"])
+    file_row = raw.arrays["file_row"]
+    return Reading(data, (*check.notes, *raw.explain(data, file_row)), file_row)
 
 
 def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, Any]:

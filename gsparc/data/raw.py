@@ -14,7 +14,7 @@ import tempfile
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from io import BytesIO
@@ -57,12 +57,14 @@ class Raw:
         attributes: numbers and strings about the whole file.
         units: unit of an array where the file gives one.
         notes: how it was understood and what of it was left out, for the user, one line each.
+        explain: what there is to say of the measurements that these became, and (S,) the row of each, from 0.
     """
 
     arrays: dict[str, np.ndarray]
     attributes: dict[str, Any] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    explain: Callable[[Any, np.ndarray], list[str]] = lambda data, file_row: []
 
 
 def read_raw(path: str | Path) -> Raw:

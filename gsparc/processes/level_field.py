@@ -18,6 +18,7 @@ from gsparc.processes.factor import Factor
 
 REACHES = (1 / 3, 1 / 10, 1 / 30, 1 / 100)  # lengths of correlation, parts of the region
 NUGGETS = (0.05, 0.2, 0.7, 3.0)  # variance of fading and noise, parts of that of shadowing
+SPREADS = (0.1, 1.0, 10.0, 100.0)  # variance of the groups' constants, parts of that of shadowing
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class LevelField:
     """The likeliest settings, and the regressors.
 
     Attributes:
-        score: logarithm of the likelihood, less half of that of the rows for each constant.
+        score: logarithm of the likelihood, less half of that of the rows for each slope.
         length: of correlation [m].
         nugget: variance of noise, part of that of the correlated field.
         variance: of the correlated field [dB^2].
@@ -56,6 +57,9 @@ def fit_level_field(
 ) -> LevelField:  # fmt: skip
     """Fit a field and a constant for each of groups, and slopes of columns over all of them.
 
+    Constants are random about a mean that nobody knows (restricted likelihood): many groups of few rows cost
+    what they leave open, not half a logarithm of all rows each.
+
     >>> place = np.random.default_rng(0).uniform(0, 100, (60, 2))
     >>> field = fit_level_field(place, 3 * place[:, 0], np.zeros(60), [place[:, 0]])
     >>> field.slope.round(3)
@@ -75,21 +79,28 @@ def fit_level_field(
     found = []
     for length in (max(reach * wide, 1e-9) for reach in REACHES):
         for nugget in nuggets:
-            gram, logarithms = np.zeros((table.shape[1],) * 2), 0.0
+            gram, logarithms, means = np.zeros((table.shape[1],) * 2), 0.0, []
             for part, distance in zip(parts, apart, strict=True):
                 factor = _factor(distance, length, nugget)
                 both = np.column_stack([np.ones(len(part)), table[part]])
                 white = factor.whiten(torch.from_numpy(both)).numpy()
-                own = white[:, 1:] - np.outer(white[:, 0], white[:, 0] @ white[:, 1:]) / (
-                    white[:, 0] @ white[:, 0]
-                )
+                weight = float(white[:, 0] @ white[:, 0])
+                mean = white[:, 0] @ white[:, 1:] / weight
+                own = white[:, 1:] - np.outer(white[:, 0], mean)
                 gram += own.T @ own
                 logarithms += 2 * float(factor.lower.diagonal().log().sum())
+                means.append((weight, *mean))
             slope = np.linalg.pinv(gram[1:, 1:]) @ gram[1:, 0]
-            variance = max(float(gram[0, 0] - slope @ gram[1:, 0]) / count, 1e-6)
-            constants = len(parts) + len(slope)
-            score = -0.5 * (count * math.log(variance) + logarithms + constants * math.log(count))
-            found.append(LevelField(score, length, nugget, variance, table[:, 1:], slope))
+            rest = float(gram[0, 0] - slope @ gram[1:, 0])
+            weight, constant = np.array(means)[:, 0], np.array(means)[:, 1:] @ np.r_[1.0, -slope]
+            for spread in SPREADS:
+                own = 1 / (spread + 1 / weight)
+                between = float(own @ (constant - own @ constant / own.sum()) ** 2)
+                variance = max((rest + between) / count, 1e-6)
+                more = float(np.log1p(spread * weight).sum()) + math.log(own.sum())
+                more += len(slope) * math.log(count)
+                score = -0.5 * (count * math.log(variance) + logarithms + more)
+                found.append(LevelField(score, length, nugget, variance, table[:, 1:], slope))
     return max(found, key=lambda one: one.score)
 
 

@@ -85,7 +85,7 @@ def test_beams_of_both_ends_were_advised_one_after_the_other(tmp_path):
         f"{i},{i * i},{t},{r},-{60 + i + 3 * t + r}" for i in range(12) for t in range(3) for r in range(2)
     ]
     file.write_text("\n".join(["x,y,tx_beam,rx_beam,rsrp", *rows]))
-    said = [note for note in parse_table(file).notes if "is not used and explains" in note]
+    said = [note for note in interpret(parse_table(file), file).notes if "is not used and explains" in note]
     assert len(said) == 2 and "device=tx_beam+rx_beam takes each off" in said[1]
     data = interpret(parse_table(file, {"station": "tx_beam+rx_beam"}), file).data
     assert len(data.site.stations) == 6

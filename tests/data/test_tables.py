@@ -8,6 +8,7 @@ import pytest
 
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.own import interpret
+from gsparc.data.query_places import read_query_places
 from gsparc.data.tables.heads import parse_head
 from gsparc.data.tables.read import parse_table
 
@@ -293,9 +294,6 @@ SPOILT = {
                           "did you mean 'rssi'?"),
     "a misspelt quantity": (PLAIN, {"rsi_db": "rssi"}, "no such quantity; did you mean 'rssi_db'?"),
     "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW: rssi_db needs"),
-    "latitude and longitude swapped": (
-        "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",
-    ),
     "channels of stations without places": ("x,y,re,im,cell\n1,2,1,0,a\n2,2,1,0,b\n", {}, "stations without places; add columns"),
     "a station that moved": (
         "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,a,5,6\n", {}, "'a' is at (5, 5) in line 2 and at (5, 6)",
@@ -322,6 +320,13 @@ SPOILT = {
     "zeros": (b"x,y\0,rssi\n1,2,-80\n", {}, "not text (byte 3 is zero"),
     "UTF-16 cut short": (PLAIN.encode("utf-16")[:-1], {}, "damaged UTF-16"),
 }  # fmt: skip
+
+
+def test_swapped_degrees_are_refused(write, refused):
+    path = write("lat,lon,rssi\n-111.8,40.7,-80\n-111.9,40.7,-81\n")
+    says = "line 2: latitude -111.8 is outside -90 to 90 degrees; are latitude and longitude swapped"
+    refused(says, lambda: interpret(parse_table(path), path))
+    refused(says, read_query_places, path, ["rx"])
 
 
 @pytest.mark.parametrize("name", SPOILT)

@@ -28,6 +28,7 @@ def long(heads: str, *more, level=LEVELS[:, 0], places=PLACES) -> str:
 
 FLOOR = RNG.integers(0, 3, ROWS)
 BAND = RNG.integers(0, 2, ROWS)
+FIFTH, NINTH = np.arange(ROWS) == 4, np.arange(ROWS) % 9 == 4
 ZERO = np.where(np.arange(ROWS)[:, None] < 12, 0, np.c_[NORTH, EAST])
 
 
@@ -58,6 +59,14 @@ CASES = {
     "a mark that is none": (wide(100), {"not_heard": []}, "394 levels above 60 dBm", "taken as not heard"),
     "no fix": (table("lat,lon,rssi", *ZERO.T, LEVELS[:, 0]), {},
         "lines 2 to 13: latitude and longitude are 0", ""),
+    "a place beyond the pole": (table("lat,lon,rssi", np.where(FIFTH, 95, NORTH), EAST, LEVELS[:, 0]), {},
+        "line 6: no such place on Earth", "refused"),
+    "a mark for no fix": (table("lat,lon,rssi", *np.where(NINTH, [[91], [181]], [NORTH, EAST]), LEVELS[:, 0]),
+        {}, "no such place on Earth", "refused"),
+    "metres far away": (table("x,y,rssi", np.where(FIFTH, 4e6, PLACES[:, 0]), PLACES[:, 1], LEVELS[:, 0]), {},
+        "line 6: no such place on Earth", "refused"),
+    "a fix that stands still": (table("x,y,rssi", *STUCK.T, ALONG), {},
+        "line 63 to line 181: one place for 119 rows, while levels", ""),
     "minutes": (table("lat,lon,rssi", *MINUTES, LEVELS[:, 0]), {}, "north of 48.20", "refused"),
     "NMEA": (table("lat,lon,rssi", *NMEA, LEVELS[:, 0]), {}, "as NMEA writes them (ddmm.mmmm)", "more rows"),
     "ten millionths": (table("lat,lon,rssi", *(np.c_[NORTH, EAST] * 1e7).astype(int).T, LEVELS[:, 0]), {},

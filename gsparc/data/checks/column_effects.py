@@ -98,7 +98,7 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
         if not known:
             break
         # Of columns that tell the same apart the first of the fewest values.
-        alike = (one for one in known if one.contrast < ALIKE * known[0].contrast)
+        alike = (one for one in known if one.contrast <= ALIKE * known[0].contrast)
         best = min(alike, key=lambda one: texts[one.head].max())
         found.append(best)
         value = values[best.head]
@@ -150,9 +150,13 @@ def _effect(
 ) -> Effect | None:  # fmt: skip
     """What one column explains; None: nothing, or it follows the level."""
     fits: dict[Kind, tuple[LevelField, float]] = {}
-    if 0 < code.max() < len(code) / REPEATED and (contrast := _contrast(links, pairs, code)) < 1:
-        fits["device"] = _devices(links, code), contrast
-        fits["transmitter"] = _fit(links, _pairwise(links.station, code)), contrast
+    if 0 < code.max() < len(code) / REPEATED:
+        offsets, contrast = _devices(links, code), _contrast(links, pairs, code)
+        if contrast < 1:
+            fits["transmitter"] = _fit(links, _pairwise(links.station, code)), contrast
+        # Few pairs are of one device, all are of known offsets: either may tell.
+        if (contrast := min(contrast, _contrast(links, pairs, offsets.regression, 1.0))) < 1:
+            fits["device"] = offsets, contrast
     if value is not None:
         fit = _fit(links, links.station, [value])
         exact = abs(fit.slope[0] / _power_of_ten(fit.slope[0]) - 1) < TOLERANCE and abs(fit.slope[0]) < 2
@@ -185,14 +189,15 @@ def _contrast(
         code: (n,) the column's values, or numbers.
         slope: that multiplies numbers; 0: none.
     """
-    level, stations = links.level, np.unique(links.station)
+    level, which = links.level, np.unique(links.station, return_inverse=True)[1].reshape(-1)
     left = level - slope * code if slope else level
-    for own in (links.station == one for one in stations):
-        within = left[own] if slope else _centred(left[own], code[own])
-        if (
-            np.var(within) < (1 - COPY[len(stations) > 1]) * np.var(level[own])
-            and own.sum() >= LEAST_ROWS / 3
-        ):
+    # Stations of few rows are looked at together, about their own means.
+    few = np.bincount(which)[which] < LEAST_ROWS / 3
+    for one in np.unique(part := np.where(few, -1, which)):
+        own = part == one
+        whole, within = (_centred(value[own], which[own]) for value in (level, left))
+        within = within if slope else _centred(within, code[own])
+        if np.var(within) < (1 - COPY[int(which.max() > 0)]) * np.var(whole) and own.sum() >= LEAST_ROWS / 3:
             return 1.0
     rest = []
     for first, second in (pair.T for pair in pairs):

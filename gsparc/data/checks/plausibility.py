@@ -28,7 +28,8 @@ HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
 NEIGHBOURS = 5  # rows on each side
-LONG_GAP = 20  # rows without a value in one piece
+LONG_GAP = 20  # rows without a value, or at one place, in one piece
+STILL_DB = 10.0  # between levels of one place, at least: fading of who stands still is faster than it is deep
 EDGE = 10  # rows beside it
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
 WEAK_DB = 6.0  # above the weakest value: heard only just
@@ -42,7 +43,7 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         steps: `find_level_steps` them.
     """
     severe = map(Severe, [*level_warnings(levels.level_db), *floor_warnings(levels)])
-    warnings = [*severe, *repeat_warnings(levels), *outlier_row_warnings(levels)]
+    warnings = [*severe, *still_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
 
@@ -167,15 +168,24 @@ def find_marks(values: np.ndarray) -> list[float]:
         rest = rest[~np.isin(rest, found)]
 
 
-def repeat_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of places that one station measured several times, with different levels."""
-    known = np.flatnonzero(np.isfinite(levels.level_db))
-    links = np.column_stack([levels.position, levels.station, levels.level_db])[known]
-    links = links[np.lexsort(links.T[::-1])]
-    apart = np.split(links[:, -1], np.flatnonzero(np.diff(links[:, :-1], axis=0).any(axis=1)) + 1)
-    spreads = [spread for one in apart if len(one) > 1 and (spread := one.std(ddof=1)) > 0]
-    repeated = f"{len(spreads)} places were measured more than once by one station, with different levels"
-    return [f"{repeated} (standard deviation {np.median(spreads or [0]):.2g} dB, median)"] * bool(spreads)
+def still_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of a place that many rows in a piece share while levels change as on a way: a fix stood still.
+
+    Where nothing moves, levels differ from row to row as much as they do in all (J. von Neumann, 1941).
+    """
+    still: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
+    for t, used in levels.heard():
+        moves = np.flatnonzero(np.diff(levels.position[used], axis=0).any(axis=1)) + 1
+        for piece in np.split(used, moves):
+            level = levels.level_db[piece]
+            if len(piece) >= LONG_GAP and np.ptp(level) > STILL_DB and np.diff(level).var() < level.var() / 2:
+                where = levels.rows[piece[0]], levels.rows[piece[-1]], len(piece)
+                still[where][levels.names[t]] = float(np.ptp(level))
+    return [
+        f"{first} to {last}: one place for {count} rows, while levels change by {max(who.values()):.0f} dB"
+        f"{_of([*who], len(levels.names))}: did the fix stand still? take them out"
+        for (first, last, count), who in still.items()
+    ]
 
 
 def outlier_row_warnings(levels: LinkLevels) -> list[str]:

@@ -31,11 +31,6 @@ def unit_warnings(data: Measurements) -> list[str]:
         # Steps in radians taken for degrees: the columns then span 2 pi degrees.
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
-    if site.kind == "rssi" and (data.target == 0).any():
-        hints.append(
-            f"{(data.target == 0).sum()} powers are exactly 0, learned as -300 dB: not heard? make them "
-            "NaN, or give rssi_db and sensitivity_db"
-        )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1.

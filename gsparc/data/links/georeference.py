@@ -11,6 +11,8 @@ from pyproj import Geod
 from gsparc.data.errors import DataError
 
 DIGITS = 4  # of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
+# Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.
+ON_EARTH = ((-90, 90), (-180, 360))
 _WGS84 = Geod(ellps="WGS84")
 
 
@@ -90,7 +92,9 @@ def find_invalid_coordinate(
 ) -> tuple[int, str] | None:
     """Return the first row of (n,) [deg] that is not on Earth, and what is wrong; None when all are."""
     latitude, longitude = np.atleast_1d(latitude, longitude)
-    for name, values, low, high in (("latitude", latitude, -90, 90), ("longitude", longitude, -180, 360)):
+    for name, values, (low, high) in zip(
+        ("latitude", "longitude"), (latitude, longitude), ON_EARTH, strict=True
+    ):
         wrong = np.flatnonzero(~((values >= low) & (values <= high)))
         if len(wrong):
             swapped = name == "latitude" and (np.abs(longitude) <= 90).all()

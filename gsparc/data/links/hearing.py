@@ -83,6 +83,9 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         elif unheard.any() and len(heard):
             floor, censored = np.full(len(values), heard.min()), unheard
         saturated = _saturated(check, values, ~unknown & marked)
+    elif measured == "rssi" and values.ndim == 1 and (values == 0).any() and (values > 0).any():
+        # Of linear powers 0 is what was not heard, as minus infinity is of levels.
+        floor, censored = np.full(len(values), values[values > 0].min()), (values == 0) & marked
     if floor is not None:
         arrays[measured] = np.where(censored, floor, arrays[measured])
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
@@ -98,7 +101,8 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         return check.refuse(measured, f"{why}; expected numbers")
     if not keep.all() or censored.any():
         none = " or without any power" if measured == "spectrum" else ""
-        below = np.zeros(1) if floor is None or not censored.any() else floor[censored]
+        below = np.ones(1) if floor is None or not censored.any() else floor[censored]
+        below = 10 * np.log10(below) if measured == "rssi" else below
         limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
         what = "not listed" + " or not heard" * bool(censored.sum() > unlisted) if unlisted else "not heard"
         unheard = f"powers were {what}: below {limits} dB"

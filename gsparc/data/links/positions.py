@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.data.checks.outliers import FEW, TOO_DISTANT_M, too_far
 from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.errors import Caution, Severe, list_first, name_row_ranges
-from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
+from gsparc.data.links.georeference import ON_EARTH, Georeference, find_invalid_coordinate
 from gsparc.data.own_checks import Checker
+from gsparc.data.raw import numbered_rows
 from gsparc.data.selection import take_rows
 
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
@@ -30,28 +32,46 @@ def positions_in_metres(check: Checker, measured: str) -> tuple[bool, Georeferen
 
 
 def _without_fix(check: Checker, measured: str) -> None:
-    """Leave out rows at exactly 0, 0 where all others are elsewhere; stations there are at unknown places."""
+    """Leave out rows at 0, 0 where all others are elsewhere and, of few, where nothing can be."""
     arrays = check.raw.arrays
     degrees = "latitude" in arrays
     for name in ("latitude",) if degrees else check.present("rx_position", "tx_position"):
         pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
-        rows = len(arrays[measured])
-        if any(p.ndim != 2 - degrees or len(p) != rows for p in pair):
+        rows, kinds = len(arrays[measured]), {p.dtype.kind for p in pair}
+        if any(p.ndim != 2 - degrees or len(p) != rows for p in pair) or not kinds <= {*"iuf"}:
             continue
-        place = np.column_stack(pair)[:, :2]
-        null = (place == 0).all(axis=1)
-        if null.all():
+        if len(pair) < 1 + degrees:  # refused where degrees are read
             continue
-        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(place[~null], axis=0).max())
-        if np.abs(np.median(place[~null], axis=0)).max() <= least:
-            continue  # 0, 0 is a place, too, for who measures there
-        _unknown_at_zero(check, degrees)
-        if null.any():
-            which = name_row_ranges([str(name) for name in arrays["row_name"][null]])
-            what = f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"
-            check.notes.append(Caution(f"{which}: {what}; these {null.sum()} of {rows} rows are left out"))
-            check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(~null), rows))
+        place = np.column_stack(pair)[:, :2].astype(np.float64)
+        null, off = (place == 0).all(axis=1), _impossible(place, degrees)
+        known = place[~(null | off)]
+        if not len(known):
+            continue
+        lost = dict[str, np.ndarray]()
+        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(known, axis=0).max())
+        if np.abs(np.median(known, axis=0)).max() > least:  # else 0, 0 is a place like any other
+            _unknown_at_zero(check, degrees)
+            lost[f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"] = null
+        # One value that repeats is a mark of a logger; several are faults only where they are few.
+        if off.sum() <= max(1, FEW * rows) or (2 * off.sum() < rows and not np.ptp(place[off], axis=0).any()):
+            lost["no such place on Earth, ({:g}, {:g})".format(*place[off.argmax()])] = off
+        for what, out in [(what, out) for what, out in lost.items() if out.any()]:
+            which = name_row_ranges([str(name) for name in arrays["row_name"][out]])
+            check.notes.append(Caution(f"{which}: {what}; these {out.sum()} of {rows} rows are left out"))
+        keep = ~np.any([*lost.values()], axis=0)
+        if lost and not keep.all():
+            check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(keep), rows))
             arrays = check.raw.arrays
+
+
+def _impossible(place: np.ndarray, degrees: bool) -> np.ndarray:
+    """Which places (n, 2) are not on Earth, or, few in metres, far beyond all others, (n,) bool."""
+    if degrees:
+        return ((place < np.array(ON_EARTH)[:, 0]) | (place > np.array(ON_EARTH)[:, 1])).any(axis=1)
+    sane, off = np.flatnonzero(np.abs(place).max(axis=1) < np.inf), np.zeros(len(place), bool)
+    far = np.linalg.norm(place[sane] - np.median(place[sane], axis=0), axis=1) > TOO_DISTANT_M
+    off[sane] = too_far(place[sane]) & far
+    return off
 
 
 def _unknown_at_zero(check: Checker, degrees: bool) -> None:
@@ -148,5 +168,6 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
     # Zeros stand in for places that nobody knows, which would be refused as no degrees.
     fault = find_invalid_coordinate(*np.where(absent, 0, (latitude, longitude)))
     if fault:
-        check.refuse(f"{prefix}latitude", "row {}: {}".format(*fault))
+        called = numbered_rows(len(latitude)) if prefix else check.raw.arrays["row_name"]
+        check.refuse(f"{prefix}latitude", f"{called[fault[0]]}: {fault[1]}")
     return latitude, longitude

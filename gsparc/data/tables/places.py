@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import Caution, DataError, list_first, name_row_ranges
+from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.links.stations import PER_STATION, SECTOR
 from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations, say_column
 from gsparc.data.tables.heads import AXES, LISTS, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
@@ -18,8 +19,6 @@ from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector
 from gsparc.data.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0
-# Both customs of longitude are taken: -180 to 180, and 0 to 360.
-ON_EARTH = ((-90, 90), (-180, 360))  # degrees of latitude and longitude
 
 
 @dataclass(frozen=True)
@@ -50,10 +49,13 @@ class Places:
         return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
 
 
-def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -> Places | None:
+def read_places(
+    sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False, strict: bool = True
+) -> Places | None:
     """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none.
 
-    Where places may be `unknown`, rows without any coordinate are NaN.
+    Where places may be `unknown`, rows without any coordinate are NaN; what is not on Earth is refused where
+    it is `strict`, else left to `gsparc.data.links.positions`.
     """
     for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
         roles = [f"{end}{axis}" for axis in axes]
@@ -75,7 +77,7 @@ def read_places(sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False) -
             return None
         across = np.stack([columns[0], columns[1]], axis=1)
         if degrees:
-            _on_earth(sheet, chosen, roles, across)
+            _on_earth(sheet, chosen, roles, across, strict)
         return Places(across, height, degrees)
     return None
 
@@ -157,23 +159,19 @@ def _notation(lat: np.ndarray, lon: np.ndarray) -> str | None:
     return "degrees times ten million; divide them" if whole else None
 
 
-def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray) -> None:
-    limits = zip(across.T, ON_EARTH, strict=True)
-    outside = [np.flatnonzero((values < low) | (values > high)) for values, (low, high) in limits]
-    swapped = len(outside[0]) > 0 and (np.abs(across[:, 1]) <= 90).all()
+def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, strict: bool) -> None:
+    outside = np.flatnonzero(np.abs(across[:, 0]) > 90)
+    swapped = (np.abs(across[:, 1]) <= 90).all()
     heads = [chosen[role][0].head or "" for role in roles]
     # Where most rows are outside, the columns are no degrees; else these rows are faulty.
-    if 2 * len(outside[0]) > len(across) and not swapped:
+    if 2 * len(outside) > len(across) and not swapped:
         end = roles[0].removesuffix("latitude")
         metres = f"metres? say {say_column(f'{end}x', heads[1])} {say_column(f'{end}y', heads[0])}"
         fault = _notation(*across[np.isfinite(across).all(axis=1)].T) or metres
-        example = f"{across[outside[0][0], 0]:.10g} in {sheet.rows[outside[0][0]]}"
+        example = f"{across[outside[0], 0]:.10g} in {sheet.rows[outside[0]]}"
         return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")
-    for i, (role, (low, high)) in enumerate(zip(roles, ON_EARTH, strict=True)):
-        hint = "; are latitude and longitude swapped?" if i == 0 and swapped else ""
-        rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in outside[i])
-        fault = f"{role} is outside {low} to {high} degrees{hint}"
-        sheet.problems.add_rows(sheet.describe_column(heads[i]), rows, fault)
+    if strict and (wrong := find_invalid_coordinate(*np.nan_to_num(across).T)):
+        sheet.refuse(f"{sheet.rows[wrong[0]]}: {wrong[1]}")
     return None
 
 

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +87,6 @@ def parse_table(
     builder = Builder(sheet, chosen, listed)
     arrays = builder.build()
     sheet.problems.raise_if_any()
-    told = say_effects(sheet, chosen, arrays)
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
     about = {}
     if power is not None and "rssi_db" in chosen:
@@ -94,7 +94,8 @@ def parse_table(
     # A column that is scaled has the schema's unit.
     if power is not None and power.unit is not None and power.unit.name in WATTS and not power.unit.times:
         about["unit"] = power.unit.name
-    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes, *told))
+    explain = partial(say_effects, sheet, chosen)
+    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes), explain=explain)
 
 
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
@@ -225,7 +226,7 @@ class Builder:
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
-        by_end = {end: read_places(self.sheet, self.chosen, end) for end in ("", "rx_", "tx_")}
+        by_end = {end: read_places(self.sheet, self.chosen, end, strict=False) for end in ("", "rx_", "tx_")}
         ends = {end: where for end, where in by_end.items() if where is not None}
         # Said beside what is wrong with levels: one look at the file mends both.
         if {f"{end}{axis}" for end in by_end for axis in AXES if axis != "z"}.isdisjoint(self.chosen):

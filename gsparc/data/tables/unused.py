@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from gsparc.data.checks.column_effects import LEAST_ROWS, LevelsAtPlaces, find_effects, find_filled
-from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.errors import Caution
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.schema import Measurements
 from gsparc.data.tables.columns import Chosen, say_column, used_heads
 from gsparc.data.tables.sheet import Sheet
 
 
-def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) -> list[str]:
+def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.ndarray) -> list[str]:
     """Return a caution for each column that explains what places and stations do not, and how to use it.
 
     Args:
         sheet: the table.
         chosen: its columns that are used.
-        arrays: that they became.
+        data: that they became.
+        file_row: (S,) row of the table, from 0, of each row of these.
     """
-    place = _places(arrays, len(sheet))
-    if "rssi_db" not in arrays or place is None:
+    if "rssi_db" not in chosen or not np.ptp(data.moving, axis=0).any():
         return []
-    level = arrays["rssi_db"].reshape(len(sheet), -1)
-    row, column = np.nonzero(np.isfinite(level) & ~np.isin(level, find_marks(level.ravel())))
-    own = arrays.get("station", np.zeros(len(sheet), np.int64))
-    station = own[row] if level.shape[1] == 1 else column
-    copies = sheet.frame.astype(str).duplicated().to_numpy()[row]
-    row, column, station = row[~copies], column[~copies], station[~copies]
+    measured = np.flatnonzero((data.censored_side(np.arange(len(data))) == 0) & (data.target[:, 0] > 0))
+    row, station = file_row[measured], np.zeros(len(data), np.int64) if data.station is None else data.station
+    level = 10 * np.log10(data.target[measured, 0].astype(np.float64))
+    links = LevelsAtPlaces(data.moving[measured], station[measured], level)
     used = used_heads(chosen)
-    links = LevelsAtPlaces(place[row], station, level[row, column])
     words = {head: sheet.words(head) for head in sheet.heads if head not in used}
     names = [column.head or "" for column in chosen.get("station", ())]
     devices = list[str]()
-    power, notes, wide = chosen["rssi_db"][0], list[str](), level.shape[1] > 1
+    power, notes, wide = chosen["rssi_db"][0], list[str](), len(chosen["rssi_db"]) > 1
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     power_text = f"{power.head}{times}"
     if words and len(links) < LEAST_ROWS:
@@ -71,19 +65,3 @@ def say_effects(sheet: Sheet, chosen: Chosen, arrays: Mapping[str, np.ndarray]) 
             how = "a file for each value takes them apart" if wide else how
         notes.append(Caution(f"{said}: {what}? {how}"))
     return notes
-
-
-def _places(arrays: Mapping[str, np.ndarray], rows: int) -> np.ndarray | None:
-    """Places (S, d) [m] of what moves; None where nothing does."""
-    if "latitude" in arrays:
-        degrees = arrays["latitude"], arrays["longitude"]
-        parts = [Georeference.from_coordinates(*degrees).from_degrees(*degrees)]
-    else:
-        parts = [a for name, a in arrays.items() if name in ("rx_position", "tx_position") and a.ndim == 2]
-    parts += [
-        arrays[f"{end}_height"][:, None]
-        for end in ("rx", "tx")
-        if np.ndim(arrays.get(f"{end}_height", 0)) == 1
-    ]
-    place = np.column_stack(parts) if parts else np.zeros((0, 1))
-    return place if len(place) == rows and np.isfinite(place).all() and np.ptp(place, axis=0).any() else None

@@ -1,7 +1,5 @@
 """Warnings about readable measurements: each is given where it should be, and nowhere else."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from releases import real
@@ -110,14 +108,15 @@ def test_whole_decibels_are_sound():
     assert plausibility.level_warnings(np.array([np.nan, np.nan])) == []
 
 
-def test_repeated_measurements():
-    place, level = room(count=20)
-    place[9], level[9] = place[8], level[8] + 2  # measured again
-    place[11] = place[10]  # of another station
-    level[11] = level[10]
-    links = replace(as_links(place, level[:, None], ["a"]), station=np.arange(20) // 11 % 2)
-    found = plausibility.repeat_warnings(links)
-    assert len(found) == 1 and "1 places were measured more than once" in found[0] and "1.4 dB" in found[0]
+def test_a_fix_that_stands_still_while_levels_change_is_named():
+    place, level, _ = walk(0)
+    there = place.copy()
+    there[60:180] = place[60]
+    (found,) = plausibility.still_warnings(as_links(there, level[:, None], ["a"]))
+    assert "row 60 to row 179: one place for 120 rows, while levels change by" in found
+    waits = np.random.default_rng(0).normal(-70, 6, len(place))  # who waits there hears fading, no way
+    assert not plausibility.still_warnings(as_links(there, waits[:, None], ["a"]))
+    assert not plausibility.still_warnings(as_links(place, level[:, None], ["a"]))
 
 
 def test_a_wild_row_is_named():

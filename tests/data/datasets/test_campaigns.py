@@ -163,7 +163,7 @@ SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
 WALKS = {  # what is replaced in the walk (None: all of it), the table of stations, and what is said
     "empty": (None, TABLE, "single_tx.csv: empty; expected a line of heads"),
     "no latitude": (("tx_x_coord", "east"), TABLE, "line 1: no column tx_x_coord; "),
-    "swapped degrees": (SWAPPED, TABLE, "latitude is outside -90 to 90 degrees; are latitude and longitude swapped?"),
+    "swapped degrees": (SWAPPED, TABLE, " is outside -90 to 90 degrees; are latitude and longitude swapped?"),
     "a word": ((":01,-101,-1,-1,-", ":01,-101,-1,-1,loud-"), TABLE, "column 'ebc-nuc1-b210', line 3: 'loud-"),
     "no degrees": ((f",{powder_arrays()['longitude'][-1]!s}\n", ",nan\n"), TABLE, "column 'tx_y_coord', line 21: no value"),
     "two transmitters": (("tx_x_coord,tx_y", "tx1_x_coord,tx2_x"), TABLE, "line 1: no column tx_x_coord and tx_y_coord"),

@@ -231,11 +231,17 @@ def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers()
     np.testing.assert_allclose(level_db[data.censored > 0], np.array(expected)[data.censored > 0], atol=1e-3)
 
 
-def test_powers_of_zero_raise_a_warning():
-    """They are learned as -300 dB, which nobody said."""
+def test_powers_of_zero_were_learned_as_300_dB_below():
+    """Nobody said that; now they are not heard, below the weakest that was."""
     powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
-    data = read({**town(rssi_db=None), "rssi": powers}).data
-    assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in unit_warnings(data)[0]
+    found = read({**town(rssi_db=None), "rssi": powers})
+    assert (found.data.censored == 1).sum() == (powers == 0).sum() > 0
+    assert f"{(powers == 0).sum()} of {powers.size} powers were not heard: below" in " ".join(found.notes)
+    bounds = 10 * np.log10(
+        found.data.target[found.data.censored == 1].astype(float) * found.data.site.target_scale
+    )
+    np.testing.assert_allclose(bounds, LEVELS[LEVELS >= -80].min(), atol=1e-3)
+    assert not unit_warnings(found.data)
 
 
 def test_nothing_heard_in_any_row_was_zero_everywhere(refused):
