@@ -84,12 +84,12 @@ def fit_level_field(
                 factor = _factor(distance, length, nugget)
                 both = np.column_stack([np.ones(len(part)), table[part]])
                 white = factor.whiten(torch.from_numpy(both)).numpy()
-                weight = float(white[:, 0] @ white[:, 0])
-                mean = white[:, 0] @ white[:, 1:] / weight
+                known = float(white[:, 0] @ white[:, 0])
+                mean = white[:, 0] @ white[:, 1:] / known
                 own = white[:, 1:] - np.outer(white[:, 0], mean)
                 gram += own.T @ own
                 logarithms += 2 * float(factor.lower.diagonal().log().sum())
-                means.append((weight, *mean))
+                means.append((known, *mean))
             slope = np.linalg.pinv(gram[1:, 1:]) @ gram[1:, 0]
             rest = float(gram[0, 0] - slope @ gram[1:, 0])
             weight, constant = np.array(means)[:, 0], np.array(means)[:, 1:] @ np.r_[1.0, -slope]

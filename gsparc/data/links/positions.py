@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.checks.outliers import FEW, TOO_DISTANT_M, too_far
+from gsparc.data.checks.outliers import FEW
 from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.errors import Caution, Severe, list_first, name_row_ranges
 from gsparc.data.links.georeference import ON_EARTH, Georeference, find_invalid_coordinate
@@ -43,7 +43,8 @@ def _without_fix(check: Checker, measured: str) -> None:
         if len(pair) < 1 + degrees:  # refused where degrees are read
             continue
         place = np.column_stack(pair)[:, :2].astype(np.float64)
-        null, off = (place == 0).all(axis=1), _impossible(place, degrees)
+        null, earth = (place == 0).all(axis=1), np.array(ON_EARTH)
+        off = degrees & ((place < earth[:, 0]) | (place > earth[:, 1])).any(axis=1)
         known = place[~(null | off)]
         if not len(known):
             continue
@@ -62,16 +63,6 @@ def _without_fix(check: Checker, measured: str) -> None:
         if lost and not keep.all():
             check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(keep), rows))
             arrays = check.raw.arrays
-
-
-def _impossible(place: np.ndarray, degrees: bool) -> np.ndarray:
-    """Which places (n, 2) are not on Earth, or, few in metres, far beyond all others, (n,) bool."""
-    if degrees:
-        return ((place < np.array(ON_EARTH)[:, 0]) | (place > np.array(ON_EARTH)[:, 1])).any(axis=1)
-    sane, off = np.flatnonzero(np.abs(place).max(axis=1) < np.inf), np.zeros(len(place), bool)
-    far = np.linalg.norm(place[sane] - np.median(place[sane], axis=0), axis=1) > TOO_DISTANT_M
-    off[sane] = too_far(place[sane]) & far
-    return off
 
 
 def _unknown_at_zero(check: Checker, degrees: bool) -> None:
