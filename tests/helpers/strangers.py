@@ -63,8 +63,6 @@ CASES = {
         "line 6: no such place on Earth", "refused"),
     "a mark for no fix": (table("lat,lon,rssi", *np.where(NINTH, [[91], [181]], [NORTH, EAST]), LEVELS[:, 0]),
         {}, "no such place on Earth", "refused"),
-    "metres far away": (table("x,y,rssi", np.where(FIFTH, 4e6, PLACES[:, 0]), PLACES[:, 1], LEVELS[:, 0]), {},
-        "line 6: no such place on Earth", "refused"),
     "a fix that stands still": (table("x,y,rssi", *STUCK.T, ALONG), {},
         "line 63 to line 181: one place for 119 rows, while levels", ""),
     "minutes": (table("lat,lon,rssi", *MINUTES, LEVELS[:, 0]), {}, "north of 48.20", "refused"),
