@@ -23,7 +23,7 @@ from gsparc.evaluation.experiment.cells import Contender, plan_cells, plugin_con
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.pictures import draw_efforts, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
-from gsparc.evaluation.experiment.run_cells import CellResult, PreparedCell, prepare_cell, run_cells
+from gsparc.evaluation.experiment.run_cells import PreparedCell, prepare_cell, run_cells
 from gsparc.evaluation.experiment.table import (
     CELL,
     average_cells,
@@ -32,7 +32,6 @@ from gsparc.evaluation.experiment.table import (
     remarks,
     split_by_problem,
     table_of,
-    table_of_cells,
     title_of,
 )
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
@@ -65,7 +64,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
     with locked(cells_dir, "cells"):
         filled = run_cells(prepared, train_cell, bool(settings["train"]), limit_s)
-    if not filled:
+    if filled.empty:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
     timed = time_by_dataset(filled, by_name) if settings["latency"] else None
@@ -84,7 +83,7 @@ def train_cell(one: PreparedCell, interrupted: str | None) -> None:
 
 
 def write_comparison(
-    filled: Sequence[CellResult], timed: pd.DataFrame | None, ours: str, run_dir: Path,
+    filled: pd.DataFrame, timed: pd.DataFrame | None, ours: str, run_dir: Path,
     figures: Sequence[str] = (),
 ) -> pd.DataFrame:  # fmt: skip
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
@@ -98,7 +97,7 @@ def write_comparison(
     by_draw = rows[rows.draws]
     by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
     write_samples(run_dir / "compare.csv", columns_of_csv(rows))
-    write_samples(run_dir / "cells.csv", table_of_cells(filled)[CELL].to_dict("list"))
+    write_samples(run_dir / "cells.csv", filled[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
     for here in by_set:
         draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)

@@ -59,16 +59,6 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     write_whole(path, text + "\n")
 
 
-def read_summary(path: str | Path) -> dict[str, Any] | None:
-    """Return the facts of a summary; None where there is none, or no whole one."""
-    try:
-        facts = json.loads(Path(path).read_text(encoding="utf-8"))
-    # ValueError: no JSON, as of a file that was cut off.
-    except (OSError, ValueError):
-        return None
-    return facts if isinstance(facts, dict) else None
-
-
 def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
     """Write equally long columns as CSV, atomically; NaN becomes an empty cell.
 

@@ -26,7 +26,7 @@ from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.instantiate import iterate_targets
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.summary import read_summary
+from gsparc.evaluation.results import read_summary
 from gsparc.models.fitting import LAST, dotted_settings
 
 log = logging.getLogger(__name__)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from gsparc.evaluation.experiment.problem import Problem
-from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction.timing import (
@@ -36,13 +36,9 @@ SPEED = ["query_ms", "query_p95_ms", "to_copy"]  # the last in units of a 16 MiB
 TIMED = ["dataset", "split", "method", *SPEED]
 
 
-def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, dict[str, float]]:
-    """Return `SPEED` and the number of `rounds` by method, of the first of its checkpoints."""
-    methods: dict[str, Method] = {}
-    for one in filled:
-        if one.cell.method not in methods:
-            # The first of a method's cells stands for all of its efforts and seeds.
-            methods[one.cell.method] = loading.load(one.checkpoint)[0]
+def time_queries(files: Mapping[str, Path], problem: Problem) -> dict[str, dict[str, float]]:
+    """Return `SPEED` and the number of `rounds` of models by name."""
+    methods: dict[str, Method] = {name: loading.load(file)[0] for name, file in files.items()}
     calls = query_calls(methods, problem.data, problem.folds.folds[0].test)
     found: dict[str, dict[str, float]] = {}
 
@@ -62,23 +58,20 @@ def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, di
     return {name: found[name] for name in methods}
 
 
-def time_by_dataset(
-    filled: Sequence[CellResult], problems: Mapping[tuple[str, str], Problem]
-) -> pd.DataFrame:
+def time_by_dataset(filled: pd.DataFrame, problems: Mapping[tuple[str, str], Problem]) -> pd.DataFrame:
     """Return columns `TIMED`, of the first split of each dataset that is there and keeps its models.
 
-    Of that alone: models of fewer measurements answer faster.
+    Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_cells`.
     """
     rows = []
-    for dataset in dict.fromkeys(one.cell.dataset for one in filled):
-        here = [one for one in filled if one.cell.dataset == dataset]
-        split = here[0].cell.split
-        present = [one for one in here if one.cell.split == split and one.checkpoint.exists()]
-        if present:
+    for dataset, here in filled.groupby("dataset", sort=False):
+        split = str(here.split.iloc[0])
+        # The first of a method's cells stands for all of its efforts and seeds.
+        own = here[(here.split == split) & here.run.map(lambda run: bool(run.checkpoints))]
+        files = own.drop_duplicates("method").set_index("method").run.map(lambda run: run.checkpoints[0])
+        if len(files):
             log.info("%s: timing single queries of every method in turns", dataset)
-            where, found = (
-                {"dataset": dataset, "split": split},
-                time_queries(present, problems[dataset, split]),
-            )
+            found = time_queries(files.to_dict(), problems[str(dataset), split])
+            where = {"dataset": dataset, "split": split}
             rows += [{**where, "method": name, **one} for name, one in found.items()]
     return pd.DataFrame(rows, columns=TIMED)

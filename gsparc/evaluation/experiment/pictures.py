@@ -22,7 +22,7 @@ PANEL = 2.4  # inches
 def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()) -> None:
     """Save accuracy against costs, see `save`: a line joins the efforts; `ours` has a large mark.
 
-    `rows` are as of `table_of_cells`.
+    `rows` are as of `average_cells`.
     """
     groups = [here for _, here in rows.groupby("dataset", sort=False)]
     columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
@@ -61,7 +61,7 @@ LINE = 0.34  # height of a method [inch]
 
 
 def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> None:
-    """Save a panel per split: mean and standard error over draws, of `table_of_cells` of one dataset."""
+    """Save a panel per split: mean and standard error over draws, of `average_cells` of one dataset."""
     splits, names = list(rows.split.unique()), list(methods_by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):

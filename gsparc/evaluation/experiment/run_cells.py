@@ -6,12 +6,12 @@ import logging
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import pandas as pd
 from omegaconf import DictConfig
 
 from gsparc.data.executor import run_each
@@ -21,47 +21,11 @@ from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.done import State, read_finished, run_once
 from gsparc.evaluation.experiment.problem import Problem, compose
 from gsparc.evaluation.metric_formats import number_format
-from gsparc.evaluation.report.runs import read_columns
-from gsparc.evaluation.results import result_rows
-from gsparc.models.checkpoint import MODEL
+from gsparc.evaluation.results import as_frame, read_run
 
 log = logging.getLogger(__name__)
 
 FREE_S, EFFORT_S = 5.0, 60.0  # guessed for a method that counts nothing; for one of effort 1
-
-
-@dataclass(frozen=True)
-class CellResult:
-    """A cell with its result.
-
-    Attributes:
-        cell: which.
-        folder: of its run.
-        facts: of its summary: `test/*`, `time/*`, `model/*`, `dataset/*`, `machine/*`.
-        drawn: whether its seed is a draw of the split.
-        earlier: commit of another program that it was measured with; "" for this one's.
-    """
-
-    cell: Cell
-    folder: Path
-    facts: dict[str, Any]
-    drawn: bool = False
-    earlier: str = ""
-
-    @property
-    def row(self) -> dict[str, Any]:
-        """Return the row of the table of results, its seed None where the method has none."""
-        return {**result_rows(self.facts)[0], "seed": self.cell.seed, "run": self}
-
-    @cached_property
-    def samples(self) -> dict[str, np.ndarray]:
-        """Return `per_sample.csv` by column."""
-        return read_columns(self.folder / "per_sample.csv")
-
-    @property
-    def checkpoint(self) -> Path:
-        """Return the file of the first fold's model."""
-        return next((file for file in self.folder.glob(f"fold0/{MODEL}")), self.folder / MODEL)
 
 
 @dataclass(frozen=True)
@@ -90,16 +54,18 @@ class PreparedCell:
         fit_s = FREE_S if self.cell.effort is None else EFFORT_S * self.cell.effort
         return len(self.problem.folds.folds) * (fit_s + 2.0)
 
-    def result(self) -> CellResult | None:
-        """Return the result, if it is done."""
-        facts = read_finished(self.folder, self.state, self.reuse)
-        return None if facts is None else self.filled(facts)
-
-    def filled(self, facts: dict[str, Any]) -> CellResult:
-        """Return the cell with these facts."""
+    def row(self) -> dict[str, Any]:
+        """Return the row of its result in the frame, by the names that it has in the comparison."""
+        run = read_run(self.folder)
         # The program's hash, not the commit, decides: most commits change nothing that a method computes.
-        earlier = "" if facts.get("program") == self.state.program else str(facts.get("git"))[:8]
-        return CellResult(self.cell, self.folder, facts, self.problem.draw is not None, earlier)
+        same = run.facts.get("program") == self.state.program
+        earlier = "" if same else str(run.facts.get("git"))[:8]
+        return {
+            **run.rows()[0],
+            **asdict(self.cell),
+            "draws": self.problem.draw is not None,
+            "earlier": earlier,
+        }
 
 
 def prepare_cell(
@@ -113,13 +79,14 @@ def prepare_cell(
     return PreparedCell(cell, problem, config, cells_dir / str(cell), state, reuse)
 
 
-Run = Callable[[PreparedCell, str | None], object]
+Fit = Callable[[PreparedCell, str | None], object]
 
 
-def _tried(run: Run, one: PreparedCell) -> CellResult | str:
-    """The cell, or why it cannot be filled; one failing cell does not stop the table."""
+def _tried(fit: Fit, one: PreparedCell) -> str:
+    """Why the cell cannot be filled, if so; one failing cell does not stop the table."""
     try:
-        return one.filled(run_once(one.folder, one.state, partial(run, one), reuse=one.reuse))
+        run_once(one.folder, one.state, partial(fit, one), reuse=one.reuse)
+        return ""
     except Exception as error:  # any error of a plugin
         if is_out_of_space(error):  # the others would be trained in vain
             raise
@@ -128,20 +95,23 @@ def _tried(run: Run, one: PreparedCell) -> CellResult | str:
 
 
 def run_cells(
-    prepared: Sequence[PreparedCell], run: Run, train: bool = True, limit_s: float | None = None
-) -> list[CellResult]:
-    """Find or fill cells, saying how far it is and how long it will take.
+    prepared: Sequence[PreparedCell], fit: Fit, train: bool = True, limit_s: float | None = None
+) -> pd.DataFrame:
+    """Return the frame of cells, found or filled now, saying how far it is and how long it will take.
 
     A cell that cannot be filled is said and left out; the others go on.
 
     Args:
         prepared: the most wanted first.
-        run: trains a cell into its folder, from what an interrupted try has left there.
+        fit: trains a cell into its folder, from what an interrupted try has left there.
         train: whether missing cells are filled.
         limit_s: no cell is started that would end later [s].
+
+    Returns:
+        Columns of `results.frame`, those of `Cell`, `draws` (whether its seed is a draw of the split) and
+        `earlier` (commit of another program that it was measured with; "" for this one's).
     """
-    there = [one.result() for one in prepared]
-    found = {str(one.cell): one for one in there if one is not None}
+    found = {str(one.cell): one.row() for one in prepared if read_finished(one.folder, one.state, one.reuse)}
     missing = [one for one in prepared if str(one.cell) not in found]
     log.info("%d cells, %d already done", len(prepared), len(found))
     # monotonic: setting the machine's clock ends no comparison.
@@ -154,17 +124,17 @@ def run_cells(
         return not late
 
     here = missing if train else []
-    work = partial(_tried, run)
+    work = partial(_tried, fit)
     try:
-        for number, result in run_each(work, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
-            if isinstance(result, str):
-                log.warning("%s failed: %s", here[number].cell, result)
+        for number, why in run_each(work, here, "cells", cost=lambda one: one.expected_s, wanted=fits):
+            cell = here[number].cell
+            if why:
+                log.warning("%s failed: %s", cell, why)
                 continue
-            found[str(result.cell)] = result
-            row = result.row
+            found[str(cell)] = row = here[number].row()
             value = format(row["value"], number_format(row["figure"]))
-            log.info("%s: %s %s after %.1f s", result.cell, row["figure"], value, row["train_s"])
+            log.info("%s: %s %s after %.1f s", cell, row["figure"], value, row["train_s"])
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"
         raise KeyboardInterrupt(message) from None
-    return [found[str(one.cell)] for one in prepared if str(one.cell) in found]
+    return as_frame(found[str(one.cell)] for one in prepared if str(one.cell) in found)

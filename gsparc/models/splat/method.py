@@ -320,7 +320,7 @@ class LearnedField(Method):
         return module
 
     def _extra(self, stage: Stage, watch: Stopwatch, origin: Origin) -> dict[str, Any]:
-        """What `_begin` reads of a run that is interrupted in a stage."""
+        """What `_begin_fit` reads of a run that is interrupted in a stage."""
         return {
             "stage": stage.name, "earlier_s": self._earlier_s, "spent_s": watch.seconds,
             "ended": [*self._ended], "paying": self._paying, "init_s": self.init_s,

@@ -15,7 +15,7 @@ from gsparc.commands.shared import run_lock
 from gsparc.commands.shared.run_lock import HOLDER, LOCK, RunLock, hold_folder, locked, release_folders
 from gsparc.commands.train import LEFT, train
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.report.runs import read_run
+from gsparc.evaluation.results import read_run
 from gsparc.models import checkpoint
 
 HOLDS = (
