@@ -17,10 +17,10 @@ from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.done import State, measurements_hash
 from gsparc.evaluation.experiment.folds import fit_context
 from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.study import Condition, Study
+from gsparc.evaluation.ledger import State, measurements_hash
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.method import MethodFactory

@@ -37,9 +37,9 @@ from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.done import State, measurements_hash, program_hash, read_finished, recorded
 from gsparc.evaluation.experiment.folds import FoldFits, fit_context, fit_folds, fold_contexts
 from gsparc.evaluation.found_plan import draw_found
+from gsparc.evaluation.ledger import State, measurements_hash, read_finished, run_once
 from gsparc.evaluation.metric_formats import main_figure, score_of
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.scores import rows_to_score
@@ -166,7 +166,6 @@ def train(
 
             facts = {**evaluation.facts, **summary.provenance(), **_of_fits(fits)}
             facts |= {"run_id": run_id, "seed": int(config.seed), "options/unused": unused}
-            facts["program"] = program_hash(to_dict(config))
             files = tuple(context.run_dir / checkpoint.MODEL for context in contexts)
             objects = TrainedRun(fits.methods, files, data, split, evaluation)
             _end_curves(contexts, fits.train_s, evaluation, config.eval_on)
@@ -337,6 +336,20 @@ def _draw(
         tracking.log_picture(loggers, "found", run_dir / "found.png")
 
 
+def _train_and_show(config: DictConfig, run_dir: Path, read: RunInputs, left: str | None) -> None:
+    """Train, from what an interrupted try has `left`, and show the table."""
+    config.ckpt_path = config.ckpt_path or left
+    facts, objects = train(config, run_dir, read)
+    made = f"{objects.data.site.name}, split {objects.split.title}"
+    drawn = config.split.get("seed") is not None and not objects.split.of_release
+    draw = f" (split.seed={config.split.seed})" if drawn else ""
+    title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
+    table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
+    tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
+    worst = worst_stations(objects.evaluation.stations, facts["model/label"])
+    show_result(run_dir, *[table, *worst] * tested, lines=summary.remarks(facts, config.eval_on))
+
+
 def task(config: DictConfig) -> float:
     """Train as configured and show the table; a job of a multirun that is done is not done again.
 
@@ -349,26 +362,16 @@ def task(config: DictConfig) -> float:
         words = " ".join(hydra.overrides.task)
         log.info("going on with the settings of the interrupted run: %s", words)
     with locked(run_dir / ".job"):  # the run's own is its training's
-        unread = State.unread(config) if job else None
+        unread = State.from_config(config) if job else None  # of a job that is done no data are read
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
         if facts is None:
             read = read_inputs(config)
-            state = State.from_config(config, measurements_hash(read.module.measurements), read.split.sha256)
-            facts = read_finished(run_dir, state, config.reuse) if job else None
-        if facts is not None:
-            log.info("%s: was done before", run_dir)
+            what = {"data": measurements_hash(read.module.measurements), "split": read.split.sha256}
+            state = replace(unread, **what) if unread else State.from_config(config, **what)
+            work = partial(_train_and_show, config, run_dir, read)
+            facts = run_once(run_dir, state, work, reuse=config.reuse, again=not job)
         else:
-            with recorded(run_dir, state, unread) as left:
-                config.ckpt_path = config.ckpt_path or left
-                facts, objects = train(config, run_dir, read)
-                made = f"{objects.data.site.name}, split {objects.split.title}"
-                drawn = config.split.get("seed") is not None and not objects.split.of_release
-                draw = f" (split.seed={config.split.seed})" if drawn else ""
-                title = f"{made}{draw}, {config.eval_on}, seed {config.seed}"
-                table = summary.results_table(facts, facts["model/label"], title, config.eval_on)
-                tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
-                worst = worst_stations(objects.evaluation.stations, facts["model/label"])
-                show_result(run_dir, *[table, *worst] * tested, lines=summary.remarks(facts, config.eval_on))
+            log.info("%s: already done", run_dir)
     figure = main_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
     if value is not None:

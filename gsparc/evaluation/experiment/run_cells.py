@@ -18,8 +18,8 @@ from gsparc.data.executor import run_each
 from gsparc.data.files import is_out_of_space
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment.cells import Cell, Contender
-from gsparc.evaluation.experiment.done import State, read_finished, run_once
 from gsparc.evaluation.experiment.problem import Problem, compose
+from gsparc.evaluation.ledger import State, is_current, read_finished, run_once
 from gsparc.evaluation.metric_formats import number_format
 from gsparc.evaluation.results import as_frame, read_run
 
@@ -57,9 +57,8 @@ class PreparedCell:
     def row(self) -> dict[str, Any]:
         """Return the row of its result in the frame, by the names that it has in the comparison."""
         run = read_run(self.folder)
-        # The program's hash, not the commit, decides: most commits change nothing that a method computes.
-        same = run.facts.get("program") == self.state.program
-        earlier = "" if same else str(run.facts.get("git"))[:8]
+        # The program, not the commit, decides: most commits change nothing that a method computes.
+        earlier = "" if is_current(self.folder) else str(run.facts.get("git"))[:8]
         return {
             **run.rows()[0],
             **asdict(self.cell),

@@ -16,8 +16,8 @@ from gsparc.data.executor import run_all
 from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.done import State, run_once
 from gsparc.evaluation.experiment.folds import FoldFits, fit_folds, fold_contexts
+from gsparc.evaluation.ledger import State, run_once
 from gsparc.evaluation.metric_formats import deciding_figure
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import provenance, write_summary

@@ -17,8 +17,8 @@ from rich.console import Console
 from gsparc.data.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
-from gsparc.evaluation.experiment.done import FAILURE
 from gsparc.evaluation.experiment.options import REDRAW
+from gsparc.evaluation.ledger import FAILURE
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -173,8 +173,8 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
         for against, lead in leads.items():
             if lead is not None:
                 verdict = "same" if lead.same else "yes" if lead.sure else "no"
-                ahead = Interval(-lead.ahead_db, error=lead.error_db)
-                lines.append([setting, against, ahead, lead.pairs, verdict])
+                gain = Interval(-lead.ahead_db, error=lead.error_db)
+                lines.append([setting, against, gain, lead.pairs, verdict])
     ahead = Column("ahead of it, dB", ".2f")
     columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("told apart", "")]
     figure = heading_of(own.figure.iloc[0])

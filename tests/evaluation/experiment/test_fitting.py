@@ -1,6 +1,7 @@
 """Cells of a comparison: what names one, what is found again, what is not."""
 
 import errno
+import json
 
 import pytest
 from hydra import initialize_config_module
@@ -9,6 +10,7 @@ from gsparc.evaluation.experiment.cells import Cell, Contender
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.problem import Problem, _may_match
 from gsparc.evaluation.experiment.run_cells import prepare_cell, run_cells
+from gsparc.evaluation.ledger import run_once
 from gsparc.evaluation.results import Run, as_frame
 from gsparc.evaluation.summary import write_summary
 from gsparc.models.checkpoint import CheckpointError
@@ -56,9 +58,14 @@ def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
     """Published results outlive the program they were measured with: a table says so."""
     one = prepared(problem, tmp_path, "mean")
     assert one.folder == tmp_path / "own" / "random" / "mean" / "0.5" / "0"
-    for program, earlier in ((one.state.program, ""), ("q", "01234567")):
-        write_summary(one.folder / "summary.json", {"program": program, "git": "0123456789"})
-        assert one.row()["earlier"] == earlier
+    run_once(
+        one.folder, one.state, lambda left: write_summary(one.folder / "summary.json", {"git": "0123456789"})
+    )
+    assert one.row()["earlier"] == ""
+    record = json.loads((one.folder / "job.json").read_text())
+    record["program"]["gsparc.models"] = "another"
+    (one.folder / "job.json").write_text(json.dumps(record))
+    assert one.row()["earlier"] == "01234567"
 
 
 def test_a_full_disk_ends_a_comparison(problem, tmp_path):

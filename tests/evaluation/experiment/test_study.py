@@ -8,8 +8,8 @@ from invented import divide, invent
 
 from gsparc.data.query import Batch
 from gsparc.evaluation.experiment import study
-from gsparc.evaluation.experiment.done import State
 from gsparc.evaluation.experiment.study import DataChanges, Study
+from gsparc.evaluation.ledger import State
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.baselines.nearest import Nearest
@@ -17,7 +17,7 @@ from gsparc.prediction import timing
 from gsparc.prediction.timing import ClockSettings
 from gsparc.training.context import FitContext, FitReport
 
-STATE = State({}, {}, "", "", "")
+STATE = State({}, {}, "d", "s")
 CLOCK = ClockSettings(rounds=10, rounds_s=2)
 WATCH = WoundClock()
 

@@ -1,0 +1,265 @@
+"""The ledger of fits: one is done when its settings, data, split and program are those of its record."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+import os
+import re
+import sys
+import sysconfig
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from hashlib import file_digest, sha256
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.assemble import content_hash, identity_hash
+from gsparc.data.errors import DataError, list_first
+from gsparc.data.files import SUMMARY, set_aside, write_whole
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.results import read_summary
+from gsparc.models.fitting import LAST, dotted_settings
+
+log = logging.getLogger(__name__)
+
+RECORD = "job.json"  # in a fit's folder: its state and program, when it began, and whether it has ended
+FAILURE = "failure.txt"  # why it has failed
+WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether, a fit is done
+OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
+WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
+PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
+READS = "READS"  # of a module: patterns, from its folder, of the data files that it reads
+STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
+REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
+# After the head of a definition, or its last line: text after other colons is read by a program.
+HEAD = r"(?m:^)[ \t]*(?:async def|def|class|\))[^\n]*:\n\s+"
+DOCSTRING = re.compile(rf'({HEAD}|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
+ENVIRONMENT = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+
+
+@dataclass(frozen=True)
+class State:
+    """What a result depends on, but for the program.
+
+    Attributes:
+        settings: resolved, by dotted name, without those that say where data lie.
+        files: SHA-256 of the files that settings name, by these.
+        data: SHA-256 of the measurements, whatever files they were read from; "" before they are read.
+        split: SHA-256 of the folds.
+    """
+
+    settings: dict[str, Any]
+    files: dict[str, str]
+    data: str = ""
+    split: str = ""
+
+    @classmethod
+    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
+        """Return the state of a resolved configuration, of hashes of measurements and of their split."""
+        kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
+        whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
+        named = dict(dotted_settings(whole))
+        files = {n: value for n, value in named.items() if isinstance(value, str) and os.path.exists(value)}
+        if data:  # which files it was read from does not matter
+            files = {name: value for name, value in files.items() if name not in OF_DATA}
+        found = {name: _hash_of(Path(value)) for name, value in files.items() if os.path.isfile(value)}
+        if os.path.isdir(root := files.get("dataset.root", "")):
+            inside = (file for file in sorted(Path(root).rglob("*")) if file.is_file())
+            found["dataset.root"] = _joined({str(file.relative_to(root)): _hash_of(file) for file in inside})
+        settings = {name: value for name, value in named.items() if name not in OF_DATA}
+        return cls(json.loads(json.dumps(settings, default=str)), found, data, split)
+
+    @property
+    def tells_data(self) -> bool:
+        """Whether what is read is known: its content, or the bytes of all files that it is read from."""
+        alone = self.settings.get("dataset._target_") == WHOLE and "dataset.file" in self.files
+        return bool(self.data) or alone or "dataset.root" in self.files
+
+    def changes(self, record: Mapping[str, Any], reuse: bool = False) -> list[str]:
+        """Return in what a record is of another state: `settings.effort`, modules.
+
+        `reuse`: whatever the program was.
+        """
+        own, before = asdict(self), {name: record.get(name) or {} for name in asdict(self)}
+        if self.data:  # by what was read, not by bytes
+            before["files"] = {n: one for n, one in before["files"].items() if n not in OF_DATA}
+            own["files"] = {n: one for n, one in own["files"].items() if n not in OF_DATA}
+        else:
+            own |= {"data": before["data"], "split": before["split"]}
+        one, other = dict(dotted_settings(own)), dict(dotted_settings(before))
+        names = [name for name in other | one if one.get(name) != other.get(name)]
+        return names if reuse else names + edited(record.get("program") or {"program": ""})
+
+
+def measurements_hash(data: Measurements) -> str:
+    """Return the SHA-256 of all that a method can learn from, of every file that was read."""
+    arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
+    arrays |= {f"release {i}": rows for i, rows in enumerate(data.release_split or ())}
+    whole = (identity_hash(data), content_hash(arrays), data.provenance.get("scene"))
+    return sha256(repr(whole).encode()).hexdigest()
+
+
+def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
+    """Return the summary of a fit that is done; None where it is not.
+
+    Args:
+        folder: of the fit.
+        state: of what is asked for; before data are read it answers where it `tells_data`.
+        reuse: whether a result of another program counts, too; its `git` says of which.
+    """
+    record = read_summary(folder / RECORD)
+    if record is None or not record.get("ended") or not state.tells_data or state.changes(record, reuse):
+        return None
+    return read_summary(folder / SUMMARY)
+
+
+def run_once(
+    folder: Path, state: State, work: Callable[[str | None], object], *, reuse: bool = False,
+    again: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the summary of a fit, which is done now where it is not done.
+
+    Args:
+        folder: its own, held by the caller.
+        state: of the fit.
+        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
+            interrupted try has left, None to begin anew.
+        reuse: see `read_finished`.
+        again: one that is done is done anew.
+
+    Raises:
+        DataError: the work has left no summary.
+    """
+    facts = None if again else read_finished(folder, state, reuse)
+    if facts is not None:
+        log.info("%s: already done", folder)
+        return facts
+    with _recorded(folder, state) as left:
+        work(left)
+    facts = read_summary(folder / SUMMARY)
+    if facts is None:
+        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
+    return facts
+
+
+@contextmanager
+def _recorded(folder: Path, state: State) -> Iterator[str | None]:
+    """Record when a fit begins, what it imports, and that it has ended where nothing is raised."""
+    record, left = read_summary(folder / RECORD), None
+    changes = [] if record is None else state.changes(record)
+    if record is None or record.get("ended") or changes:
+        if changes:
+            log.info("%s: begun anew, as these changed: %s", folder, list_first(changes))
+        set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
+        record = {**asdict(state), "began": time.time(), "ended": False}
+    else:
+        left = _last_state(folder, record["began"])
+    (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
+
+    def write(ended: bool) -> None:
+        whole = {**record, "program": program(), "ended": ended}
+        write_whole(folder / RECORD, json.dumps(whole, indent=1))
+
+    write(False)
+    try:
+        yield left
+    except BaseException:
+        with suppress(OSError):  # such as a full disk, which the error itself names
+            write(False)  # with what was imported meanwhile
+        raise
+    write(True)
+
+
+def is_current(folder: Path) -> bool:
+    """Return whether the fit in a folder is of the program that runs now."""
+    record = read_summary(folder / RECORD) or {}
+    return not edited(record.get("program") or {"program": ""})
+
+
+def edited(before: Mapping[str, str]) -> list[str]:
+    """Return which of the files of a `program` are others now."""
+    return [name for name, content in before.items() if _content(name) != content]
+
+
+def program() -> dict[str, str]:
+    """Return the content of every file imported so far, by module, and of the data files that it `READS`.
+
+    Those of the environment's packages are left out: their versions stand in each summary. Of gsparc itself
+    all count, wherever it is installed. Changes of comments and docstrings alone change nothing.
+    """
+    found = {}
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if name in ("__main__", "__mp_main__") or not file or not os.path.isfile(file):
+            continue
+        if name.partition(".")[0] == "gsparc" or not os.path.abspath(file).startswith(ENVIRONMENT):
+            reads = [name, *(f"{name}:{pattern}" for pattern in getattr(module, READS, ()))]
+            found |= {one: _content(one) for one in reads}
+    return found | {"version": version("gsparc")}
+
+
+def _content(name: str) -> str:
+    """Of an entry of `program`; "" where it is gone."""
+    module, _, pattern = name.partition(":")
+    if module == "version":
+        return version("gsparc")
+    file = getattr(sys.modules.get(module), "__file__", None)
+    with suppress(ImportError, ValueError, AttributeError):  # of a parent that is gone
+        file = file or getattr(find_spec(module), "origin", None)
+    if file is None or not os.path.isfile(file):
+        return ""
+    if pattern:
+        return _joined({one.name: _hash_of(one) for one in sorted(Path(file).parent.glob(pattern))})
+    return _hash_of_program(file)
+
+
+@functools.cache  # of a process, which runs what it has read
+def _hash_of_program(file: str) -> str:
+    return _hash_of(Path(file))
+
+
+def strip_comments(text: str) -> str:
+    """Return Python without comments and empty lines, and with empty docstrings.
+
+    By strings and comments alone: parsing every file of gsparc would take seconds at the start of each run.
+
+    >>> strip_comments("mark = '#'  # of a comment")
+    "mark = '#'"
+    """
+    code = REMARK.sub(lambda one: one[1] or "", text)
+    return DOCSTRING.sub(lambda one: one[2] or f'{one[1]}""', code)
+
+
+def _joined(hashes: Mapping[str, str]) -> str:
+    return sha256(repr(hashes).encode()).hexdigest()
+
+
+def _hash_of(file: Path) -> str:
+    """The hash of a file, of Python of what it does."""
+    if file.suffix == ".py":
+        text = file.read_text(encoding="utf-8", errors="replace")
+        return sha256(strip_comments(text).encode()).hexdigest()
+    with open(file, "rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
+
+
+def _last_state(folder: Path, began: float) -> str | None:
+    """The last checkpoint of this fit, not of one of another state before, or the folder of one of many
+    parts; None: it begins anew."""
+
+    def own(path: Path) -> bool:
+        return path.exists() and path.stat().st_mtime >= began
+
+    for name in LAST:
+        if own(folder / name):
+            return str(folder / name)
+    return str(folder) if any(own(path) for pattern in PARTS for path in folder.glob(pattern)) else None
