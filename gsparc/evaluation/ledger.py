@@ -27,6 +27,7 @@ from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import read_summary
+from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import LAST, dotted_settings
 
 log = logging.getLogger(__name__)
@@ -36,6 +37,11 @@ FAILURE = "failure.txt"  # why it has failed
 WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether, a fit is done
 OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
+LEFT = (  # by a training: of another one, all of it would be read beside this one's
+    *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
+    *("test.png", "found.png"),
+    *(f"{fold}{name}" for fold in ("", "fold*/") for name in (MODEL, "learning_curve.csv")),
+)
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 READS = "READS"  # of a module: patterns, from its folder, of the data files that it reads
 STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
@@ -177,6 +183,14 @@ def _recorded(folder: Path, state: State) -> Iterator[str | None]:
             write(False)  # with what was imported meanwhile
         raise
     write(True)
+
+
+def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
+    """Move files of an earlier run aside, except those that a training resumes or starts from."""
+    taken = [Path(path).resolve() for path in begun_from if path]
+    goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
+    if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
+        log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
 
 
 def is_current(folder: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import platform
@@ -103,6 +104,7 @@ def new_run_id() -> str:
     return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
 
 
+@functools.cache  # of a process, which runs what it has read
 def provenance() -> dict[str, str | None]:
     """Return `git`: commit of the source tree (`-dirty` when edited, None outside one).
 

@@ -13,7 +13,7 @@ from campaigns import compose, spectra
 from omegaconf import OmegaConf
 
 import gsparc
-from gsparc.commands.train import read_inputs
+from gsparc.commands.shared.inputs import read_inputs
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.evaluation import ledger
@@ -108,7 +108,7 @@ def of(file, *words) -> State:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
     begun = read_inputs(config)
-    return State.from_config(config, measurements_hash(begun.module.measurements), begun.split.sha256)
+    return State.from_config(config, measurements_hash(begun.data), begun.split.sha256)
 
 
 def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
 from gsparc.evaluation.experiment.problem import Problem
 from gsparc.models import loading
 from gsparc.models.method import Method
@@ -36,10 +38,12 @@ SPEED = ["query_ms", "query_p95_ms", "to_copy"]  # the last in units of a 16 MiB
 TIMED = ["dataset", "split", "method", *SPEED]
 
 
-def time_queries(files: Mapping[str, Path], problem: Problem) -> dict[str, dict[str, float]]:
-    """Return `SPEED` and the number of `rounds` of models by name."""
+def time_queries(
+    files: Mapping[str, Path], data: Measurements, split: Split, fast: ClockSettings = FAST
+) -> dict[str, dict[str, float]]:
+    """Return `SPEED` and the number of `rounds` of models by name; slow ones have clocks of their own."""
     methods: dict[str, Method] = {name: loading.load(file)[0] for name, file in files.items()}
-    calls = query_calls(methods, problem.data, problem.folds.folds[0].test)
+    calls = query_calls(methods, data, split.folds[0].test)
     found: dict[str, dict[str, float]] = {}
 
     def timed(names: Iterable[str], clock: ClockSettings) -> None:
@@ -53,7 +57,7 @@ def time_queries(files: Mapping[str, Path], problem: Problem) -> dict[str, dict[
     timed(calls, ONCE)
     timed([name for name, one in found.items() if SLOW_MS < one["query_ms"] <= ENDLESS_MS], ONCE)
     speeds = {name: one["query_ms"] for name, one in found.items()}
-    timed([name for name, ms in speeds.items() if ms <= SLOW_MS], FAST)
+    timed([name for name, ms in speeds.items() if ms <= SLOW_MS], fast)
     timed([name for name, ms in speeds.items() if SLOW_MS < ms <= ENDLESS_MS], SLOW)
     return {name: found[name] for name in methods}
 
@@ -61,7 +65,7 @@ def time_queries(files: Mapping[str, Path], problem: Problem) -> dict[str, dict[
 def time_by_dataset(filled: pd.DataFrame, problems: Mapping[tuple[str, str], Problem]) -> pd.DataFrame:
     """Return columns `TIMED`, of the first split of each dataset that is there and keeps its models.
 
-    Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_cells`.
+    Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_jobs`.
     """
     rows = []
     for dataset, here in filled.groupby("dataset", sort=False):
@@ -71,7 +75,8 @@ def time_by_dataset(filled: pd.DataFrame, problems: Mapping[tuple[str, str], Pro
         files = own.drop_duplicates("method").set_index("method").run.map(lambda run: run.checkpoints[0])
         if len(files):
             log.info("%s: timing single queries of every method in turns", dataset)
-            found = time_queries(files.to_dict(), problems[str(dataset), split])
+            problem = problems[str(dataset), split]
+            found = time_queries(files.to_dict(), problem.data, problem.folds)
             where = {"dataset": dataset, "split": split}
             rows += [{**where, "method": name, **one} for name, one in found.items()]
     return pd.DataFrame(rows, columns=TIMED)

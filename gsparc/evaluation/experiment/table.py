@@ -68,7 +68,7 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     """Return the cells of a method of one effort, averaged over seeds or over draws of the split.
 
     Args:
-        filled: the frame of `run_cells`.
+        filled: the frame of `run_jobs`.
         timed: of `time_by_dataset`; None: nothing was timed.
 
     Returns:

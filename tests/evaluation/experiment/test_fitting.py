@@ -6,10 +6,10 @@ import json
 import pytest
 from hydra import initialize_config_module
 
-from gsparc.evaluation.experiment.cells import Cell, Contender
+from gsparc.evaluation.experiment.cells import Cell, Contender, job_of_cell
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.problem import Problem, _may_match
-from gsparc.evaluation.experiment.run_cells import prepare_cell, run_cells
+from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.ledger import run_once
 from gsparc.evaluation.results import Run, as_frame
 from gsparc.evaluation.summary import write_summary
@@ -32,7 +32,7 @@ def prepared(problem, folder, model="gsparc", effort=0.5, seed=0, settings=None,
     contender = Contender(model, (f"model={model}", *choose), True)
     cell = Cell("own", "random", model, effort, seed)
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        return prepare_cell(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
+        return job_of_cell(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_full_disk_ends_a_comparison(problem, tmp_path):
 
     cells = [prepared(problem, tmp_path, method) for method in ("mean", "gp")]
     with pytest.raises(CheckpointError, match="cannot be written"):
-        run_cells(cells, full)
+        run_jobs(cells, full)
     assert len(tried) == 1
 
 
