@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.drawing import PRINTED
+from gsparc.evaluation.experiment.latency import time_again
 from gsparc.evaluation.report.page import write_report
-from gsparc.evaluation.report.retime import time_again
 from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns
 from gsparc.evaluation.summary import write_summary
 

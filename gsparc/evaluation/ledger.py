@@ -10,8 +10,8 @@ import re
 import sys
 import sysconfig
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import file_digest, sha256
 from importlib.metadata import version
@@ -149,24 +149,13 @@ def run_once(
     if facts is not None:
         log.info("%s: already done", folder)
         return facts
-    with _recorded(folder, state) as left:
-        work(left)
-    facts = read_summary(folder / SUMMARY)
-    if facts is None:
-        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
-    return facts
-
-
-@contextmanager
-def _recorded(folder: Path, state: State) -> Iterator[str | None]:
-    """Record when a fit begins, what it imports, and that it has ended where nothing is raised."""
     record, left = read_summary(folder / RECORD), None
     changes = [] if record is None else state.changes(record)
     if record is None or record.get("ended") or changes:
         if changes:
             log.info("%s: begun anew, as these changed: %s", folder, list_first(changes))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
-        record = {**asdict(state), "began": time.time(), "ended": False}
+        record = {**asdict(state), "began": time.time()}
     else:
         left = _last_state(folder, record["began"])
     (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
@@ -177,12 +166,16 @@ def _recorded(folder: Path, state: State) -> Iterator[str | None]:
 
     write(False)
     try:
-        yield left
+        work(left)
     except BaseException:
         with suppress(OSError):  # such as a full disk, which the error itself names
             write(False)  # with what was imported meanwhile
         raise
     write(True)
+    facts = read_summary(folder / SUMMARY)
+    if facts is None:
+        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
+    return facts
 
 
 def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
@@ -210,7 +203,7 @@ def program() -> dict[str, str]:
     Those of the environment's packages are left out: their versions stand in each summary. Of gsparc itself
     all count, wherever it is installed. Changes of comments and docstrings alone change nothing.
     """
-    found = {}
+    found: dict[str, str] = {}
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if name in ("__main__", "__mp_main__") or not file or not os.path.isfile(file):

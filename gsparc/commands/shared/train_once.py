@@ -39,8 +39,9 @@ def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs]
             log.info("%s: already done", run_dir)
             return facts
         inputs = read_inputs(config)
-        what = {"data": measurements_hash(inputs.data), "split": inputs.split.sha256}
-        state = replace(unread, **what) if unread else State.from_config(config, **what)
+        data, split = measurements_hash(inputs.data), inputs.split.sha256
+        state = State.from_config(config, data, split)
+        state = replace(unread, data=data, split=split) if unread else state
         return run_once(run_dir, state, work, reuse=config.reuse, again=not job)
 
 

@@ -1,4 +1,4 @@
-"""Single-query latency of all methods of a problem, in turns, on one processor, after all training."""
+"""Latency of single queries: models asked in turns, with nothing beside them, after all training."""
 
 from __future__ import annotations
 
@@ -9,14 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.experiment.problem import Problem
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.results import frame_of_runs, own_rows, read_run
+from gsparc.evaluation.summary import write_samples
 from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction.timing import (
+    BLOCKS,
     COPY,
+    Call,
     ClockSettings,
     p50_p95,
     query_calls,
@@ -80,3 +86,36 @@ def time_by_dataset(filled: pd.DataFrame, problems: Mapping[tuple[str, str], Pro
             where = {"dataset": dataset, "split": split}
             rows += [{**where, "method": name, **one} for name, one in found.items()]
     return pd.DataFrame(rows, columns=TIMED)
+
+
+def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) -> pd.DataFrame:
+    """Return the frame with the times of single queries, which each run's `render_ms.csv` has from now on.
+
+    A sweep runs jobs at the same time, which disturbs their times; call this after it.
+
+    Args:
+        rows: those of runs without a readable checkpoint keep the times they have.
+        rounds: visits to each.
+        rounds_s: no new round after this [s].
+    """
+    runs, calls = list(own_rows(rows).run), dict[int, Call]()
+    for number, run in enumerate(runs):
+        try:
+            opened = open_files(run.checkpoints[:1])
+            # A folder used twice may hold the model of one run beside the summary of the other.
+            if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
+                raise ValueError("its checkpoint is of another run than its summary")
+            if not len(opened.split.folds[0].test):
+                log.warning("%s is not timed again: it has no test rows", run.folder)
+                continue
+        except (ValueError, IndexError) as error:
+            log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
+            continue
+        calls[number] = opened.predictor.cycle_places(opened.data.moving[opened.split.folds[0].test])
+    threads = {
+        number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
+    }
+    times = time_interleaved(calls, replace(BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
+    for number, ms in times.items():
+        write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
+    return frame_of_runs(read_run(run.folder) for run in runs)

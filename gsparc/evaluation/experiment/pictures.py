@@ -113,7 +113,7 @@ PANELS = (
 
 
 def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
-    """Save the rows of `average_rounds` as PNG; a dotted line is the variant's accuracy on undisturbed data."""
+    """Save the rows of `average_rounds` as PNG; a dotted line: the accuracy on undisturbed data."""
     changes = set(rows.what) - {"none"} or {"none"}  # costs alone where nothing was changed
     wanted = [panel for panel in PANELS if panel[0] in changes]
     figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))

@@ -75,9 +75,9 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
     and its table.
     """
+    from gsparc.evaluation.experiment.latency import time_again
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import write_report
-    from gsparc.evaluation.report.retime import time_again
     from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
     from gsparc.evaluation.results import STUDY, frame, own_rows, short_settings
 
