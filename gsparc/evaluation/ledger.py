@@ -10,9 +10,9 @@ import re
 import sys
 import sysconfig
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from hashlib import file_digest, sha256
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -61,12 +61,15 @@ class State:
         files: SHA-256 of the files that settings name, by these.
         data: SHA-256 of the measurements, whatever files they were read from; "" before they are read.
         split: SHA-256 of the folds.
+        unread: SHA-256 of the files that data and folds are read from; a state before they are read is known
+            by these.
     """
 
     settings: dict[str, Any]
     files: dict[str, str]
     data: str = ""
     split: str = ""
+    unread: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
@@ -74,36 +77,30 @@ class State:
         kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
-        files = {n: value for n, value in named.items() if isinstance(value, str) and os.path.exists(value)}
-        if data:  # which files it was read from does not matter
-            files = {name: value for name, value in files.items() if name not in OF_DATA}
-        found = {name: _hash_of(Path(value)) for name, value in files.items() if os.path.isfile(value)}
-        if os.path.isdir(root := files.get("dataset.root", "")):
-            inside = (file for file in sorted(Path(root).rglob("*")) if file.is_file())
-            found["dataset.root"] = _joined({str(file.relative_to(root)): _hash_of(file) for file in inside})
-        settings = {name: value for name, value in named.items() if name not in OF_DATA}
-        return cls(json.loads(json.dumps(settings, default=str)), found, data, split)
+        where = {name: named.pop(name) for name in OF_DATA if name in named}
+        files = {name: value for name, value in named.items() if isinstance(value, str)}
+        settings = json.loads(json.dumps(named, default=str))
+        return cls(settings, _hashes(files), data, split, {} if data else _hashes(where))
 
     @property
     def tells_data(self) -> bool:
         """Whether what is read is known: its content, or the bytes of all files that it is read from."""
-        alone = self.settings.get("dataset._target_") == WHOLE and "dataset.file" in self.files
-        return bool(self.data) or alone or "dataset.root" in self.files
+        alone = self.settings.get("dataset._target_") == WHOLE and "dataset.file" in self.unread
+        return bool(self.data) or alone or "dataset.root" in self.unread
 
     def changes(self, record: Mapping[str, Any], reuse: bool = False) -> list[str]:
         """Return in what a record is of another state: `settings.effort`, modules.
 
         `reuse`: whatever the program was.
         """
-        own, before = asdict(self), {name: record.get(name) or {} for name in asdict(self)}
-        if self.data:  # by what was read, not by bytes
-            before["files"] = {n: one for n, one in before["files"].items() if n not in OF_DATA}
-            own["files"] = {n: one for n, one in own["files"].items() if n not in OF_DATA}
-        else:
-            own |= {"data": before["data"], "split": before["split"]}
-        one, other = dict(dotted_settings(own)), dict(dotted_settings(before))
-        names = [name for name in other | one if one.get(name) != other.get(name)]
-        return names if reuse else names + edited(record.get("program") or {"program": ""})
+        names = ("settings", "files", *(("data", "split") if self.data else ("unread",)))
+        now, before = ({name: of.get(name) or {} for name in names} for of in (vars(self), record))
+        before["settings"] = {
+            n: v for n, v in before["settings"].items() if n not in OF_DATA
+        }  # older records
+        one, other = dict(dotted_settings(now)), dict(dotted_settings(before))
+        differing = [name for name in other | one if one.get(name) != other.get(name)]
+        return differing if reuse else differing + edited(record)
 
 
 def measurements_hash(data: Measurements) -> str:
@@ -186,14 +183,11 @@ def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
         log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
 
 
-def is_current(folder: Path) -> bool:
-    """Return whether the fit in a folder is of the program that runs now."""
-    record = read_summary(folder / RECORD) or {}
-    return not edited(record.get("program") or {"program": ""})
-
-
-def edited(before: Mapping[str, str]) -> list[str]:
-    """Return which of the files of a `program` are others now."""
+def edited(record: Mapping[str, Any]) -> list[str]:
+    """Return which of the files that a record's program imported are others now."""
+    before = record.get("program")
+    if not isinstance(before, Mapping):  # an older record has one hash of all
+        return ["program"]
     return [name for name, content in before.items() if _content(name) != content]
 
 
@@ -225,7 +219,7 @@ def _content(name: str) -> str:
     if file is None or not os.path.isfile(file):
         return ""
     if pattern:
-        return _joined({one.name: _hash_of(one) for one in sorted(Path(file).parent.glob(pattern))})
+        return _joined(Path(file).parent.glob(pattern), Path(file).parent)
     return _hash_of_program(file)
 
 
@@ -246,8 +240,17 @@ def strip_comments(text: str) -> str:
     return DOCSTRING.sub(lambda one: one[2] or f'{one[1]}""', code)
 
 
-def _joined(hashes: Mapping[str, str]) -> str:
+def _joined(files: Iterable[Path], root: Path) -> str:
+    hashes = {str(file.relative_to(root)): _hash_of(file) for file in sorted(files) if file.is_file()}
     return sha256(repr(hashes).encode()).hexdigest()
+
+
+def _hashes(paths: Mapping[str, Any]) -> dict[str, str]:
+    """Of those settings that name a file, or the folder of a dataset."""
+    found = {name: _hash_of(Path(path)) for name, path in paths.items() if path and os.path.isfile(path)}
+    if (root := paths.get("dataset.root")) and os.path.isdir(root):
+        found["dataset.root"] = _joined(Path(root).rglob("*"), Path(root))
+    return found
 
 
 def _hash_of(file: Path) -> str:

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import json
 import os
 import sys
 from dataclasses import replace
@@ -21,7 +22,6 @@ from gsparc.evaluation.ledger import (
     FAILURE,
     State,
     edited,
-    is_current,
     measurements_hash,
     program,
     read_finished,
@@ -210,7 +210,7 @@ def test_a_plugin_s_helper_or_weights_were_edited_and_it_counted_as_done(
     (plugin / file).write_text(text)
     ledger._hash_of_program.cache_clear()  # another process
     assert state().changes(read_summary(tmp_path / "job.json")) == counts
-    assert (read_finished(tmp_path, state()) is None) == bool(counts) != is_current(tmp_path)
+    assert (read_finished(tmp_path, state()) is None) == bool(counts)
     assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
     assert run_once(tmp_path, state(), ends(tmp_path, 2)) == {"value": 2 if counts else 1}
 
@@ -218,7 +218,7 @@ def test_a_plugin_s_helper_or_weights_were_edited_and_it_counted_as_done(
 def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path, plugin):
     run_once(tmp_path, state(), ends(tmp_path, 1))
     (plugin / "lone_other.py").write_text("VALUE = 2\n")  # that nobody imports
-    assert is_current(tmp_path) and read_finished(tmp_path, state()) == {"value": 1}
+    assert read_finished(tmp_path, state()) == {"value": 1}
 
 
 def test_cells_were_current_whose_method_s_own_files_had_changed():
@@ -229,7 +229,7 @@ def test_cells_were_current_whose_method_s_own_files_had_changed():
         importlib.import_module(f"gsparc.{name}")
     wanted = ("processes.kernel", "ops._native", "ops.cuda_library:csrc/**/*.cu")
     assert {f"gsparc.{name}" for name in wanted} <= {*program()}
-    assert edited(program()) == []
+    assert edited({"program": program()}) == []
 
 
 def test_a_method_that_was_imported_by_an_interrupted_job_counts(tmp_path, plugin):
@@ -250,6 +250,16 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
             State.from_config(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)}))
         )
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
+
+
+def test_records_of_an_older_program_are_reused_where_that_is_asked(tmp_path):
+    """They have one hash of all files, and settings that say where data lay."""
+    run_once(tmp_path, state(), ends(tmp_path, 1))
+    record = read_summary(tmp_path / "job.json")
+    record |= {"program": "0123456789ab", "settings": record["settings"] | {"dataset.file": "own.npz"}}
+    (tmp_path / "job.json").write_text(json.dumps(record))
+    assert read_finished(tmp_path, state()) is None and state().changes(record) == ["program"]
+    assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
 
 
 def test_a_job_that_begins_anew_says_why(tmp_path, caplog):

@@ -19,9 +19,9 @@ from gsparc.data.files import is_out_of_space
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.ledger import State, is_current, read_finished, run_once
+from gsparc.evaluation.ledger import RECORD, State, edited, read_finished, run_once
 from gsparc.evaluation.metric_formats import number_format
-from gsparc.evaluation.results import as_frame, read_run
+from gsparc.evaluation.results import as_frame, read_run, read_summary
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +66,8 @@ class Job:
         """Return the row of its result in the frame, by the names that it has in the list."""
         run = read_run(self.folder)
         # The program, not the commit, decides: most commits change nothing that a method computes.
-        earlier = "" if is_current(self.folder) else str(run.facts.get("git"))[:8]
+        changed = edited(read_summary(self.folder / RECORD) or {})
+        earlier = str(run.facts.get("git"))[:8] if changed else ""
         return {**run.rows()[0], **asdict(self.name), "earlier": earlier}
 
 
