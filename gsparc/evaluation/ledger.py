@@ -197,15 +197,20 @@ def program() -> dict[str, str]:
     Those of the environment's packages are left out: their versions stand in each summary. Of gsparc itself
     all count, wherever it is installed. Changes of comments and docstrings alone change nothing.
     """
-    found: dict[str, str] = {}
+    found = {"version": version("gsparc")}
     for name, module in list(sys.modules.items()):
-        file = getattr(module, "__file__", None)
-        if name in ("__main__", "__mp_main__") or not file or not os.path.isfile(file):
-            continue
-        if name.partition(".")[0] == "gsparc" or not os.path.abspath(file).startswith(ENVIRONMENT):
+        if _counts(name, getattr(module, "__file__", None)):
             reads = [name, *(f"{name}:{pattern}" for pattern in getattr(module, READS, ()))]
             found |= {one: _content(one) for one in reads}
-    return found | {"version": version("gsparc")}
+    return found
+
+
+@functools.cache
+def _counts(name: str, file: str | None) -> bool:
+    """Whether a module is of the program."""
+    if name in ("__main__", "__mp_main__") or not file or not os.path.isfile(file):
+        return False
+    return name.partition(".")[0] == "gsparc" or not os.path.abspath(file).startswith(ENVIRONMENT)
 
 
 def _content(name: str) -> str:
