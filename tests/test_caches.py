@@ -8,7 +8,7 @@ import pytest
 from gsparc.data.assemble import identity_hash
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site, Stations
-from gsparc.evaluation.experiment.done import measurements_hash
+from gsparc.evaluation.ledger import measurements_hash
 from gsparc.models.array_vectors import vector_cache
 from gsparc.models.checkpoint import _site_from, _tensors_to_numpy, _to_plain
 from gsparc.ops import SphereGrid

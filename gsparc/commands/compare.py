@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,15 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import run_directory, show_result
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.commands.train import read_inputs, train
+from gsparc.commands.shared.train_job import train_job
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import POSITIVE
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.cells import Contender, plan_cells, plugin_contenders
+from gsparc.evaluation.experiment.cells import Contender, job_of_cell, plan_cells, plugin_contenders
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.pictures import draw_efforts, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
-from gsparc.evaluation.experiment.run_cells import CellResult, PreparedCell, prepare_cell, run_cells
+from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.table import (
     CELL,
     average_cells,
@@ -32,11 +31,9 @@ from gsparc.evaluation.experiment.table import (
     remarks,
     split_by_problem,
     table_of,
-    table_of_cells,
     title_of,
 )
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
-from gsparc.models.array_vectors.vector_cache import forget_vectors
 
 log = logging.getLogger(__name__)
 
@@ -56,35 +53,24 @@ def task(config: DictConfig) -> pd.DataFrame:
         POSITIVE.check("efforts", effort)
     counted = settings["efforts"], settings["seeds"], settings["only"]
     own = {name: of or {} for name, of in settings["datasets"].items()}
-    prepared = [
-        prepare_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
+    jobs = [
+        job_of_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
         for problem, cell in plan_cells(problems, methods, *counted)
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     log.info("cells are in %s", cells_dir)
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
     with locked(cells_dir, "cells"):
-        filled = run_cells(prepared, train_cell, bool(settings["train"]), limit_s)
-    if not filled:
+        filled = run_jobs(jobs, train_job, bool(settings["train"]), limit_s)
+    if filled.empty:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
     timed = time_by_dataset(filled, by_name) if settings["latency"] else None
     return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 
-def train_cell(one: PreparedCell, interrupted: str | None) -> None:
-    """Train a cell into its folder; of a split that is drawn several times, models of the first are kept."""
-    config = deepcopy(one.config)
-    forget_vectors()  # solved for another cell, they would be missing from this one's processor seconds
-    # What an interrupted try has left is gone on from, unless the settings name something else.
-    config.ckpt_path = config.ckpt_path or interrupted
-    _, made = train(config, one.folder, read_inputs(config, one.problem.data), in_full=False)
-    for file in made.checkpoints if one.problem.draw else ():  # queries are timed with those of the first
-        file.unlink()
-
-
 def write_comparison(
-    filled: Sequence[CellResult], timed: pd.DataFrame | None, ours: str, run_dir: Path,
+    filled: pd.DataFrame, timed: pd.DataFrame | None, ours: str, run_dir: Path,
     figures: Sequence[str] = (),
 ) -> pd.DataFrame:  # fmt: skip
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
@@ -98,7 +84,7 @@ def write_comparison(
     by_draw = rows[rows.draws]
     by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
     write_samples(run_dir / "compare.csv", columns_of_csv(rows))
-    write_samples(run_dir / "cells.csv", table_of_cells(filled)[CELL].to_dict("list"))
+    write_samples(run_dir / "cells.csv", filled[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
     for here in by_set:
         draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)

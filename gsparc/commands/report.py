@@ -13,8 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.commands.shared.output import run_directory
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.drawing import PRINTED
+from gsparc.evaluation.experiment.latency import time_again
 from gsparc.evaluation.report.page import write_report
-from gsparc.evaluation.report.runs import find_runs, group_by_study, read_columns, time_again
+from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns
 from gsparc.evaluation.summary import write_summary
 
 
@@ -25,15 +26,16 @@ def task(config: DictConfig) -> dict[str, Any]:
     for form in config.figures:
         PRINTED.check("figures", form)
     paths = [Path(path) for path in config.runs]
-    runs = find_runs(paths)
+    rows = frame(*paths)
     # Times of other days and machines do not compare: every model is asked anew, here.
     if config.retime:
-        runs = time_again(runs, rounds=int(config.rounds), rounds_s=float(config.rounds_s))
+        rows = time_again(rows, rounds=int(config.rounds), rounds_s=float(config.rounds_s))
     out = run_directory()
-    origin = write_report(out, config.title, runs, _fronts(paths), config.figures)
-    facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(group_by_study(runs)), **origin}
+    origin = write_report(out, config.title, rows, _fronts(paths), config.figures)
+    count, studies = len(own_rows(rows)), rows.groupby(STUDY, dropna=False).ngroups
+    facts: dict[str, Any] = {"report/runs": count, "report/studies": studies, **origin}
     write_summary(out / "summary.json", facts)
-    runs_read = f"{len(runs)} run{'s' * (len(runs) > 1)}"
+    runs_read = f"{count} run{'s' * (count > 1)}"
     open_console().print(f"{runs_read}; written to {out / 'report.html'}", highlight=False)
     return facts
 

@@ -5,8 +5,6 @@ Leaves `study.csv`, a row a variant and condition (`study.ROW`), `study.png` and
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -15,59 +13,53 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.train_job import train_job
+from gsparc.data.instantiate import config_node
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.done import State, measurements_hash
-from gsparc.evaluation.experiment.folds import fit_context
 from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.study import Condition, Study
+from gsparc.evaluation.experiment.problem import compose
+from gsparc.evaluation.experiment.runner import run_jobs
+from gsparc.evaluation.experiment.study import Condition, average_rounds, plan_rounds
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
-from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
 
 
-def variants_of(config: DictConfig) -> dict[str, Callable[[], MethodFactory]]:
-    """Return those of `config.variants`, overrides of `config.model`, then `config.baselines` by name."""
-
+def configs_of(config: DictConfig) -> dict[str, DictConfig]:
+    """Return what trains each of `config.variants`, overrides of `config.model`, then `config.baselines`."""
+    whole = compose({}, ())
+    for name in ("dataset", "split", "trainer", "callbacks", "seed", "effort", "threads"):
+        OmegaConf.update(whole, name, config[name], merge=False)
+    OmegaConf.update(whole, "init", None, merge=False)  # a variant names its own, if any
     # Resolved first: an interpolation would take the place of the model's own settings, not join them.
-    variants = {
-        str(name): partial(build, OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+    models = {
+        str(name): OmegaConf.merge(config.model, overrides)
         for name, overrides in to_dict(config.variants).items()
     }
-    return variants | {name: method_class(name) for name in config.baselines}
-
-
-def study_of(config: DictConfig) -> Study:
-    """Return the study that a composed configuration describes."""
-    return Study(
-        variants_of(config),
-        instantiate(config.kind).conditions(),
-        int(config.rounds),
-        int(config.seed),
-        ClockSettings(rounds=int(config.queries), rounds_s=float(config.query_s)),
-    )
+    models |= {name: OmegaConf.create(config_node(method_class(name))) for name in config.baselines}
+    return {name: OmegaConf.merge(whole, {"model": None}, {"model": one}) for name, one in models.items()}  # type: ignore[misc]
 
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
     settings = RunSettings.from_config(config)
     build(config.model)  # its parts check themselves
-    run_dir = run_directory()
-    study = study_of(config)
+    run_dir, conditions = run_directory(), instantiate(config.kind).conditions()
     data = load(to_dict(config.dataset))
     split = split_for(to_dict(config.split), data)
     try:
-        # Rounds that were done on other data, splits or settings do not count as these.
-        state = State.from_config(config, measurements_hash(data), split.sha256)
-        rows = study.run(data, split, fit_context(config, run_dir=run_dir), state)
-    except KeyboardInterrupt:  # whose advice is that of a training
+        jobs = plan_rounds(configs_of(config), conditions, int(config.rounds), data, split, run_dir)
+        fits = run_jobs(jobs, train_job)
+    except KeyboardInterrupt:  # whose advice is that of a comparison
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
         raise KeyboardInterrupt(message) from None
+    clock = ClockSettings(rounds=int(config.queries), rounds_s=float(config.query_s))
+    rows = average_rounds(fits, conditions, data, split, clock)
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": study.rounds,
+        "seed": settings.seed, "study/rounds": int(config.rounds),
     }  # fmt: skip
     title = f"{data.site.name}, split {split.title}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))

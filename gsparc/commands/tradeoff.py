@@ -19,7 +19,7 @@ from gsparc.commands.shared.settings import to_dict
 from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
-from gsparc.evaluation.experiment.done import State, measurements_hash, run_once
+from gsparc.evaluation.ledger import State, measurements_hash, run_once
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table

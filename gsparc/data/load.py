@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import logging
 from collections.abc import Iterable, Mapping
@@ -156,6 +157,7 @@ def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:
     return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
 
 
+@functools.cache
 def _choices() -> dict[str, DictConfig]:
     """What conf/dataset holds, by name; settings that come from other groups are left to their defaults."""
     choices: dict[str, DictConfig] = {}

@@ -6,13 +6,17 @@ import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from omegaconf import DictConfig
+
+from gsparc.data.instantiate import config_node, import_target
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score_methods
-from gsparc.models.method import Method
+from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import stations_of_fold
-from gsparc.models.registry import method_class
+from gsparc.models.registry import all_methods, method_class
 from gsparc.training.context import FitContext, FitReport
 
 log = logging.getLogger(__name__)
@@ -36,6 +40,14 @@ def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
     few = (stations_of_fold(method_class("complex_gp")(), data, fold).only_tested.any() for fold in folds)
     return names if any(few) else (*names, "complex_gp")
+
+
+def same_as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
+    """Return the name of a run's method where a baseline of that name would be fitted in the same way."""
+    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_effort
+    kind = all_methods().get(method.name)
+    same = kind is not None and to_dict(config.model) == config_node(import_target(kind))
+    return method.name if plainly and same else None
 
 
 @dataclass(frozen=True)
@@ -70,11 +82,11 @@ def fit_baseline(
     if eval_on == "val" and learned is None:  # learned from as methods do, but where they are scored
         before = replace(before, folds=tuple(replace(fold, val=fold.val[:0]) for fold in before.folds))
 
-    def said(number: int, method: Method, report: FitReport) -> None:
+    def say(number: int, there: Measurements, rows: Fold, method: Method, report: FitReport) -> None:
         for note in report.notes:
             log.info("fold %d: %s", number, note)
 
     contexts = [FitContext(Path())] * len(before.folds)
-    fits = fit_folds(method_class(name)(), own, before, contexts, keep=said)
+    fits = fit_folds(method_class(name)(), own, before, contexts, keep=say)
     scores = score_methods(fits.methods, data, split, eval_on, learned)
     return FittedBaseline(fits.methods, scores, fits.train_s)

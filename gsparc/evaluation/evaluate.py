@@ -58,6 +58,24 @@ class Evaluation:
                 (folder / name).unlink(missing_ok=True)  # of an earlier run, of other data
 
 
+@dataclass(frozen=True)
+class TrainedRun:
+    """What a run made, for callers from Python.
+
+    Attributes:
+        methods: one fitted method per fold.
+        checkpoints: their files.
+        data, split: what they learned from.
+        evaluation: figures and per-sample columns.
+    """
+
+    methods: tuple[Method, ...]
+    checkpoints: tuple[Path, ...]
+    data: Measurements
+    split: Split
+    evaluation: Evaluation
+
+
 def evaluate(
     methods: Method | Sequence[Method], train_s: float | Sequence[float] | None, data: Measurements,
     split: Split, *, eval_on: str = "test", baselines: Sequence[str] | None = None,

@@ -2,20 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
+from gsparc.data.splits import Fold, Split
+from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import PALETTE, panels, save
+from gsparc.evaluation.found_plan import draw_found
+from gsparc.evaluation.sector_levels import draw_sector_levels
+from gsparc.evaluation.summary import results_table
 from gsparc.models.method import Method
 from gsparc.prediction.confidence import predict_rows
 from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
+from gsparc.training import tracking
 
 SPECTRA = 4  # test rows drawn
+
+
+def draw_run(
+    method: Method, data: Measurements, split: Split, walls: SceneWalls | None, facts: Mapping[str, Any],
+    eval_on: str, run_dir: Path, loggers: Sequence[Any],
+) -> None:  # fmt: skip
+    """Draw predictions and what was found; give loggers the pictures, figures and the table of a run."""
+    # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
+    numbers = {name: value for name, value in facts.items() if isinstance(value, (int, float))}
+    own = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
+    tracking.log_final(loggers, own)
+    fold = split.folds[0]
+    draw_sector_levels(method, data, fold, run_dir / "sectors.png")
+    if len(fold.test):
+        title = f"{data.site.name}: test rows of {method.label}"
+        draw_predictions(method, data, fold, title, run_dir / "test.png")
+        tracking.log_picture(loggers, "test rows", run_dir / "test.png")
+    table = results_table(facts, str(facts["model/label"]), prefix=eval_on)
+    tracking.log_table(loggers, "results", *table.texts())
+    found = method.objects()
+    if len(found):
+        draw_found(data, found, run_dir / "found.png", walls)
+        tracking.log_picture(loggers, "found", run_dir / "found.png")
 
 
 def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str, path: Path) -> None:

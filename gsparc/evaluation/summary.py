@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import platform
@@ -59,16 +60,6 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     write_whole(path, text + "\n")
 
 
-def read_summary(path: str | Path) -> dict[str, Any] | None:
-    """Return the facts of a summary; None where there is none, or no whole one."""
-    try:
-        facts = json.loads(Path(path).read_text(encoding="utf-8"))
-    # ValueError: no JSON, as of a file that was cut off.
-    except (OSError, ValueError):
-        return None
-    return facts if isinstance(facts, dict) else None
-
-
 def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
     """Write equally long columns as CSV, atomically; NaN becomes an empty cell.
 
@@ -113,6 +104,7 @@ def new_run_id() -> str:
     return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
 
 
+@functools.cache  # of a process, which runs what it has read
 def provenance() -> dict[str, str | None]:
     """Return `git`: commit of the source tree (`-dirty` when edited, None outside one).
 

@@ -2,13 +2,17 @@
 
 import csv
 import json
+from functools import partial
 
 import pytest
 from campaigns import compose, runs_in, spectra
+from hydra import initialize_config_module
 
-from gsparc.commands.study import study_of, task
+from gsparc.commands.study import configs_of, task
+from gsparc.models.registry import build
 from gsparc.models.terms import EffectSettings
 
+HYDRA = partial(initialize_config_module, "gsparc.conf", version_base="1.3")
 PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {
     "effects": ([], ["none"]),
@@ -26,7 +30,8 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
         "~variants", f"+variants={{plain: {PLAIN}}}", "baselines=[mean]", "query_s=0.5",
         "trainer.max_steps=6", "trainer.val_check_interval=3", *more, config="study",
     )  # fmt: skip
-    rows = task(config)
+    with HYDRA():
+        rows = task(config)
     assert list(rows.what) == 2 * conditions
     facts = json.loads((tmp_path / "summary.json").read_text())
     assert facts["study/rounds"] and facts["dataset/name"] == "own" and facts["seed"] == 0
@@ -39,8 +44,9 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
 
 def test_variants_join_the_models_settings_where_they_are_interpolations():
     """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
-    makers = study_of(compose("kind=effects", config="study")).variants
-    variants = {name: make() for name, make in makers.items()}
+    with HYDRA():
+        configs = configs_of(compose("kind=effects", config="study"))
+    variants = {name: build(config.model) for name, config in configs.items()}
     switches = {name: method.switches for name, method in variants.items() if name != "gp"}
     assert len(switches) == 9 and all(isinstance(one, EffectSettings) for one in switches.values())
     assert (switches["plain"].image, switches["plain"].phase) == (True, False)

@@ -52,7 +52,8 @@ def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
 
 def test_sectors_were_drawn_where_there_are_test_rows_alone(spectra_file, tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr("gsparc.commands.train.draw_sector_levels", lambda *of: drawn.append(of[-1].name))
+    drawing = "gsparc.evaluation.pictures.draw_sector_levels"
+    monkeypatch.setattr(drawing, lambda *of: drawn.append(of[-1].name))
     train(plain(spectra_file, "gp", "baselines=[]", "split=none"), tmp_path)
     assert drawn == ["sectors.png"]
 
@@ -129,7 +130,7 @@ def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_fil
 def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monkeypatch):
     """It was, but only after the data were read."""
     monkeypatch.setattr("gsparc.training.tracking.find_spec", lambda name: None)
-    monkeypatch.setattr("gsparc.commands.train.datamodule", None)
+    monkeypatch.setattr("gsparc.commands.shared.inputs.datamodule", None)
     folders = [f"logger.{name}.save_dir='{tmp_path}'" for name in ("csv", "tensorboard")]
     with pytest.raises(ValueError, match="TensorBoard is not installed") as error:
         train(compose(*brief(spectra_file), "logger=tensorboard", *folders), tmp_path)

@@ -12,11 +12,10 @@ from types import FrameType
 
 import pytest
 import torch
-from campaigns import channels, compose, powers, spectra
+from campaigns import channels, compose, fit_context, powers, spectra
 from kinds import moving_array, static_array
 
 from gsparc.data.load import load, split_for
-from gsparc.evaluation.experiment.folds import fit_context
 from gsparc.models.registry import build
 from gsparc.processes import worker
 

@@ -11,7 +11,7 @@ from judging import repeated, run
 from product import PARTS
 from worlds import CHOICES, World, arrays, covering, every, possible_pairs
 
-from gsparc.commands.train import read_inputs
+from gsparc.commands.shared.inputs import read_inputs
 from gsparc.evaluation.baselines import fit_baseline
 
 FEW = covering(every((30,)), 1)[:14]  # seven of eight pairs; `make grid` has all

@@ -70,6 +70,20 @@ def compose(*overrides: str, config: str = "train"):
     return composed
 
 
+def fit_context(config, run_dir: Path):
+    """What `train` gives to the fit of a single fold."""
+    from functools import partial
+
+    from hydra.utils import instantiate
+
+    from gsparc.evaluation.experiment.folds import build_callbacks, effort_settings
+    from gsparc.training.context import FitContext
+
+    made = {"trainer": instantiate(config.trainer, _partial_=True)}
+    made["callbacks"] = partial(build_callbacks, config.callbacks)
+    return FitContext(**effort_settings(config), **made, run_dir=run_dir)
+
+
 def _chooses(word: str) -> bool:
     return word[0] in "~+" or ("." not in (key := word.partition("=")[0]) and (CONF / key).is_dir())
 

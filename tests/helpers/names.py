@@ -11,8 +11,8 @@ from typing import Any
 from pages import ROOT
 
 LISTS = ("console", "figures")
-# Of json: hydra's own settings are explained in conf and in the classes, files by their names.
-ELSEWHERE = re.compile(r"(?:unread/)?(?:settings|files)/.*")
+# Of json: hydra's own settings are explained in conf and in the classes, files and modules by their names.
+ELSEWHERE = re.compile(r"(?:unread/)?(?:settings|files|program)/.*")
 SUFFIX = re.compile(r"(?:_p\d+|_batch64| low| high| least| largest| error)$")
 
 

@@ -24,6 +24,6 @@ def time_and_draw_less(patch) -> None:
     def dot(method, data, fold, title, path):
         Image.new("L", (1, 1)).save(path)  # what loggers are given
 
-    patch.setattr("gsparc.commands.train.draw_predictions", dot)
+    patch.setattr("gsparc.evaluation.pictures.draw_predictions", dot)
     patch.setattr("gsparc.evaluation.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
     patch.setattr("gsparc.prediction.timing.COPY_BYTES", 2**12)

@@ -9,10 +9,13 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
+from omegaconf import DictConfig
 from rich.console import RenderableType
 
+from gsparc.data.splits import Split
+from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import open_console, repeated_warnings
-from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.summary import provenance, remarks, results_table, write_summary
 from gsparc.prediction.timing import machine_facts
 
 
@@ -40,6 +43,19 @@ def show_result(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (
     text = console.export_text().rstrip()
     for file in files:  # to the log's file alone: the console has it
         file.handle(logging.LogRecord(__name__, logging.INFO, __file__, 0, f"result:\n{text}", None, None))
+
+
+def show_training(
+    config: DictConfig, run_dir: Path, facts: Mapping[str, Any], split: Split, stations: Mapping[str, Any]
+) -> None:
+    """Show the table of a training, the worst of its `stations`, and remarks."""
+    drawn = config.split.get("seed") is not None and not split.of_release
+    draw = f" (split.seed={config.split.seed})" if drawn else ""
+    title = f"{facts['dataset/name']}, split {split.title}{draw}, {config.eval_on}, seed {config.seed}"
+    table = results_table(facts, facts["model/label"], title, config.eval_on)
+    tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
+    worst = worst_stations(stations, facts["model/label"])
+    show_result(run_dir, *[table, *worst] * tested, lines=remarks(facts, config.eval_on))
 
 
 def finish_run(

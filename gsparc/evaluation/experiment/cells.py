@@ -1,4 +1,4 @@
-"""Which trainings a comparison consists of."""
+"""Which fits a comparison consists of."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import product
+from pathlib import Path
+from typing import Any
 
 from gsparc.data.instantiate import import_target, plugins
-from gsparc.evaluation.experiment.problem import Problem
+from gsparc.evaluation.experiment.problem import Problem, compose
+from gsparc.evaluation.experiment.runner import Job
 from gsparc.models.registry import built_in_methods
 
+FREE_S, EFFORT_S = 5.0, 60.0  # guessed for a method that counts nothing; for one of effort 1
 ANY = "any"  # stands for the effort or seed of a method that has none
 
 
@@ -57,6 +61,7 @@ class Cell:
         dataset, split, method: names.
         effort: that what it counts is multiplied by; None for a method that counts nothing.
         seed: of the method, and of the split where that is drawn several times; None for neither.
+        draws: whether its seed is a draw of the split.
     """
 
     dataset: str
@@ -64,6 +69,7 @@ class Cell:
     method: str
     effort: float | None
     seed: int | None
+    draws: bool = False
 
     def __str__(self) -> str:
         effort = ANY if self.effort is None else f"{self.effort:g}"
@@ -98,7 +104,7 @@ def plan_cells(
     able = [(problem, [m for m in methods.values() if m.serves(problem)]) for problem in problems]
     # Methods that count nothing first: they stand in the tables of all efforts.
     once = ((p, m) for p, those in able for m in those if not m.effort)
-    cells = [(p, Cell(p.dataset, p.split, m.name, None, p.draw)) for p, m in once]
+    cells = [(p, Cell(p.dataset, p.split, m.name, None, p.draw, p.draw is not None)) for p, m in once]
     for turn, seed in enumerate(seeds):
         for effort, (problem, those) in product(efforts, able):
             # A drawn split has its draws for seeds: further seeds would repeat the first draw.
@@ -106,7 +112,7 @@ def plan_cells(
                 continue
             own = seed if problem.draw is None else problem.draw
             named = ((problem.dataset, problem.split, m.name) for m in those if m.effort)
-            cells += [(problem, Cell(*name, effort, own)) for name in named]
+            cells += [(problem, Cell(*name, effort, own, problem.draw is not None)) for name in named]
     names = [str(cell) for _, cell in cells]
     for pattern in only:
         if not any(fnmatchcase(name, pattern) for name in names):
@@ -115,3 +121,21 @@ def plan_cells(
                 f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
     return [one for one in cells if not only or any(fnmatchcase(str(one[1]), part) for part in only)]
+
+
+def job_of_cell(
+    cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, cells_dir: Path,
+    reuse: bool = False,
+) -> Job:  # fmt: skip
+    """Compose a cell's configuration and name its folder, `dataset/split/method/effort/seed`.
+
+    Of a split that is drawn several times, models of the first draw are kept: queries are timed with those.
+    """
+    overrides = [*problem.chosen, *contender.overrides(cell.effort)]
+    config = compose(settings, overrides, problem.draw, cell.seed)
+    # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
+    fit_s = 2.0 + (FREE_S if cell.effort is None else EFFORT_S * cell.effort)
+    return Job(
+        cell, config, cells_dir / str(cell), problem.data, problem.folds, problem.content,
+        expected_s=len(problem.folds.folds) * fit_s, keeps_models=not problem.draw, reuse=reuse,
+    )  # fmt: skip

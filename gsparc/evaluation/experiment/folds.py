@@ -1,49 +1,32 @@
-"""Fit a method on every fold of a split, score it, time it: of a study, a comparison or a run."""
+"""Fit a method on every fold of a split, and keep each fold as it ends."""
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
+import numpy as np
 from hydra.utils import instantiate
 from lightning import Callback
-from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.errors import Caution
 from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import to_dict
-from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.scores import score_methods
-from gsparc.models import fitting
+from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import wrap_per_station
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 
-
-def fit_context(config: DictConfig, **others: Any) -> FitContext:
-    """Return the context of a fit as a composed configuration says, and what is given.
-
-    Args:
-        config: its seed, effort, split, `init_from`, batch size, Trainer and callbacks.
-        **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
-    """
-    init_from = config.get("init_from")
-    return FitContext(
-        **effort_settings(config),
-        init_from=None if init_from is None else Path(init_from),
-        batch_size=config.dataset.get("batch_size", 16),
-        trainer=instantiate(config.trainer, _partial_=True),
-        callbacks=partial(build_callbacks, config.get("callbacks")),
-        config_yaml=OmegaConf.to_yaml(config, resolve=True),
-        **others,
-    )
+log = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
 
 
 def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,29 +63,90 @@ class FoldFits:
     notes: tuple[str, ...]
     cost: Cost = NO_COST
 
-    def figures(self, data: Measurements, split: Split) -> dict[str, float | None]:
-        """Return accuracies pooled over folds, of what it learned from or of other data, as moved queries."""
-        return pool_figures(score_methods(self.methods, data, split), data, split)
+    def facts(self) -> dict[str, Any]:
+        """Return what a summary says of the fits."""
+        told = [note for note in self.notes if not isinstance(note, Caution)]  # those were warnings
+        facts = {"time/train_cpu_s": fmean(self.train_cpu_s), "model/learned": "\n".join(told) or None}
+        if self.cost.stages:
+            facts |= {"time/cost": self.cost.describe(), "time/unused_s": self.cost.unused_s}
+        return facts
 
 
-def fold_contexts(whole: FitContext, split: Split) -> list[FitContext]:
-    """Return the contexts of its folds, each with a folder and series of figures of its own."""
-    return [whole.for_part(f"fold{number}") for number in range(len(split.folds))]
+def folds_to_resume(ckpt_path: str | None, factory: MethodFactory, split: Split) -> list[Path | None]:
+    """Return what each fold goes on from, a file or a folder; each of several has its own in the run's.
+
+    Raises:
+        ValueError: a file that belongs to no fold, or a method that trains in one piece.
+    """
+    path, folds = None if ckpt_path is None else Path(ckpt_path), len(split.folds)
+    if path is not None and not path.is_dir() and not factory.resumable:  # a folder has finished parts
+        raise ValueError(f"ckpt_path: {factory.name} trains in one piece; start again without ckpt_path")
+    if path is None or folds == 1:
+        return [path] * folds
+    run = fitting.run_folder(path, fitting.FOLDS)
+    every = [run / f"fold{number}" for number in range(folds)]
+    # A file that belongs to no fold says nothing of where the other folds stand.
+    if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
+        raise ValueError(f"ckpt_path={path}: split={split.name} has {folds} folds, give the run's folder")
+    return [own if own.is_dir() else None for own in every]
+
+
+def fold_contexts(
+    whole: FitContext, split: Split, resumes: Sequence[Path | None] | None = None
+) -> list[FitContext]:
+    """Return the contexts of its folds, each of several with a folder and series of figures of its own."""
+    count = len(split.folds)
+    contexts = [whole.for_part(f"fold{number}") for number in range(count)] if count > 1 else [whole]
+    every = zip(contexts, resumes or [None] * count, strict=True)
+    return [replace(context, resume=resume) for context, resume in every]
+
+
+def checkpoints(contexts: Sequence[FitContext]) -> tuple[Path, ...]:
+    """Return the files of the folds' models."""
+    return tuple(context.run_dir / checkpoint.MODEL for context in contexts)
+
+
+def keep_fold(
+    split: Split, contexts: Sequence[FitContext], run_id: str,
+    number: int, data: Measurements, fold: Fold, fitted: Method, report: FitReport,
+) -> None:  # fmt: skip
+    """Write the checkpoint of a fold as soon as it is fitted, and say what its fit notes."""
+    context = contexts[number]
+    for note in report.notes:
+        log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
+    extra = fitting.run_extra(report, data, fold, context)
+    extra |= {"fold": number, "split_sha256": split.sha256, "run_id": run_id}
+    extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
+    checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
+
+
+def end_curves(
+    contexts: Sequence[FitContext], seconds: Sequence[float], columns: Mapping[str, Any], eval_on: str
+) -> None:
+    """End the curve of every fold with its seconds and the error of what was fitted on the rows scored.
+
+    `columns` are those of `per_sample.csv`.
+    """
+    squared = columns["error_db"] ** 2 if "error_db" in columns else columns.get("mse")
+    for number, (context, spent) in enumerate(zip(contexts, seconds, strict=True)):
+        own = [] if squared is None else squared[columns["fold"] == number]
+        error = float(np.nanmean(own)) if np.isfinite(own).any() else None
+        context.log_curve(spent, f"{eval_on} rows", error)
 
 
 def fit_folds(
     factory: MethodFactory, data: Measurements, split: Split, contexts: Sequence[FitContext], *,
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
-    keep: Callable[[int, Method, FitReport], None] | None = None,
+    keep: Callable[[int, Measurements, Fold, Method, FitReport], None] | None = None,
 ) -> FoldFits:  # fmt: skip
-    """Fit an unfitted method on every fold; `FoldFits.figures` scores them together.
+    """Fit an unfitted method on every fold.
 
     Args:
         factory: an unfitted method, or what chooses one.
         data, split: learned from `train` and `val` of each fold.
         contexts: of each fold's fit.
         learned: what is learned from instead, such as displaced or fewer measurements.
-        keep: called after each fit with the fold's number, the method and its report.
+        keep: called after each fit with the fold's number, what it learned from, the method and its report.
 
     Raises:
         ValueError: the method does not serve these data.
@@ -112,9 +156,12 @@ def fit_folds(
     if uses_other_processes() and len(split.folds) > 1:  # loggers and loaders of a run are of its process
         contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
-    def fitted(number: int) -> tuple[Method, FitReport, float]:
+    def of_fold(number: int) -> tuple[Measurements, Fold]:
         fold = split.folds[number]
-        there, rows = (data, fold) if learned is None else learned(data, fold)
+        return (data, fold) if learned is None else learned(data, fold)
+
+    def fitted(number: int) -> tuple[Method, FitReport, float]:
+        there, rows = of_fold(number)
         # process_time counts all threads of this process, waiting for others excluded.
         before = time.process_time()
         # Stations are counted in the data that are learned from, which `learned` may have changed.
@@ -123,11 +170,17 @@ def fit_folds(
         return method, report, time.process_time() - before
 
     by_fold: dict[int, tuple[Method, FitReport, float]] = {}
-    # Folds may end in any order: kept at once, so that an interrupt loses only those at work.
-    for number, one in run_each(fitted, range(len(split.folds)), "folds"):
-        by_fold[number] = one
-        if keep is not None:
-            keep(number, *one[:2])
+    try:
+        # Folds may end in any order: kept at once, so that an interrupt loses only those at work.
+        for number, one in run_each(fitted, range(len(split.folds)), "folds"):
+            by_fold[number] = one
+            if keep is not None:
+                keep(number, *of_fold(number), *one[:2])
+    except KeyboardInterrupt as stopped:
+        if len(contexts) == 1:
+            raise
+        cause, run_dir = str(stopped).partition("; ")[0] or "interrupted", contexts[0].run_dir.parent
+        raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={run_dir}") from None
     methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.

@@ -1,20 +1,28 @@
-"""Single-query latency of all methods of a problem, in turns, on one processor, after all training."""
+"""Latency of single queries: models asked in turns, with nothing beside them, after all training."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import torch
 
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
 from gsparc.evaluation.experiment.problem import Problem
-from gsparc.evaluation.experiment.run_cells import CellResult
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.results import frame_of_runs, own_rows, read_run
+from gsparc.evaluation.summary import write_samples
 from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction.timing import (
+    BLOCKS,
     COPY,
+    Call,
     ClockSettings,
     p50_p95,
     query_calls,
@@ -36,14 +44,12 @@ SPEED = ["query_ms", "query_p95_ms", "to_copy"]  # the last in units of a 16 MiB
 TIMED = ["dataset", "split", "method", *SPEED]
 
 
-def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, dict[str, float]]:
-    """Return `SPEED` and the number of `rounds` by method, of the first of its checkpoints."""
-    methods: dict[str, Method] = {}
-    for one in filled:
-        if one.cell.method not in methods:
-            # The first of a method's cells stands for all of its efforts and seeds.
-            methods[one.cell.method] = loading.load(one.checkpoint)[0]
-    calls = query_calls(methods, problem.data, problem.folds.folds[0].test)
+def time_queries(
+    files: Mapping[str, Path], data: Measurements, split: Split, fast: ClockSettings = FAST
+) -> dict[str, dict[str, float]]:
+    """Return `SPEED` and the number of `rounds` of models by name; slow ones have clocks of their own."""
+    methods: dict[str, Method] = {name: loading.load(file)[0] for name, file in files.items()}
+    calls = query_calls(methods, data, split.folds[0].test)
     found: dict[str, dict[str, float]] = {}
 
     def timed(names: Iterable[str], clock: ClockSettings) -> None:
@@ -57,28 +63,59 @@ def time_queries(filled: Sequence[CellResult], problem: Problem) -> dict[str, di
     timed(calls, ONCE)
     timed([name for name, one in found.items() if SLOW_MS < one["query_ms"] <= ENDLESS_MS], ONCE)
     speeds = {name: one["query_ms"] for name, one in found.items()}
-    timed([name for name, ms in speeds.items() if ms <= SLOW_MS], FAST)
+    timed([name for name, ms in speeds.items() if ms <= SLOW_MS], fast)
     timed([name for name, ms in speeds.items() if SLOW_MS < ms <= ENDLESS_MS], SLOW)
     return {name: found[name] for name in methods}
 
 
-def time_by_dataset(
-    filled: Sequence[CellResult], problems: Mapping[tuple[str, str], Problem]
-) -> pd.DataFrame:
+def time_by_dataset(filled: pd.DataFrame, problems: Mapping[tuple[str, str], Problem]) -> pd.DataFrame:
     """Return columns `TIMED`, of the first split of each dataset that is there and keeps its models.
 
-    Of that alone: models of fewer measurements answer faster.
+    Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_jobs`.
     """
     rows = []
-    for dataset in dict.fromkeys(one.cell.dataset for one in filled):
-        here = [one for one in filled if one.cell.dataset == dataset]
-        split = here[0].cell.split
-        present = [one for one in here if one.cell.split == split and one.checkpoint.exists()]
-        if present:
+    for dataset, here in filled.groupby("dataset", sort=False):
+        split = str(here.split.iloc[0])
+        # The first of a method's cells stands for all of its efforts and seeds.
+        own = here[(here.split == split) & here.run.map(lambda run: bool(run.checkpoints))]
+        files = own.drop_duplicates("method").set_index("method").run.map(lambda run: run.checkpoints[0])
+        if len(files):
             log.info("%s: timing single queries of every method in turns", dataset)
-            where, found = (
-                {"dataset": dataset, "split": split},
-                time_queries(present, problems[dataset, split]),
-            )
+            problem = problems[str(dataset), split]
+            found = time_queries(files.to_dict(), problem.data, problem.folds)
+            where = {"dataset": dataset, "split": split}
             rows += [{**where, "method": name, **one} for name, one in found.items()]
     return pd.DataFrame(rows, columns=TIMED)
+
+
+def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) -> pd.DataFrame:
+    """Return the frame with the times of single queries, which each run's `render_ms.csv` has from now on.
+
+    A sweep runs jobs at the same time, which disturbs their times; call this after it.
+
+    Args:
+        rows: those of runs without a readable checkpoint keep the times they have.
+        rounds: visits to each.
+        rounds_s: no new round after this [s].
+    """
+    runs, calls = list(own_rows(rows).run), dict[int, Call]()
+    for number, run in enumerate(runs):
+        try:
+            opened = open_files(run.checkpoints[:1])
+            # A folder used twice may hold the model of one run beside the summary of the other.
+            if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
+                raise ValueError("its checkpoint is of another run than its summary")
+            if not len(opened.split.folds[0].test):
+                log.warning("%s is not timed again: it has no test rows", run.folder)
+                continue
+        except (ValueError, IndexError) as error:
+            log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
+            continue
+        calls[number] = opened.predictor.cycle_places(opened.data.moving[opened.split.folds[0].test])
+    threads = {
+        number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
+    }
+    times = time_interleaved(calls, replace(BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
+    for number, ms in times.items():
+        write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
+    return frame_of_runs(read_run(run.folder) for run in runs)

@@ -14,7 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.heeded import Option, Reads
 from gsparc.data.instantiate import import_target
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import FileSettings, SplitSettings
+from gsparc.data.splits import FileSettings, Split, SplitSettings
+from gsparc.evaluation.scores import rows_to_score
 from gsparc.models.fitting import dotted_settings
 from gsparc.models.method import Method, MethodFactory
 
@@ -73,6 +74,12 @@ def _holders(path: str, node: DictConfig, method: MethodFactory) -> Iterator[tup
     if stored is not None:  # "" is the name of nothing that is read
         owner, _, attribute = stored.rpartition(".")
         yield type(getattr(method, owner) if owner else method), attribute
+
+
+def ask_one_query(method: Method, data: Measurements, split: Split, eval_on: str) -> None:
+    """Ask a fitted method once: some options are read by answers alone."""
+    rows = rows_to_score(split.folds[0], "train" if split.name == "none" else eval_on)
+    method.predict(data.batch(rows[:1]))
 
 
 def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | None:

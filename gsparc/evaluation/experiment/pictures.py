@@ -22,7 +22,7 @@ PANEL = 2.4  # inches
 def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()) -> None:
     """Save accuracy against costs, see `save`: a line joins the efforts; `ours` has a large mark.
 
-    `rows` are as of `table_of_cells`.
+    `rows` are as of `average_cells`.
     """
     groups = [here for _, here in rows.groupby("dataset", sort=False)]
     columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
@@ -61,7 +61,7 @@ LINE = 0.34  # height of a method [inch]
 
 
 def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> None:
-    """Save a panel per split: mean and standard error over draws, of `table_of_cells` of one dataset."""
+    """Save a panel per split: mean and standard error over draws, of `average_cells` of one dataset."""
     splits, names = list(rows.split.unique()), list(methods_by_mean_behind(rows))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
@@ -113,7 +113,7 @@ PANELS = (
 
 
 def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
-    """Save rows of a `Study` as PNG; a dotted line is the variant's accuracy on undisturbed data."""
+    """Save the rows of `average_rounds` as PNG; a dotted line: the accuracy on undisturbed data."""
     changes = set(rows.what) - {"none"} or {"none"}  # costs alone where nothing was changed
     wanted = [panel for panel in PANELS if panel[0] in changes]
     figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))

@@ -19,8 +19,8 @@ from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import to_dict
-from gsparc.evaluation.experiment.done import measurements_hash
 from gsparc.evaluation.experiment.options import REDRAW
+from gsparc.evaluation.ledger import measurements_hash
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.registry import fill_defaults
 from gsparc.simulate.scenes.build import has_known_scene
@@ -66,7 +66,7 @@ class Problem:
         chosen: overrides of train.yaml for dataset and split, but for the draw.
         data: measurements.
         folds: which rows learn and which test.
-        content: hash of the measurements, see `done.measurements_hash`.
+        content: hash of the measurements, see `measurements_hash`.
         draw: number of the split's draw; None where it is not drawn again.
     """
 

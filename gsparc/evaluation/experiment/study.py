@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
+from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.executor import run_all
-from gsparc.data.files import SUMMARY
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.done import State, run_once
-from gsparc.evaluation.experiment.folds import FoldFits, fit_folds, fold_contexts
-from gsparc.evaluation.metric_formats import deciding_figure
-from gsparc.evaluation.results import facts_under
-from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.models import checkpoint, loading
-from gsparc.models.method import MethodFactory
+from gsparc.evaluation.experiment.latency import time_queries
+from gsparc.evaluation.experiment.runner import Job
+from gsparc.evaluation.intervals import pool_figures
+from gsparc.evaluation.ledger import measurements_hash
+from gsparc.evaluation.scores import score_methods
+from gsparc.models import loading
 from gsparc.models.refined_places import move_rows
-from gsparc.prediction.pareto import defined_figure
-from gsparc.prediction.timing import ClockSettings, p50_p95, query_calls, time_interleaved
-from gsparc.training.context import FitContext
-
-log = logging.getLogger(__name__)
-
-# Part of the message, since methods raise a plain ValueError for all that they refuse.
-REFUSED = "not possible"  # in the error of an effect that the data do not allow
+from gsparc.prediction.timing import ClockSettings
 
 
 @dataclass(frozen=True)
@@ -56,15 +46,6 @@ class Condition:
         # A query's error changes nothing that is learned: one training serves all of them.
         return Condition() if self.what == "query" else self
 
-    def model(self, folder: Path) -> Path:
-        """Return where the model that was trained so is, in the folder of its cell."""
-        return folder / str(self.learned).replace(" ", "-") / checkpoint.MODEL
-
-    def row(self, facts: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-        """Return its part of a cell's summary."""
-        names = {"figure": facts["figure"], "model": str(self.model(folder))}
-        return {**asdict(self), **names, **facts_under(facts, str(self))}
-
     def change_training(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
         """Return data and rows of a fold under this condition."""
         if self.what == "keep":
@@ -86,124 +67,105 @@ ROW = (
 
 
 @dataclass(frozen=True)
-class Study:
-    """What is compared.
+class Round(Condition):
+    """One training of a variant.
 
     Attributes:
-        variants: factories of methods by name, in the order of the table.
-        conditions: each variant is fitted once per condition that changes what is learned from.
-        rounds: trainings of each, in turns; round r uses seed + r.
-        seed: of the first round.
-        clock: of the queries.
+        variant: its name.
+        round: its number; round r uses the first seed + r.
     """
 
-    variants: Mapping[str, Callable[[], MethodFactory]]
-    conditions: Sequence[Condition] = (Condition(),)
-    rounds: int = 1
-    seed: int = 0
-    clock: ClockSettings = field(default_factory=ClockSettings)
+    variant: str = ""
+    round: int = 0
 
-    def run(self, data: Measurements, split: Split, context: FitContext, state: State) -> pd.DataFrame:
-        """Fit, score and time everything; a variant that the data do not allow is left out.
+    def __str__(self) -> str:
+        changed = "" if self.what == "none" else f", {super().__str__()}"
+        return f"{self.variant}{changed}, round {self.round + 1}"
 
-        A round of a variant is a cell with a folder of its own, which is done once.
 
-        Args:
-            data, split: as they are before any condition.
-            context: of every fit, but for its folder and seed.
-            state: what results depend on; stored ones of another state are not reused.
+def plan_rounds(
+    configs: Mapping[str, DictConfig], conditions: Sequence[Condition], rounds: int, data: Measurements,
+    split: Split, folder: Path,
+) -> list[Job]:  # fmt: skip
+    """List a study's fits: every variant under every condition that changes what is learned from, in rounds.
 
-        Returns:
-            A row per variant and condition, columns `ROW` (those of `study.csv`).
-            `effects` that the variant computes; measurements (`rows`) that it learned from, mean over folds.
-            `figure`, `value`: accuracy on the test rows, mean over rounds; `spread`: standard deviation.
-            `train_s`, `train_cpu_s`: training of one model by the clock and of the processor, median over
-            rounds [s].
-            `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms].
-            NaN where there is no spread.
+    Args:
+        configs: of the variants by name, as composed from conf/train.yaml, with the seed of the first round.
+        conditions: of the data.
+        rounds: trainings of each, in turns; each has another seed, of the draws of errors as well.
+        data, split: as they are before any condition.
+        folder: of the study.
+    """
+    learned = dict.fromkeys(one.learned for one in conditions)
+    content, jobs = measurements_hash(data), []
+    for turn, (variant, config), condition in product(range(rounds), configs.items(), learned):
+        own = OmegaConf.merge(config, {"seed": config.seed + turn})
+        place = folder / variant / str(turn) / str(condition).replace(" ", "-")
+        change = partial(condition.change_training, seed=own.seed)
+        name = Round(condition.what, condition.amount, variant, turn)
+        unchanged = condition.what == "none"
+        jobs.append(Job(name, own, place, data, split, content, learned=None if unchanged else change))  # type: ignore[arg-type]
+    return jobs
 
-        Raises:
-            ValueError: no variant can be trained here.
-        """
 
-        def done(cell: tuple[str, int]) -> list[dict[str, Any]] | str:
-            """A row per condition, or why the data do not allow the variant."""
-            variant, turn = cell
-            # Each round has another seed, of the draws of errors as well as of the method.
-            own = replace(context, run_dir=context.run_dir / variant / str(turn), seed=self.seed + turn)
-            work = partial(self._fit_and_score, variant, data, split, own)
-            try:
-                facts = run_once(own.run_dir, state, work)
-            # Only what the data do not allow: any other error is a mistake and ends the study.
-            except ValueError as refused:
-                if REFUSED not in str(refused):
-                    raise
-                return str(refused)
-            return [{"variant": variant, **one.row(facts, own.run_dir)} for one in self.conditions]
+def ask_moved(
+    fits: pd.DataFrame, conditions: Sequence[Condition], data: Measurements, split: Split
+) -> pd.DataFrame:
+    """Return a row per variant, round and condition, of the frame of `run_jobs`.
 
-        cells = [(variant, turn) for turn in range(self.rounds) for variant in self.variants]
-        found = run_all(done, cells, "rounds of variants, possible here or not")
-        refused = {cell[0]: why for why, cell in zip(found, cells, strict=True) if isinstance(why, str)}
-        rows = [row for one in found if not isinstance(one, str) for row in one]
-        if not rows:
-            raise ValueError(next(iter(refused.values())))
-        for variant, why in refused.items():
-            log.info("%s is left out: %s", variant, why)
-        return self._table(pd.DataFrame(rows), data, split)
+    Under a `query` condition what was learned from undisturbed rows is asked where these are said to be.
+    `rows` are what was learned from, mean over folds; `model` is the file of the first fold's.
+    """
+    rows = []
+    for condition, fit in product(conditions, fits.to_dict("records")):
+        if (fit["what"], fit["amount"]) != (condition.learned.what, condition.learned.amount):
+            continue
+        folds = [condition.change_training(data, fold, fit["seed"])[1] for fold in split.folds]
+        own = {**fit, **asdict(condition), "model": fit["run"].checkpoints[0]}
+        own["rows"] = float(np.mean([len(fold.train) + len(fold.val) for fold in folds]))
+        if condition.what == "query":
+            tested = np.concatenate([fold.test for fold in split.folds])
+            moved = add_position_errors(data, tested, condition.amount, fit["seed"])
+            methods = [loading.load(file)[0] for file in fit["run"].checkpoints]
+            own["value"] = pool_figures(score_methods(methods, moved, split), moved, split)[fit["figure"]]
+        rows.append(own)
+    return pd.DataFrame(rows)
 
-    def _fit_and_score(
-        self, variant: str, data: Measurements, split: Split, context: FitContext, left: str | None
-    ) -> None:
-        """One training per condition that changes what is learned from, scored under all of them."""
-        facts, fits, seed = dict[str, Any](), dict[Condition, FoldFits](), context.seed
-        for condition in self.conditions:
-            learned = condition.learned
-            if learned not in fits:
-                file = learned.model(context.run_dir)
-                here = data, split, fold_contexts(replace(context, run_dir=file.parent), split)
-                learned_from = partial(learned.change_training, seed=seed)
-                fits[learned] = fit_folds(self.variants[variant](), *here, learned=learned_from)
-                # Without the configuration of the study: a variant has other settings.
-                extra = {"fold": 0, "split_sha256": split.sha256}
-                checkpoint.save(file, fits[learned].methods[0], "", extra)
-            outcome, asked = fits[learned], data
-            if condition.what == "query":
-                tested = np.concatenate([fold.test for fold in split.folds])
-                asked = add_position_errors(data, tested, condition.amount, seed)
-            figures = outcome.figures(asked, split)
-            # Where rows were silent they count, as in every other table.
-            figure = deciding_figure(figures, data.site.scored)
-            folds = [condition.change_training(data, fold, seed)[1] for fold in split.folds]
-            own = {
-                "rows": float(np.mean([len(fold.train) + len(fold.val) for fold in folds])),
-                "value": defined_figure(figures, figure), "train_s": float(np.mean(outcome.train_s)),
-                "train_cpu_s": float(np.mean(outcome.train_cpu_s)),
-                "effects": str(outcome.methods[0].effects or "none").replace("+", ", "),
-            }  # fmt: skip
-            facts |= {"figure": figure, **{f"{condition}/{name}": value for name, value in own.items()}}
-            log.info(
-                "%s%s, round %d of %d: %s %.4g after %.3g s of training a fold",
-                variant, "" if condition == Condition() else f", {condition}",
-                seed - self.seed + 1, self.rounds, figure, own["value"], own["train_s"],
-            )  # fmt: skip
-        write_summary(context.run_dir / SUMMARY, {"seed": seed, **facts, **provenance()})
 
-    def _table(self, cells: pd.DataFrame, data: Measurements, split: Split) -> pd.DataFrame:
-        """Rounds put together, and the models of the last one timed."""
-        # The model of the last round is timed: rounds differ in weights, not in size.
-        last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
-        median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
-        groups = cells.groupby(["variant", "what", "amount"], sort=False)
-        rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
-        # A method that was only asked elsewhere is the same on the clock: it is timed once.
-        # A dictionary by file: conditions that share a training share its model and its time.
-        methods = {
-            file: loading.rebuild_method(self.variants[variant](), checkpoint.read(file))
-            for file, variant in zip(rows.model, rows.variant, strict=True)
-        }
-        times = time_interleaved(query_calls(methods, data, split.folds[0].test), self.clock)
-        rows[["query_ms", "query_p95_ms"]] = [p50_p95(times[file]) for file in rows.model]
-        return rows[list(ROW)]
+def average_rounds(
+    fits: pd.DataFrame, conditions: Sequence[Condition], data: Measurements, split: Split,
+    clock: ClockSettings,
+) -> pd.DataFrame:  # fmt: skip
+    """Put rounds together, and time the models of the last one in turns.
+
+    Args:
+        fits: the frame of `run_jobs`.
+        conditions, data, split: of the study.
+        clock: of the queries.
+
+    Returns:
+        A row per variant and condition, columns `ROW` (those of `study.csv`).
+        `effects` that the variant computes; measurements (`rows`) that it learned from, mean over folds.
+        `figure`, `value`: accuracy on the test rows, mean over rounds; `spread`: standard deviation.
+        `train_s`, `train_cpu_s`: training of one model by the clock and of the processor, median over
+        rounds [s].
+        `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms].
+        NaN where there is no spread.
+    """
+    every = ask_moved(fits, conditions, data, split)
+    every = every.astype(dict.fromkeys(("value", "train_s", "train_cpu_s"), float))
+    # The model of the last round is timed: rounds differ in weights, not in size.
+    last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
+    median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
+    groups = every.groupby(["variant", "what", "amount"], sort=False)
+    rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
+    order = [list(fits.variant.unique()).index(variant) for variant in rows.variant]
+    rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
+    # Conditions that share a training share its model and its time: a file is timed once.
+    times = time_queries({str(file): file for file in rows.model.unique()}, data, split, clock)
+    for name in ("query_ms", "query_p95_ms"):
+        rows[name] = [times[str(file)][name] for file in rows.model]
+    return rows.assign(effects=rows.effects.str.replace("+", ", "))[list(ROW)]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import pandas as pd
 
 from gsparc.data.schema import Scored
 from gsparc.evaluation.experiment.latency import SPEED, TIMED
-from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     DECIDING,
@@ -26,7 +24,7 @@ from gsparc.evaluation.metric_formats import (
 from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
-from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Table, value_with_error
+from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Row, Table, value_with_error
 
 SECOND: dict[Scored, str] = {
     "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
@@ -55,32 +53,22 @@ ROW = [
 CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spread_db` by what it is
 
 
-def table_of_cells(filled: Sequence[CellResult]) -> pd.DataFrame:
-    """Return every cell, columns `CELL` (those of `cells.csv`) first; others are as in `average_cells`."""
-    rows = []
-    for one in filled:
-        own = one.row
-        second = DECIDING[own["kind"]] if own["figure"] == WITH_SILENT else SECOND[own["kind"]]
-        label = str(own["label"] or "")
-        rows.append({
-            **own, **asdict(one.cell), "result": own, "draws": one.drawn, "score_db": score_db(own),
-            "second_figure": second, "second_value": own.get(second),
-            **{name: own.get(key) for name, (key, _) in BESIDE.items()},
-            "earlier": one.earlier, "label": label[label.find(" (") :] if " (" in label else "",
-        })  # fmt: skip
-    if not rows:
-        return pd.DataFrame(columns=CELL)
-    # pandas would make 1.0 of 1 where another row has None.
-    seeds = pd.Series([row["seed"] for row in rows], dtype=object)  # whole numbers beside None
-    numbers = ["effort", "load", *BESIDE, "second_value"]
-    return pd.DataFrame(rows).assign(seed=seeds).astype(dict.fromkeys(numbers, float))
+def _scored(own: Row) -> dict[str, Any]:
+    """What a comparison reads of a cell, beside the columns of all results."""
+    second = DECIDING[own["kind"]] if own["figure"] == WITH_SILENT else SECOND[own["kind"]]
+    label = str(own["label"] or "")
+    return {
+        "result": own, "score_db": score_db(own), "second_figure": second, "second_value": own.get(second),
+        **{name: own.get(key) for name, (key, _) in BESIDE.items()},
+        "label": label[label.find(" (") :] if " (" in label else "",
+    }  # fmt: skip
 
 
-def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = None) -> pd.DataFrame:
+def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd.DataFrame:
     """Return the cells of a method of one effort, averaged over seeds or over draws of the split.
 
     Args:
-        filled: cells.
+        filled: the frame of `run_jobs`.
         timed: of `time_by_dataset`; None: nothing was timed.
 
     Returns:
@@ -100,14 +88,16 @@ def average_cells(filled: Sequence[CellResult], timed: pd.DataFrame | None = Non
         `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
     """
-    cells = table_of_cells(filled)
-    if cells.empty:
+    if filled.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
+    means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
+    own: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
+    cells = pd.DataFrame([{**row, **_scored(row)} for row in own])
+    cells = cells.astype(dict.fromkeys(["effort", *means], float))
     # Draws with the same test rows are seeds.
     drawn = cells.groupby(PROBLEM)[["draw", "seed"]].transform("nunique")
     cells["draws"] &= (drawn["draw"] > 1) | (drawn["seed"] == 1)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
-    means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     rows = groups[means].mean()
     rows[["figure", "second_figure"]] = groups[["figure", "second_figure"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
@@ -20,8 +21,7 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.metric_formats import LISTED, PER_SAMPLE, judged_by
 from gsparc.evaluation.report import plots, tables
-from gsparc.evaluation.report.runs import Run, drop_shared_overrides, group_by_study
-from gsparc.evaluation.results import score_db
+from gsparc.evaluation.results import STUDY, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -58,52 +58,54 @@ class Section:
 
 
 def make_sections(
-    runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()
+    rows: pd.DataFrame, fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()
 ) -> list[Section]:
-    """Return everything there is to show, study by study.
+    """Return everything there is to show of a frame of results, study by study.
 
     `fronts`: names of datasets, `tradeoff.csv` by column.
     """
     sections = []
-    for (dataset, split), group in group_by_study(runs).items():
-        own = drop_shared_overrides(group)
-        firsts = [same[0] for same in tables.group_by_setting(own).values()]
+    for (dataset, split), group in rows.groupby(STUDY, sort=False, dropna=False):
+        study = short_settings(group)
+        own = own_rows(study)
+        firsts = own.drop_duplicates("setting")
         # With one run a setting, spreads over seeds would be empty brackets.
         several = [tables.table_of_seeds] * (len(firsts) < len(own))
         kinds = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
         swept = [columns for name, columns in fronts if name == dataset]
-        of_sample = [PER_SAMPLE[own[0].row["kind"]]]
+        of_sample = [PER_SAMPLE[own.kind.iloc[0]]]
         pictures = [
-            (f"{run.setting}{what}", _png(run.folder / name))
-            for run in firsts[:MOST_PICTURES]
+            (f"{setting}{what}", _png(run.folder / name))
+            for setting, run in zip(firsts.setting[:MOST_PICTURES], firsts.run, strict=False)
             for name, what in (("test.png", ""), ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
         ]
-        shown = [table for table in (kind(own) for kind in kinds) if table.rows]
-        figures = [plots.draw_pareto(own, swept), plots.draw_distributions(own, of_sample)]
-        sections.append(Section(f"{dataset}, split {split}", warnings(own), shown, figures, pictures))
+        shown = [table for table in (kind(study) for kind in kinds) if table.rows]
+        figures = [plots.draw_pareto(study, swept), plots.draw_distributions(study, of_sample)]
+        sections.append(Section(f"{dataset}, split {split}", warnings(study), shown, figures, pictures))
     return sections
 
 
-def warnings(runs: Sequence[Run]) -> list[str]:
+def warnings(rows: pd.DataFrame) -> list[str]:
     """Return what a reader must know first, each once: the loads of a busy machine are one range."""
     # Loads differ from run to run: as remarks of their own there would be one a run.
-    remarks = [
-        remark for run in runs for remark in summary.run_conditions({**run.facts, "machine/load": None})
-    ]
-    scored = [run for run in runs if run.row["value"] is not None]
+    own = own_rows(rows)
+    without_load = ({**run.facts, "machine/load": None} for run in own.run)
+    remarks = [remark for facts in without_load for remark in summary.run_conditions(facts)]
+    scored = own[own.value.notna()]
+    score = scored.apply(score_db, axis=1).astype(float) if len(scored) else scored.value
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
-        groups = tables.group_by_setting(scored).values()
-        group = max(groups, key=lambda own: np.mean([score_db(run.row) for run in own]))
-        for ahead, figure in judged_by(group[0].facts).items():
-            leads = {name: lead for name, lead in tables.leads_of_baselines(group, figure).items() if lead}
+        best = str(score.groupby(scored.setting, sort=False).mean().idxmax())
+        facts = scored.run[scored.setting == best].iloc[0].facts
+        for ahead, figure in judged_by(facts).items():
+            every = tables.leads_of_baselines(rows[rows.run.isin(scored.run)], best, figure)
+            leads = {name: lead for name, lead in every.items() if lead}
             if leads:
                 name = max(leads, key=lambda one: leads[one].ahead_db)
-                of = group[0].setting, figure, leads[name], ahead == LISTED
-                remarks += summary.judge_baseline(name, *of)
-    elif scored:  # a baseline must beat the best run of the page
-        remarks += summary.better_baseline(max(scored, key=lambda run: score_db(run.row)).facts)
-    loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
+                remarks += summary.judge_baseline(name, best, figure, leads[name], ahead == LISTED)
+    elif len(scored):  # a baseline must beat the best run of the page
+        remarks += summary.better_baseline(scored.run[score.idxmax()].facts)
+    loads = own.load.dropna().astype(float).tolist()
     return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
 
 
@@ -123,15 +125,15 @@ def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
 
 
 def write_report(
-    folder: Path, title: str, runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
+    folder: Path, title: str, rows: pd.DataFrame, fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
     figures: Sequence[str] = (),
 ) -> dict[str, Any]:  # fmt: skip
     """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`.
 
     Returns where the program comes from, see `provenance`.
     """
-    sections, origin = make_sections(runs, fronts), summary.provenance()
-    note = f"{len(runs)} run{'s' * (len(runs) > 1)}; made by {summary.program_version(origin)}"
+    sections, origin, count = make_sections(rows, fronts), summary.provenance(), len(own_rows(rows))
+    note = f"{count} run{'s' * (count > 1)}; made by {summary.program_version(origin)}"
     (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:

@@ -10,14 +10,16 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
 from gsparc.evaluation.metric_formats import heading_of, score_of
-from gsparc.evaluation.report.runs import Run, distinct_baselines, error_sizes
-from gsparc.evaluation.report.tables import group_by_setting, interval_of_figure
+from gsparc.evaluation.report.tables import groups_of, interval_of_figure
+from gsparc.evaluation.results import Run, distinct_baselines, own_rows
+from gsparc.evaluation.table import Row
 from gsparc.prediction.pareto import pareto_front
 
 WIDE, TALL = 7.0, 3.8
@@ -40,23 +42,23 @@ def to_svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
+def draw_pareto(rows: pd.DataFrame, fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
     figure, ((axes,),) = panels(WIDE, TALL)
-    name = runs[0].row["figure"]
+    name = rows.figure.iloc[0]
     points: list[tuple[float, float]] = []
-    for (setting, group), style in _styled(runs):
-        for run in group:
-            p50, p95 = run.row["query_ms"], run.row["query_p95_ms"]
-            estimate = interval_of_figure(run.row, name)
+    for setting, group, style in _styled(rows):
+        for number, row in enumerate(group):
+            p50, p95 = row["query_ms"], row["query_p95_ms"]
+            estimate = interval_of_figure(row, name)
             if p50 is None or estimate is None:
                 continue
             axes.errorbar(
                 [p50], [estimate.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]], yerr=estimate.bars,
-                fmt="o", ms=4, lw=0.7, color=style["color"], label=setting if run is group[0] else None,
+                fmt="o", ms=4, lw=0.7, color=style["color"], label=None if number else setting,
             )  # fmt: skip
             points.append((p50, estimate.value))
-    others = [(base["method"], base["query_ms"], base["value"]) for base in _rivals(runs)]
+    others = [(base["method"], base["query_ms"], base["value"]) for base in _rivals(rows)]
     others = [other for other in others if other[1] is not None]
     points += [other[1:] for other in others]
     for columns in fronts:
@@ -74,7 +76,7 @@ def draw_pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = (
 
 
 def draw_distributions(
-    runs: Sequence[Run], names: Sequence[str], labels: Mapping[str, str] = MappingProxyType({})
+    rows: pd.DataFrame, names: Sequence[str], labels: Mapping[str, str] = MappingProxyType({})
 ) -> Figure:
     """Draw the shares of test samples that are at most so good, per setting over its seeds, a panel a figure.
 
@@ -83,8 +85,8 @@ def draw_distributions(
     """
     figure, ((*line,),) = panels(max(4.2 * len(names), WIDE), TALL, 1, len(names))
     for axes, name in zip(line, names, strict=True):
-        for (setting, group), style in _styled(runs):
-            every = [run.render_ms if name == TIMES else error_sizes(run, name) for run in group]
+        for setting, group, style in _styled(rows):
+            every = [_values_of(row["run"], name) for row in group]
             every = [values[np.isfinite(values)] for values in every]
             count = max(map(len, every)) if name != TIMES else sum(map(len, every))
             values, share = _shares(every)
@@ -93,7 +95,7 @@ def draw_distributions(
             axes.step(values, share, where="post", lw=1.2, label=labels.get(setting, setting), **style)
             low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
             axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
-        beside = [base["run"].samples for base in _rivals(runs) if base["method"] == "gp"]
+        beside = [base["run"].samples for base in _rivals(rows) if base["method"] == "gp"]
         if known := [own[f"baseline/gp/{name}"] for own in beside if f"baseline/gp/{name}" in own]:
             axes.step(*_shares(known), lw=0.8, label="gp", **style_of("gp").line)  # of all draws
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
@@ -106,21 +108,21 @@ def draw_distributions(
     return figure
 
 
-def draw_sweep(runs: Sequence[Run], title: str, path: Path) -> None:
+def draw_sweep(rows: pd.DataFrame, title: str, path: Path) -> None:
     """Save the figure that ends a sweep: distributions over test samples and of single queries, as PNG.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
-    names = [name for name in CDFS[runs[0].row["kind"]] if name in runs[0].samples]
-    names += [TIMES] if any(len(run.render_ms) for run in runs) else []
+    own = own_rows(rows)
+    names = [name for name in CDFS[own.kind.iloc[0]] if name in own.run.iloc[0].samples]
+    names += [TIMES] if any(len(run.render_ms) for run in own.run) else []
     if not names:  # nothing was tested
         return
     labels = {}
-    for setting, group in group_by_setting(runs).items():
-        seconds = np.mean([run.row["train_s"] for run in group])
-        ms = np.mean([run.row["query_ms"] for run in group if run.row["query_ms"] is not None])
+    for setting, group in groups_of(own).items():
+        seconds, ms = group.train_s.mean(), group.query_ms.dropna().mean()
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s, one query {ms:.3g} ms"
-    figure = draw_distributions(runs, names, labels)
+    figure = draw_distributions(rows, names, labels)
     figure.suptitle(title, fontsize=9)
     save(figure, path, 100)
 
@@ -131,19 +133,26 @@ def _shares(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return values, np.arange(1, len(values) + 1) / len(values)
 
 
-def _rivals(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _values_of(run: Run, name: str) -> np.ndarray:
+    """A per-sample figure (n,) of a run, empty where it has none; an error by its size."""
+    values = run.render_ms if name == TIMES else run.samples.get(name, np.zeros(0))
+    return np.abs(values) if name == "error_db" else values
+
+
+def _rivals(rows: pd.DataFrame) -> list[Row]:
     """Baselines of each draw that no run is of."""
-    methods = {run.row["method"] for run in runs}
-    return [row for row in distinct_baselines(runs) if row["method"] not in methods]
+    others = distinct_baselines(rows)
+    return others[~others.method.isin(own_rows(rows).method)].to_dict("records")  # type: ignore[return-value]
 
 
-def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:
-    """Settings, their runs, colour and line: a method's own where each has one setting, else one by one."""
-    groups = group_by_setting(runs)
-    names = [str(group[0].row["method"]) for group in groups.values()]
+def _styled(rows: pd.DataFrame) -> list[tuple[str, list[Row], dict[str, Any]]]:
+    """Settings, their rows, colour and line: a method's own where each has one setting, else one by one."""
+    groups = groups_of(own_rows(rows))
+    names = [str(group.method.iloc[0]) for group in groups.values()]
     unique = len(set(names)) == len(names)
     styles = [style_of(name).line if unique else numbered_style(i) for i, name in enumerate(names)]
-    return list(zip(groups.items(), styles, strict=True))
+    every = zip(groups.items(), styles, strict=True)
+    return [(setting, group.to_dict("records"), style) for (setting, group), style in every]  # type: ignore[misc]
 
 
 def shorten_setting(text: str, most: int = 32) -> str:

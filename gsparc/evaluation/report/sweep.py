@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,11 +17,11 @@ from rich.console import Console
 from gsparc.data.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
-from gsparc.evaluation.experiment.done import FAILURE
 from gsparc.evaluation.experiment.options import REDRAW
+from gsparc.evaluation.ledger import FAILURE
 
 if TYPE_CHECKING:
-    from gsparc.evaluation.report.runs import Run
+    import pandas as pd
 
 log = logging.getLogger(__name__)
 
@@ -76,35 +75,37 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
     and its table.
     """
+    from gsparc.evaluation.experiment.latency import time_again
     from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import write_report
-    from gsparc.evaluation.report.runs import drop_shared_overrides, find_runs, group_by_study, time_again
-    from gsparc.evaluation.report.tables import group_by_setting, table_of_leads, table_of_seeds
+    from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
+    from gsparc.evaluation.results import STUDY, frame, own_rows, short_settings
 
-    runs = find_runs([folder])
+    rows = frame(folder)
     if settings.retime:
-        runs = time_again(runs, rounds=settings.rounds, rounds_s=settings.rounds_s)
-    origin = write_report(folder, title, runs)
-    for number, (study, together) in enumerate(group_by_study(runs).items()):
-        group = drop_shared_overrides(together)
+        rows = time_again(rows, rounds=settings.rounds, rounds_s=settings.rounds_s)
+    origin = write_report(folder, title, rows)
+    for number, (study, together) in enumerate(rows.groupby(STUDY, sort=False, dropna=False)):
+        group = short_settings(together)
+        own = own_rows(group)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
-        plots.draw_sweep(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
+        plots.draw_sweep(group, f"{title}: {', split '.join(map(str, study))}", folder / f"{stem}.png")
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
-        seeds = {run.config.get("split.seed") for run in group}
-        if study[1] == "random" and len(seeds) > 1 == len({run.row["draw"] for run in group}):
+        seeds = {run.config.get("split.seed") for run in own.run}
+        if study[1] == "random" and len(seeds) > 1 == own.draw.nunique():
             log.warning("split.seed moves validation rows alone: %s", REDRAW)
-        for same in equal_settings(group_by_setting(group)):
+        for same in equal_settings(own):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
-    summary.write_summary(folder / "summary.json", {"sweep/runs": len(runs), **origin})
+    summary.write_summary(folder / "summary.json", {"sweep/runs": len(own_rows(rows)), **origin})
     console.print(f"written to {folder}", highlight=False)
 
 
-def equal_settings(groups: Mapping[str, Iterable[Run]]) -> list[str]:
-    """Return settings, each with its runs, whose runs have equal figures, one line for those that agree."""
+def equal_settings(own: pd.DataFrame) -> list[str]:
+    """Return settings of rows with their `run` that have equal figures, one line for those that agree."""
     alike: dict[str, list[str]] = defaultdict(list)
-    for setting, runs in groups.items():
+    for setting, runs in own.groupby("setting", sort=False).run:
         figures = (sorted(one for one in run.facts.items() if one[0].startswith(SCORED)) for run in runs)
-        alike[repr(sorted(map(repr, figures)))].append(setting)
+        alike[repr(sorted(map(repr, figures)))].append(str(setting))
     return [list_first(names) for names in alike.values() if len(names) > 1]

@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
-from gsparc.evaluation.report.runs import Run, distinct_baselines, group_in_order
+from gsparc.evaluation.results import distinct_baselines, own_rows
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
@@ -81,18 +81,24 @@ def pooled_interval(values: Sequence[float | None], draws: Sequence[str]) -> Int
     return Interval(known.value.mean(), *ends) if len(known) else None
 
 
-def has_draws(runs: Sequence[Run]) -> bool:
+def has_draws(rows: pd.DataFrame) -> bool:
     """Return whether a setting was run on several draws of the split."""
-    return any(len({run.row["draw"] for run in group}) > 1 for group in group_by_setting(runs).values())
+    return bool((own_rows(rows).groupby("setting").draw.nunique() > 1).any())
 
 
-def leads_of_baselines(group: Sequence[Run], figure: str) -> dict[str, Lead | None]:
-    """Return what each baseline has more of a figure than a setting, see `lead_over_runs`."""
-    rows = (row for run in group for row in (run.row, *run.baselines))
-    every = [row | {"figure": figure, "value": row.get(figure)} for row in rows]
-    own, beside = ([row for row in every if row["baseline"] is other] for other in (False, True))
-    methods = group_in_order(beside, lambda base: base["method"])
-    return {name: lead_over_runs(theirs, own) for name, theirs in methods.items()}
+def leads_of_baselines(rows: pd.DataFrame, setting: str, figure: str) -> dict[str, Lead | None]:
+    """Return what each baseline beside a setting has more of a figure, see `lead_over_runs`."""
+    own = own_rows(rows)[lambda own: own.setting == setting]
+    beside = rows[rows.baseline & rows.run.isin(own.run)]
+    others = {str(name): theirs for name, theirs in beside.groupby("method", sort=False)}
+    return {
+        name: lead_over_runs(_judged(theirs, figure), _judged(own, figure)) for name, theirs in others.items()
+    }
+
+
+def _judged(rows: pd.DataFrame, figure: str) -> list[Row]:
+    """The rows as they are judged by this figure."""
+    return rows.assign(figure=figure, value=rows.get(figure)).to_dict("records")  # type: ignore[return-value]
 
 
 def accuracy_column(figure: str, note: str = "") -> Column:
@@ -100,27 +106,27 @@ def accuracy_column(figure: str, note: str = "") -> Column:
     return Column(heading_of(figure), number_format(figure), note, partial(interval_of_figure, figure=figure))
 
 
-def _figures(row: Row) -> list[str]:
-    """Figures of its data, first the one that decides: with silent rows it is none of the usual ones."""
-    return list(dict.fromkeys([row["figure"], *TABLES[row["kind"]]]))
+def _figures(rows: pd.DataFrame) -> list[str]:
+    """Figures of these data, first the one that decides: with silent rows it is none of the usual ones."""
+    return list(dict.fromkeys([rows.figure.iloc[0], *TABLES[rows.kind.iloc[0]]]))
 
 
-def group_by_setting(runs: Sequence[Run]) -> dict[str, list[Run]]:
-    """Return runs that differ by their seed only, by setting, in order of appearance."""
-    return group_in_order(runs, lambda run: run.setting)
+def groups_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return rows that differ by their seed only, by setting, in order of appearance."""
+    return {str(setting): group for setting, group in rows.groupby("setting", sort=False)}
 
 
-def _run_columns(runs: Sequence[Run]) -> list[Column]:
-    return [SETTING, *([DRAW] * has_draws(runs)), SEED]
+def _run_columns(rows: pd.DataFrame) -> list[Column]:
+    return [SETTING, *([DRAW] * has_draws(rows)), SEED]
 
 
-def table_of_results(runs: Sequence[Run]) -> Table:
+def table_of_results(rows: pd.DataFrame) -> Table:
     """Return every run and every baseline of one study: accuracy, what it cost, memory, size, effects,
     origin.
     """
     note = "95 % interval: bootstrap over test samples"
     columns = [
-        *_run_columns(runs), *(accuracy_column(f, note) for f in _figures(runs[0].row)),
+        *_run_columns(rows), *(accuracy_column(f, note) for f in _figures(rows)),
         Column(heading_of(CALIBRATION), number_format(CALIBRATION), "1: deviations are right", CALIBRATION),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
@@ -131,67 +137,66 @@ def table_of_results(runs: Sequence[Run]) -> Table:
         Column("commit", "", of=lambda row: str(row["git"])[:8]),
     ]  # fmt: skip
     note = f"Brackets: 95 % intervals over test samples (independent samples assumed). {TIMED}"
-    rows = [*(run.row for run in runs), *distinct_baselines(runs)]
-    return Table.from_rows("Results", columns, rows, note=note)
+    shown = pd.concat([own_rows(rows), distinct_baselines(rows)]).to_dict("records")
+    return Table.from_rows("Results", columns, shown, note=note)  # type: ignore[arg-type]
 
 
-def table_of_seeds(runs: Sequence[Run]) -> Table:
+def table_of_seeds(rows: pd.DataFrame) -> Table:
     """Return settings and baselines side by side, their spread over seeds or draws of the split,
     and their cost.
     """
-    differs, several, spread = differing_settings(runs), has_draws(runs), _spread_columns(runs)
+    differs, several, spread = differing_settings(rows), has_draws(rows), _spread_columns(rows)
     also = [Column("differs, too", "")] if any(differs.values()) else []
-    every = [*(run.row for run in runs), *distinct_baselines(runs)]
-    groups = group_in_order(every, lambda row: row["setting"])
-    rows = []
-    for setting, group in groups.items():
-        draws = [row["draw"] for row in group]
-        counts = [len(set(draws)), len({row["seed"] for row in group})] if several else [len(group)]
-        values = [pooled_interval([column.value(row) for row in group], draws) for column in spread]
-        rows.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
+    lines = []
+    for setting, group in groups_of(pd.concat([own_rows(rows), distinct_baselines(rows)])).items():
+        seeds = group.seed.nunique(dropna=False)
+        counts = [group.draw.nunique(), seeds] if several else [len(group)]
+        values = [pooled_interval(group.apply(column.value, axis=1), group.draw) for column in spread]
+        lines.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
     counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
     note = "Brackets: least and largest over seeds, on the same test rows: split.seed draws others "
     note += "(split.redraw=true where the data name their test rows). "
     if several:
         note = "± standard error of the mean over draws of the split (split.seed). "
     columns, title = [SETTING, *also, *counted, *spread], f"Settings over {'draws' if several else 'seeds'}"
-    return Table(title, columns, rows, note + TIMED, ends={"low": "least", "high": "largest"})
+    return Table(title, columns, lines, note + TIMED, ends={"low": "least", "high": "largest"})
 
 
-def table_of_leads(runs: Sequence[Run]) -> Table:
+def table_of_leads(rows: pd.DataFrame) -> Table:
     """Return what each setting has more than the first one and than each baseline, pair by pair."""
-    groups, rows = group_by_setting(runs), []
-    first, *others = groups
-    leads = {setting: leads_of_baselines(group, group[0].row["figure"]) for setting, group in groups.items()}
-    for setting in others:
-        one, other = ([run.row for run in groups[name]] for name in (first, setting))
-        leads[setting] = {first: lead_over_runs(one, other), **leads[setting]}
-    for setting, against, lead in ((s, *pair) for s, own in leads.items() for pair in own.items()):
-        if lead is not None:
-            told = "same" if lead.same else "yes" if lead.sure else "no"
-            rows.append([setting, against, Interval(-lead.ahead_db, error=lead.error_db), lead.pairs, told])
+    settings = {name: group.to_dict("records") for name, group in groups_of(own_rows(rows)).items()}
+    first, *others = settings
+    lines, own = [], own_rows(rows)
+    for setting, group in settings.items():
+        leads = {first: lead_over_runs(settings[first], group)} if setting in others else {}  # type: ignore[arg-type]
+        leads |= leads_of_baselines(rows, setting, group[0]["figure"])
+        for against, lead in leads.items():
+            if lead is not None:
+                verdict = "same" if lead.same else "yes" if lead.sure else "no"
+                gain = Interval(-lead.ahead_db, error=lead.error_db)
+                lines.append([setting, against, gain, lead.pairs, verdict])
     ahead = Column("ahead of it, dB", ".2f")
     columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("told apart", "")]
-    figure = heading_of(runs[0].row["figure"])
+    figure = heading_of(own.figure.iloc[0])
     note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; told apart: 95 % (Student's t)."
-    if len({run.row["seed"] for run in runs}) == 1 and any("test rows" in str(row[3]) for row in rows):
+    if own.seed.nunique(dropna=False) == 1 and any("test rows" in str(line[3]) for line in lines):
         note += " Of one seed: what seeds change is not in the error (seed=0,1,2)."
-    return Table("Paired differences", columns, rows, note)
+    return Table("Paired differences", columns, lines, note)
 
 
-def _spread_columns(runs: Sequence[Run]) -> list[Column]:
-    figures = [Column(heading_of(f), number_format(f), of=f) for f in _figures(runs[0].row)]
-    if any(run.row["alone"] is not None for run in runs):
-        deciding = runs[0].row["figure"]
+def _spread_columns(rows: pd.DataFrame) -> list[Column]:
+    figures = [Column(heading_of(f), number_format(f), of=f) for f in _figures(rows)]
+    if rows.alone.notna().any():
+        deciding = rows.figure.iloc[0]
         name = f"{heading_of(deciding)} of Gaussians alone"
         figures.append(Column(name, number_format(deciding), of="alone"))
     return [*figures, TRAIN, P50, P95, Column(SIZE.name, ".0f", of=SIZE.of)]
 
 
-def differing_settings(runs: Sequence[Run]) -> dict[str, str]:
+def differing_settings(rows: pd.DataFrame) -> dict[str, str]:
     """Return, by setting, resolved values in which runs differ besides what was swept: `init=sphere, ...`."""
-    groups = group_by_setting(runs)
-    every = {setting: group[0].resolved for setting, group in groups.items()}
+    firsts = own_rows(rows).groupby("setting", sort=False).run.first()
+    every = {setting: run.resolved for setting, run in firsts.items()}
     # Names of all runs: a setting may be in one alone.
     names = dict.fromkeys(name for one in every.values() for name in one)
     # As text: lists of settings cannot be put into a set.
@@ -199,29 +204,30 @@ def differing_settings(runs: Sequence[Run]) -> dict[str, str]:
     if "model._target_" in vary:  # each model has settings of its own, which its name stands for
         vary = [n for n in vary if not n.startswith("model.")]
     return {
-        setting: ", ".join(f"{name}={one.get(name)}" for name in vary if not groups[setting][0].swept(name))
+        str(setting): ", ".join(f"{n}={one.get(n)}" for n in vary if not firsts[setting].swept(n))
         for setting, one in every.items()
     }
 
 
-def table_of_worst(runs: Sequence[Run]) -> Table:
+def table_of_worst(rows: pd.DataFrame) -> Table:
     """Return the three test positions with the largest error of each run."""
-    name = PER_SAMPLE[runs[0].row["kind"]]
+    own = own_rows(rows)
+    name = PER_SAMPLE[own.kind.iloc[0]]
     rival = f"baseline/gp/{name}"
-    beside = ("gp there",) if any(rival in run.samples for run in runs) else ()
+    beside = ("gp there",) if any(rival in run.samples for run in own.run) else ()
     numbers = [Column(head, ".2f") for head in (heading_of(name), *beside, "confidence")]
-    rows, who = [], _run_columns(runs)
+    lines, who = [], _run_columns(rows)
     columns = [*who, Column("sample", ""), Column("where [m]", ""), *numbers]
-    for run in runs:
-        if name not in run.samples:
+    for fit in own.to_dict("records"):
+        if name not in fit["run"].samples:
             continue
-        every = pd.DataFrame(run.samples)
+        every = pd.DataFrame(fit["run"].samples)
         # Decibels of quality are negated, so that the worst samples have the largest error.
         error = every[name].abs() if name == "error_db" else -every[name]
         for row in every.loc[error.nlargest(WORST).index].to_dict("records"):
             place = ", ".join(f"{row[axis]:.2f}" for axis in ("x_m", "y_m", "z_m"))
             figures = row[name], *([row.get(rival)] if beside else []), row["confidence"]
-            rows.append([*(one.value(run.row) for one in who), str(row["name"]), place, *figures])
+            lines.append([*(one.value(fit) for one in who), str(row["name"]), place, *figures])  # type: ignore[arg-type]
     hard = "; the Gaussian process there shows whether it is hard for all" if beside else ""
     note = f"The moving end's position{hard}."
-    return Table("The three worst places", columns, rows, note)
+    return Table("The three worst places", columns, lines, note)

@@ -13,9 +13,10 @@ from omegaconf import OmegaConf
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared import run_lock
 from gsparc.commands.shared.run_lock import HOLDER, LOCK, RunLock, hold_folder, locked, release_folders
-from gsparc.commands.train import LEFT, train
+from gsparc.commands.train import train
+from gsparc.evaluation.ledger import LEFT
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.report.runs import read_run
+from gsparc.evaluation.results import read_run
 from gsparc.models import checkpoint
 
 HOLDS = (

@@ -1,14 +1,18 @@
 """Cells of a comparison: what names one, what is found again, what is not."""
 
 import errno
+import json
 
 import pytest
 from hydra import initialize_config_module
 
-from gsparc.evaluation.experiment.cells import Cell, Contender
+from gsparc.evaluation.experiment.cells import Cell, Contender, job_of_cell
 from gsparc.evaluation.experiment.latency import time_by_dataset
 from gsparc.evaluation.experiment.problem import Problem, _may_match
-from gsparc.evaluation.experiment.run_cells import CellResult, prepare_cell, run_cells
+from gsparc.evaluation.experiment.runner import run_jobs
+from gsparc.evaluation.ledger import run_once
+from gsparc.evaluation.results import Run, as_frame
+from gsparc.evaluation.summary import write_summary
 from gsparc.models.checkpoint import CheckpointError
 
 
@@ -19,8 +23,8 @@ def problem(campaign, folds):
 
 def test_a_cell_whose_model_is_gone_is_not_timed(tmp_path):
     """Times that a comparison had kept stood in tables of other programs' models."""
-    gone = CellResult(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})
-    assert time_by_dataset([gone], {}).empty
+    gone = Run(tmp_path / "gp", {}).rows()[0] | {"dataset": "toy", "split": "random"}
+    assert time_by_dataset(as_frame([gone]), {}).empty
 
 
 def prepared(problem, folder, model="gsparc", effort=0.5, seed=0, settings=None, choose=()):
@@ -28,7 +32,7 @@ def prepared(problem, folder, model="gsparc", effort=0.5, seed=0, settings=None,
     contender = Contender(model, (f"model={model}", *choose), True)
     cell = Cell("own", "random", model, effort, seed)
     with initialize_config_module("gsparc.conf", version_base="1.3"):
-        return prepare_cell(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
+        return job_of_cell(cell, contender, {"file": "x", **(settings or {})}, problem, folder)
 
 
 @pytest.mark.parametrize(
@@ -53,9 +57,15 @@ def test_a_cell_was_taken_for_one_of_another_batch_effort_or_start(changes, tmp_
 def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
     """Published results outlive the program they were measured with: a table says so."""
     one = prepared(problem, tmp_path, "mean")
-    facts = {"program": one.state.program, "git": "0123456789"}
-    assert one.filled(facts).earlier == "" and one.filled({**facts, "program": "q"}).earlier == "01234567"
-    assert one.folder == tmp_path / "own" / "random" / "mean" / "0.5" / "0" and one.result() is None
+    assert one.folder == tmp_path / "own" / "random" / "mean" / "0.5" / "0"
+    run_once(
+        one.folder, one.state, lambda left: write_summary(one.folder / "summary.json", {"git": "0123456789"})
+    )
+    assert one.row()["earlier"] == ""
+    record = json.loads((one.folder / "job.json").read_text())
+    record["program"]["gsparc.models"] = "another"
+    (one.folder / "job.json").write_text(json.dumps(record))
+    assert one.row()["earlier"] == "01234567"
 
 
 def test_a_full_disk_ends_a_comparison(problem, tmp_path):
@@ -68,7 +78,7 @@ def test_a_full_disk_ends_a_comparison(problem, tmp_path):
 
     cells = [prepared(problem, tmp_path, method) for method in ("mean", "gp")]
     with pytest.raises(CheckpointError, match="cannot be written"):
-        run_cells(cells, full)
+        run_jobs(cells, full)
     assert len(tried) == 1
 
 

@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
+from gsparc.evaluation.intervals import pool_figures
+from gsparc.evaluation.scores import score_methods
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -17,7 +19,8 @@ def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, 
     def outcome():
         context = fold_contexts(FitContext(tmp_path), split)
         keep = lambda number, *unused: kept.append(number)  # noqa: E731
-        return fit_folds(method_class("gp")(), data, split, context, keep=keep).figures(data, split)
+        fits = fit_folds(method_class("gp")(), data, split, context, keep=keep)
+        return pool_figures(score_methods(fits.methods, data, split), data, split)
 
     here = outcome()
     elsewhere("joblib")

@@ -7,9 +7,6 @@ import torch
 from clocks import WoundClock
 
 from gsparc.evaluation.experiment import latency
-from gsparc.evaluation.experiment.cells import Cell
-from gsparc.evaluation.experiment.problem import Problem
-from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.models.method import Prediction
 from gsparc.prediction import timing
 
@@ -39,10 +36,9 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     )
     monkeypatch.setattr(latency, "SLOW_MS", 150.0)
     monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)
-    monkeypatch.setattr(latency, "FAST", replace(latency.FAST, rounds=12))
-    problem = Problem("toy", "random", (), campaign("spectrum", 20), folds(20))
-    cells = [CellResult(Cell("toy", "random", name, None, None), tmp_path / name, {}) for name in WAITS]
-    found = latency.time_queries(cells, problem)
+    files = {name: tmp_path / name / "model.ckpt" for name in WAITS}
+    fast = replace(latency.FAST, rounds=12)
+    found = latency.time_queries(files, campaign("spectrum", 20), folds(20), fast)
     assert list(found) == list(WAITS)
     assert {name: one["rounds"] for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}
     assert found["slow"]["query_ms"] == pytest.approx(200, abs=1) and found["quick"]["query_ms"] < 1

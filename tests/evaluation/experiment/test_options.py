@@ -8,6 +8,7 @@ import hydra
 import numpy as np
 import pytest
 import torch
+from campaigns import fit_context
 from hydra import initialize_config_module
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
@@ -18,7 +19,7 @@ from gsparc.data.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment import options
-from gsparc.evaluation.experiment.folds import fit_context, fit_folds
+from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.models.registry import build, fill_defaults
 from gsparc.models.terms import EffectSettings
 

@@ -1,6 +1,5 @@
 """The table says who is first, who is fast, and when a simple baseline wins."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,32 +7,30 @@ import pandas as pd
 import pytest
 
 from gsparc.evaluation.experiment import latency, pictures
-from gsparc.evaluation.experiment.cells import Cell
 from gsparc.evaluation.experiment.pictures import draw_efforts
-from gsparc.evaluation.experiment.run_cells import CellResult
 from gsparc.evaluation.experiment.table import (
     average_cells,
     columns_of_csv,
     markdown,
     remarks,
     split_by_problem,
-    table_of_cells,
     title_of,
 )
 from gsparc.evaluation.paired import lead_over_rows
+from gsparc.evaluation.results import Run, as_frame
 
 
 def filled(method, value, seed=None, effort=None, split="random", kind="spectrum", **more):
-    """A cell with the figure that decides, and other facts."""
+    """The row of a cell with the figure that decides, and other facts."""
     figures = {"spectrum": ("psnr_db", "ssim"), "rssi": ("rmse_db", "mae_db")}[kind]
     facts = {f"test/{name}": number for name, number in zip(figures, (value, 0.9), strict=True)}
     facts |= {
         "split/sha256": f"{split}{seed if more.get('drawn') else ''}",
         "dataset/kind": kind, "time/train_s": 1.0, "time/train_cpu_s": 1.0, "machine/load": 0.1,
     }  # fmt: skip
-    drawn, earlier = more.pop("drawn", False), more.pop("earlier", "")
-    cell = Cell("rfid", split, method, effort, seed)
-    return CellResult(cell, Path("absent"), facts | {"dataset/kind": kind} | more, drawn, earlier)
+    cell = {"dataset": "rfid", "split": split, "method": method, "effort": effort, "seed": seed}
+    cell |= {"draws": more.pop("drawn", False), "earlier": more.pop("earlier", "")}
+    return Run(more.pop("folder", Path("absent")), facts | more).rows()[0] | cell
 
 
 def drawn(method, *values, **more):
@@ -43,7 +40,11 @@ def drawn(method, *values, **more):
 
 def said_of(cells, ours="gsparc"):
     """Remarks on the first table of cells."""
-    return " | ".join(remarks(split_by_problem(average_cells(cells))[0], ours))
+    return " | ".join(remarks(split_by_problem(averages(cells))[0], ours))
+
+
+def averages(cells, timed=None):
+    return average_cells(as_frame(cells), timed)
 
 
 FOUND = [
@@ -58,7 +59,7 @@ TIMED = pd.DataFrame(
 
 
 def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
-    found = split_by_problem(average_cells(FOUND, TIMED))
+    found = split_by_problem(averages(FOUND, TIMED))
     assert [(title_of(block), list(block.method)) for block in found] == [
         ("rfid, split random, effort 1", ["gp", "gsparc", "gsrf"]),
         ("rfid, split random, effort 3", ["gp", "gsrf"]),
@@ -74,7 +75,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     facts = {"test/interval/coverage_90": 0.8, "test/outage/brier": 0.0125}
     how = {"kind": "rssi", "split": "drawn", **facts}
     found = drawn("gp", 5.0, 7.0, 9.0, **how) + drawn("idw", 6.0, 8.1, 10.2, **how)
-    (block,) = split_by_problem(average_cells(found))
+    (block,) = split_by_problem(averages(found))
     gp, idw = block.itertuples()
     assert (gp.method, gp.behind_db, idw.behind_db) == ("gp", 0.0, pytest.approx(1.1))
     assert idw.behind_error_db == pytest.approx(0.1 / 3**0.5) and gp.spread_db == pytest.approx(2 / 3**0.5)
@@ -85,13 +86,12 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert "simple baseline wins" not in page, "there are no others"
     (said, *_) = remarks(block, "gsparc")
     assert "; 1.10 ± 0.06 dB before idw (standard error over the same 3 draws): they are told" in said
-    assert table_of_cells(found)[["seed", "value"]].values[:2].tolist() == [[0, 5.0], [1, 7.0]]
 
 
 def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
     there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
     drawn = {"kind": "rssi", "drawn": True}
-    found = average_cells([filled(method, 5.0, 0, split=split, **drawn) for split, method in there])
+    found = averages([filled(method, 5.0, 0, split=split, **drawn) for split, method in there])
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
     pictures.draw_splits(found, tmp_path / "city.png")
@@ -103,7 +103,7 @@ def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monk
     """The legend drew every mark with an error bar, also of points without one."""
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
-    draw_efforts(average_cells(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
+    draw_efforts(averages(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
     (legend,) = figures[0].legends
     marks = {
         text.get_text(): line.get_marker()
@@ -113,7 +113,7 @@ def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monk
 
 
 def test_losers_are_not_hidden():
-    said = " | ".join(remarks(split_by_problem(average_cells(FOUND, TIMED))[0], "gsparc"))
+    said = " | ".join(remarks(split_by_problem(averages(FOUND, TIMED))[0], "gsparc"))
     assert "first: gp" in said and "a simple baseline wins: take gp" in said
     absent = said_of(FOUND, "never run")
     assert "never run was not run: no verdict" in absent and "baseline wins" not in absent
@@ -128,7 +128,7 @@ def test_losers_are_not_hidden():
 
 def test_what_an_earlier_program_measured_is_said():
     old = filled("gsrf", 29.0, 0, 1.0, earlier="0123abcd")
-    found = split_by_problem(average_cells([*FOUND[:1], old]))[0]
+    found = split_by_problem(averages([*FOUND[:1], old]))[0]
     assert list(found.earlier) == ["", "0123abcd"]
     assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
 
@@ -136,7 +136,7 @@ def test_what_an_earlier_program_measured_is_said():
 def test_how_a_method_approximates_stands_behind_its_name():
     labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
     found = [filled("gp", 30.0, i, 1.0, **{"model/label": label}) for i, label in enumerate(labels)]
-    (block,) = split_by_problem(average_cells(found))
+    (block,) = split_by_problem(averages(found))
     assert list(block.label) == [" (Vecchia 30)"] and "gp (Vecchia 30)" in markdown([block], "gsparc")
 
 
@@ -144,7 +144,7 @@ def test_lists_were_compared_by_their_listed_rows_alone():
     """kriging was first by these, while the pages and `train` name the figure with unlisted rows."""
     errors = (("kriging", 4.6, 5.2), ("gsparc", 4.9, 4.2))
     found = [filled(m, e, 0, kind="rssi", **{"test/rmse_db_with_silent": silent}) for m, e, silent in errors]
-    (block,) = split_by_problem(average_cells(found))
+    (block,) = split_by_problem(averages(found))
     first = next(block.itertuples())
     assert (first.method, first.figure, first.second_figure) == ("gsparc", "rmse_db_with_silent", "rmse_db")
 
@@ -152,7 +152,7 @@ def test_lists_were_compared_by_their_listed_rows_alone():
 def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
     """Its figure had no heading; that of errors was `-RMSE dB`, with negative numbers."""
     facts = {"test/rmse_db_with_silent": 4.2, "test/reduced_chi2": 25.0}
-    found = average_cells([filled("gp", 5.0, 0, 1.0, kind="rssi", **facts)])
+    found = averages([filled("gp", 5.0, 0, 1.0, kind="rssi", **facts)])
     page = markdown(split_by_problem(found), "gsparc")
     assert "| RMSE dB, silent too (less is better) |" in page and "gp, RMSE dB, silent too 4.20" in page
     assert "std of gp is 5 times too small" in page and "gsparc map" in page
@@ -166,8 +166,8 @@ def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
     for method, level in (("gp", 28.0 + ahead), ("idw", np.full(4, 28.0))):
         (tmp_path / method).mkdir()
         pd.DataFrame({"row": range(4), "psnr_db": level}).to_csv(tmp_path / method / "per_sample.csv")
-        cells.append(replace(filled(method, level.mean()), folder=tmp_path / method))
-    (block,) = split_by_problem(average_cells(cells))
+        cells.append(filled(method, level.mean(), folder=tmp_path / method))
+    (block,) = split_by_problem(averages(cells))
     (said, *_) = remarks(block, "gsparc")
     assert "; 2.00 ± 0.41 dB before idw (standard error over the same 4 test rows): they are told" in said
 
@@ -187,7 +187,7 @@ def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, m
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
     near = [filled("gp", 30.0), filled("gsparc", 29.0, **{"time/train_cpu_s": 4.0})]
-    draw_efforts(average_cells(near, TIMED), tmp_path / "compare.png", "gsparc")
+    draw_efforts(averages(near, TIMED), tmp_path / "compare.png", "gsparc")
     figures[0].canvas.draw()
     axes = figures[0].axes[:2]
     assert [axis.get_title() for axis in axes] == ["rfid, random", "rfid, queries"]
@@ -221,7 +221,7 @@ def test_the_csv_file_had_other_signs_than_the_console():
     """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws, a spread was an error."""
     draws = drawn("gp", 5.0, 6.0, 7.0, kind="rssi", split="drawn")
     seeds = [filled("gsparc", 5.0 + seed, seed, 1.0, kind="rssi") for seed in range(2)]
-    gp, gsparc = pd.DataFrame(columns_of_csv(average_cells([*draws, *seeds]))).itertuples()
+    gp, gsparc = pd.DataFrame(columns_of_csv(averages([*draws, *seeds]))).itertuples()
     assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
     assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
     assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(gsparc.score_error_db)
@@ -235,10 +235,10 @@ def test_what_methods_were_given_besides_places_was_not_said():
 def test_draws_with_the_same_test_rows_had_a_standard_error():
     """`split=random, draws: 3` of a release that names its test rows gave three copies of one split."""
     found = drawn("gp", 30.0, 31.0, 32.0, **{"split/test_sha256": "t"})
-    (block,) = split_by_problem(average_cells(found))
+    (block,) = split_by_problem(averages(found))
     (row,) = block.itertuples()
     assert not row.draws and row.seeds == 3 and "draws" not in title_of(block)
-    (block,) = split_by_problem(average_cells(found[:1]))
+    (block,) = split_by_problem(averages(found[:1]))
     assert title_of(block).endswith("one draw")
 
 
@@ -246,10 +246,10 @@ def test_the_last_of_three_was_bold_in_a_comparison():
     """`ours` was, 14 dB behind; README has in bold what is best and told apart."""
     behind = {"gsparc": 0.0, "gp": 1.0, "complex_gp": 14.0}.items()
     cells = [c for name, by in behind for c in drawn(name, *(30 - by - n * (1 + by / 50) for n in range(3)))]
-    (block,) = split_by_problem(average_cells(cells))
+    (block,) = split_by_problem(averages(cells))
     page = markdown([block], "complex_gp")
     assert "| **gsparc** |" in page and "| complex_gp (ours) |" in page and page.count("**gsparc**") == 1
-    (alone,) = split_by_problem(average_cells(cells[:3]))
+    (alone,) = split_by_problem(averages(cells[:3]))
     assert "**" not in markdown([alone], "gsparc")
 
 
@@ -258,5 +258,5 @@ def test_the_lead_of_the_first_had_no_verdict():
     leads = ((6.0, 5.9, 6.1), "they are told apart"), ((2.0, 0.1, 0.9), "they are not told apart")
     for gains, verdict in leads:
         cells = drawn("gp", 30.0, 30.0, 30.0) + drawn("gsparc", *(30.0 + gain for gain in gains))
-        (block,) = split_by_problem(average_cells(cells))
+        (block,) = split_by_problem(averages(cells))
         assert remarks(block, "gsparc")[0].endswith(f"over the same 3 draws): {verdict}")

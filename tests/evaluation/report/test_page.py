@@ -11,7 +11,7 @@ from gsparc.commands.report import task
 from gsparc.evaluation.drawing import style_of
 from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import make_sections, render_html, warnings
-from gsparc.evaluation.report.runs import Run, find_runs
+from gsparc.evaluation.results import Run, frame, frame_of_runs
 
 arguments = COMMANDS["report"].arguments
 
@@ -51,7 +51,7 @@ def test_the_page_fetches_nothing(written):
 
 def test_what_a_run_is_called_cannot_become_a_script(run_dir, tmp_path):
     run_dir(tmp_path / "x", name="<script>alert(1)</script>")
-    text = render_html("<b>", "now", make_sections(find_runs([tmp_path / "x"])))
+    text = render_html("<b>", "now", make_sections(frame(tmp_path / "x")))
     assert "<script>alert" not in text and "<b>" not in text
 
 
@@ -59,7 +59,7 @@ def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
     """And in another plot it had the colour of another method."""
     for name in ("gsparc", "gp"):
         run_dir(tmp_path / name, name=name)
-    runs = find_runs([tmp_path])
+    runs = frame(tmp_path)
     axes = plots.draw_distributions(runs, ["psnr_db"]).axes[0]
     assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
     colours = {to_hex(one.get_color()).upper() for one in axes.lines if one.get_label() in ("gsparc", "gp")}
@@ -106,8 +106,8 @@ def test_no_baseline_is_the_better_choice_than_a_run_that_beats_it(run_dir, tmp_
     """A page of gsparc and worse methods called gp the better choice, because it beat the worse ones."""
     better = run_dir(tmp_path / "a", psnr=29.5)
     worse = run_dir(tmp_path / "b", name="nearest", psnr=26.0)
-    assert warnings(find_runs([better, worse])) == []
-    assert "gp has the better psnr_db" in warnings(find_runs([worse]))[0]
+    assert warnings(frame(better, worse)) == []
+    assert "gp has the better psnr_db" in warnings(frame(worse))[0]
 
 
 def test_a_report_of_draws_said_nothing_of_heard_rows(tmp_path):
@@ -118,7 +118,7 @@ def test_a_report_of_draws_said_nothing_of_heard_rows(tmp_path):
         facts = {"dataset/kind": "rssi", "split/sha256": str(draw), "model/name": "gsparc", "seed": 0}
         facts |= figures | {"baseline/gp/rmse_db_with_silent": 3.0 + off}
         runs.append(Run(tmp_path, facts, overrides=(f"split.seed={draw}",)))
-    assert warnings(runs) == [
+    assert warnings(frame_of_runs(runs)) == [
         "gsparc is 1.03 ± 0.09 dB better over 3 draws in rmse_db_with_silent than gp, the best baseline",
         "the baseline gp is 1.03 ± 0.09 dB better over 3 draws in rmse_db of heard rows",
     ]

@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 from campaigns import brief, spectra
 from hydra.core.utils import JobReturn, JobStatus
@@ -123,8 +124,14 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
 
 
 def test_settings_that_change_nothing_were_tabled_as_if_they_were_compared():
-    def of(seed, value, hidden):
-        return SimpleNamespace(facts={"seed": seed, "test/nmse": value, "time/train_s": hidden})
+    def of(setting, seed, value, hidden):
+        return setting, SimpleNamespace(facts={"seed": seed, "test/nmse": value, "time/train_s": hidden})
 
-    groups = {"a": [of(0, 0.1, 1), of(1, 0.2, 1)], "b": [of(1, 0.2, 2), of(0, 0.1, 2)], "c": [of(0, 0.1, 3)]}
-    assert equal_settings(groups) == ["a, b"]
+    rows = [
+        of("a", 0, 0.1, 1),
+        of("a", 1, 0.2, 1),
+        of("b", 1, 0.2, 2),
+        of("b", 0, 0.1, 2),
+        of("c", 0, 0.1, 3),
+    ]
+    assert equal_settings(pd.DataFrame(rows, columns=["setting", "run"])) == ["a, b"]

@@ -11,8 +11,8 @@ from rich.console import Console
 from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.report import tables
 from gsparc.evaluation.report.page import warnings
-from gsparc.evaluation.report.runs import Run, drop_shared_overrides, find_runs
 from gsparc.evaluation.report.tables import bootstrap_interval
+from gsparc.evaluation.results import Run, frame, frame_of_runs, own_rows, short_settings
 from gsparc.evaluation.table import Column, Interval, Table
 
 
@@ -21,15 +21,12 @@ def cells(table, row: int) -> dict:
 
 
 def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
-    runs = find_runs([three[0].parent])
-    assert [run.folder.name for run in runs] == ["a0", "a1", "b0"] and find_runs(three[:1])[0].facts[
-        "seed"
-    ] == 0
-    assert [run.setting for run in drop_shared_overrides(runs)] == ["gsparc emission.hidden=8"] * 2 + [
-        "gsparc emission.hidden=64"
-    ]
-    assert {run.setting for run in drop_shared_overrides(runs[:2])} == {"gsparc"}
-    assert list(tables.group_by_setting(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
+    rows = own_rows(frame(three[0].parent))
+    assert [run.folder.name for run in rows.run] == ["a0", "a1", "b0"] and list(rows.seed) == [0, 1, 0]
+    settings = ["gsparc emission.hidden=8"] * 2 + ["gsparc emission.hidden=64"]
+    assert list(own_rows(short_settings(rows)).setting) == settings
+    assert {*own_rows(short_settings(rows[:2])).setting} == {"gsparc"}
+    assert list(tables.groups_of(rows)) == settings[1:]
 
 
 @pytest.mark.parametrize(("folder", "text", "message"), [
@@ -43,11 +40,11 @@ def test_a_directory_without_a_run_is_named(folder, text, message, tmp_path):
     if text is not None:
         (tmp_path / folder / "summary.json").write_text(text)
     with pytest.raises(ValueError, match=message):
-        find_runs([tmp_path / folder])
+        frame(tmp_path / folder)
 
 
 def test_results_have_accuracy_beside_time_memory_and_origin(three):
-    table = tables.table_of_results(find_runs(three))
+    table = tables.table_of_results(frame(*three))
     row = cells(table, 0)
     assert row["PSNR dB"].value == 28.0 and row["PSNR dB"].low < 28.0 < row["PSNR dB"].high
     assert row["train s/fold"] == 10 and row["query ms p50"] == 0.5 and row["memory MB"] == 800
@@ -59,7 +56,7 @@ def test_results_have_accuracy_beside_time_memory_and_origin(three):
 
 
 def test_seeds_are_put_together_with_their_spread(three):
-    table = tables.table_of_seeds(find_runs(three))
+    table = tables.table_of_seeds(frame(*three))
     found = cells(table, 0)["PSNR dB"]
     assert (found.value, found.low, found.high) == (pytest.approx(28.2), 28.0, 28.4)
     assert cells(table, 0)["seeds"] == 2 and cells(table, 1)["PSNR dB"] == Interval(29.5)
@@ -75,12 +72,13 @@ def test_an_interval_covers_as_often_as_it_says():
 
 
 def test_the_worst_receivers_are_the_worst(three):
-    runs = find_runs(three[:1])
+    runs = frame(three[0])
+    samples = runs.run[0].samples
     table = tables.table_of_worst(runs)
     values = [row[4] for row in table.rows]
-    assert values == sorted(runs[0].samples["psnr_db"])[:3]
+    assert values == sorted(samples["psnr_db"])[:3]
     assert table.rows[0][5] == pytest.approx(values[0] - 0.5)  # the Gaussian process at the same place
-    del runs[0].samples["baseline/gp/psnr_db"]  # powers have no such column: it was left empty
+    del samples["baseline/gp/psnr_db"]  # powers have no such column: it was left empty
     assert "gp there" not in [column.name for column in tables.table_of_worst(runs).columns]
 
 
@@ -96,7 +94,7 @@ def test_a_table_survives_csv_and_markdown():
 
 def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
     (three[0] / "render_ms.csv").write_text("render_ms\n0.1\n0.1\n0.3\n")
-    assert [run.row["query_ms"] for run in find_runs(three[:2])] == [0.1, 0.5]
+    assert list(own_rows(frame(*three[:2])).query_ms) == [0.1, 0.5]
     assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
 
 
@@ -115,7 +113,7 @@ def test_settings_of_several_models_were_told_for_each(tmp_path):
         Run(tmp_path, {"model/name": str(i)}, config={**kind, "init.count": i})
         for i, kind in enumerate(kinds)
     ]
-    told = "".join(tables.differing_settings(runs).values())
+    told = "".join(tables.differing_settings(frame_of_runs(runs)).values())
     assert "init.count=1" in told and "model.x" not in told and "model._target_" not in told
 
 
@@ -123,7 +121,7 @@ def test_a_report_of_lists_left_out_the_figure_that_decides(tmp_path):
     """Beside its table of listed rows a remark named the better baseline by all rows."""
     figures = {"rmse_db": 4.6, "mae_db": 3.0, "rmse_db_with_silent": 2.2}
     run = Run(tmp_path, {"dataset/kind": "rssi", **{f"test/{name}": v for name, v in figures.items()}})
-    shown = cells(tables.table_of_results([run]), 0)
+    shown = cells(tables.table_of_results(frame_of_runs([run])), 0)
     assert list(shown)[2:5] == ["RMSE dB, silent too", "RMSE dB", "MAE dB"]
     assert shown["RMSE dB, silent too"].value == 2.2
 
@@ -135,7 +133,7 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
         facts = json.loads((folder / "summary.json").read_text())
         facts |= {"split/sha256": f"{draw}" * 64, "baseline/gp/psnr_db": gp}
         (folder / "summary.json").write_text(json.dumps(facts))
-    runs = drop_shared_overrides(find_runs([tmp_path]))
+    runs = short_settings(frame(tmp_path))
     pooled = tables.table_of_seeds(runs)
     assert pooled.title == "Settings over draws" and [row[0] for row in pooled.rows] == [
         "gsparc", "mean (baseline)", "gp (baseline)",
@@ -164,20 +162,22 @@ def test_copies_of_one_split_counted_as_draws(run_dir, tmp_path):
         file = run_dir(tmp_path / str(draw), overrides=(f"split.seed={draw}",)) / "summary.json"
         facts = json.loads(file.read_text()) | {"split/sha256": f"{draw}" * 64, "split/test_sha256": "t"}
         file.write_text(json.dumps(facts))
-    runs = drop_shared_overrides(find_runs([tmp_path]))
+    runs = short_settings(frame(tmp_path))
     pooled = tables.table_of_seeds(runs)
     assert pooled.title == "Settings over seeds" and "split.redraw=true" in pooled.note
     assert cells(pooled, 0)["seeds"] == 3 and cells(pooled, 0)["PSNR dB"].error is None
     assert all("draws" not in row[3] for row in tables.table_of_leads(runs).rows)
-    assert lead_over_runs([runs[0].row], [runs[1].row]) is None, "they learned from other rows"
+    assert lead_over_runs(*([row] for row in own_rows(runs)[:2].to_dict("records"))) is None, (
+        "they learned from other rows"
+    )
 
 
 def test_a_sweep_of_seeds_did_not_say_that_the_split_is_one(three):
-    assert "on the same test rows: split.seed draws others" in tables.table_of_seeds(find_runs(three)).note
+    assert "on the same test rows: split.seed draws others" in tables.table_of_seeds(frame(*three)).note
 
 
 def test_one_model_had_two_latencies_and_a_note_in_the_report_alone(three):
-    runs = find_runs(three)
+    runs = frame(*three)
     notes = [tables.table_of_seeds(runs).note, tables.table_of_results(runs).note]
     assert all("a run's own table has other milliseconds" in note for note in notes)
 
@@ -187,7 +187,7 @@ def sweep_of(run_dir, folder, levels):
     for seed, pair in enumerate(levels):
         for word, level in zip(("on", "off"), pair, strict=True):
             run_dir(folder / f"{word}{seed}", seed=seed, psnr=level, overrides=(f"x={word}", f"seed={seed}"))
-    return drop_shared_overrides(find_runs([folder]))
+    return short_settings(frame(folder))
 
 
 def test_an_ablation_by_multirun_had_no_paired_difference(run_dir, tmp_path):
@@ -198,7 +198,7 @@ def test_an_ablation_by_multirun_had_no_paired_difference(run_dir, tmp_path):
     assert lead[2].value == pytest.approx(0.2) and lead[2].error == pytest.approx(0.1)
     assert (
         "| gsparc x=on | gsparc x=off | 0.20 ± 0.10 | 2 seeds | no |"
-        in tables.table_of_leads(find_runs([tmp_path / "a"])).markdown()
+        in tables.table_of_leads(frame(tmp_path / "a")).markdown()
     )
 
 
@@ -212,8 +212,9 @@ def test_settings_were_told_apart_without_a_word_on_the_seed_that_they_share(run
 def test_a_method_without_chance_had_differences_without_error(run_dir, tmp_path):
     """Three seeds of a closed form are one fit: its difference is known as well as its test rows tell it."""
     runs = sweep_of(run_dir, tmp_path, [(29.0, 28.7)] * 3)
-    for run in runs:
+    for row in own_rows(runs).itertuples():
         change = np.repeat([0.1, 0.0], 12)  # on half of the rows
-        run.samples["psnr_db"] = run.samples["psnr_db"] + (change if "on" in run.setting else -change)
+        samples = row.run.samples
+        samples["psnr_db"] = samples["psnr_db"] + (change if "on" in row.setting else -change)
     (lead,) = tables.table_of_leads(runs).rows
     assert lead[3] == "24 test rows" and lead[2].error == pytest.approx(0.1 / 23**0.5)

@@ -1,9 +1,11 @@
 """A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
 
 import ast
+import importlib
+import json
 import os
 import sys
-from importlib.util import spec_from_file_location
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,28 +14,26 @@ from campaigns import compose, spectra
 from omegaconf import OmegaConf
 
 import gsparc
-from gsparc.commands.train import read_inputs
+from gsparc.commands.shared.inputs import read_inputs
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split, hash_indices
-from gsparc.evaluation.experiment import done
-from gsparc.evaluation.experiment.done import (
+from gsparc.evaluation import ledger
+from gsparc.evaluation.ledger import (
     FAILURE,
     State,
+    edited,
     measurements_hash,
-    package_hash,
-    program_files,
+    program,
     read_finished,
-    recorded,
     run_once,
     strip_comments,
 )
+from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import write_summary
 
 
 def state(**changes) -> State:
-    return State(
-        **({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s", "program": "p"} | changes)
-    )
+    return State(**({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s"} | changes))
 
 
 def ends(folder, value=1.0, seen=None):
@@ -61,7 +61,6 @@ def cut_short(folder, name="last.ckpt"):
     {"files": {"init.file": "0"}},
     {"data": "e"},
     {"split": "t"},
-    {"program": "q"},
 ])  # fmt: skip
 def test_a_cell_is_done_once_in_one_state(tmp_path, other):
     assert run_once(tmp_path, state(), ends(tmp_path, 1)) == run_once(tmp_path, state(), ends(tmp_path, 2))
@@ -71,12 +70,6 @@ def test_a_cell_is_done_once_in_one_state(tmp_path, other):
     assert run_once(tmp_path, state(**other), ends(tmp_path, 4), again=True) == {"value": 4}
     (tmp_path / "summary.json").write_text("{")  # no whole one
     assert read_finished(tmp_path, state(**other)) is None
-
-
-def test_another_program_s_result_counts_where_that_is_asked(tmp_path):
-    run_once(tmp_path, state(), ends(tmp_path, 1))
-    assert run_once(tmp_path, state(program="q"), ends(tmp_path, 2), reuse=True) == {"value": 1}
-    assert run_once(tmp_path, state(program="q"), ends(tmp_path, 2)) == {"value": 2}
 
 
 @pytest.mark.parametrize(
@@ -96,11 +89,11 @@ def test_an_interrupted_job_goes_on_and_then_counts_as_done(tmp_path, name, resu
 
 
 def test_a_checkpoint_of_another_state_is_not_gone_on_from(tmp_path):
-    for program in "pq":
+    for data in "ed":
         with pytest.raises(KeyboardInterrupt):
-            run_once(tmp_path, state(program=program), cut_short(tmp_path))
+            run_once(tmp_path, state(data=data), cut_short(tmp_path))
     seen = []
-    run_once(tmp_path, state(), ends(tmp_path, 1, seen))
+    run_once(tmp_path, state(data="e"), ends(tmp_path, 1, seen))
     assert seen == [None]
 
 
@@ -115,7 +108,7 @@ def of(file, *words) -> State:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
     begun = read_inputs(config)
-    return State.from_config(config, measurements_hash(begun.module.measurements), begun.split.sha256)
+    return State.from_config(config, measurements_hash(begun.data), begun.split.sha256)
 
 
 def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
@@ -150,20 +143,20 @@ def test_a_finished_job_answered_for_data_of_equal_size_and_time(tmp_path):
 
 def test_a_job_found_done_read_its_data_first(tmp_path):
     """Seconds for each job of a sweep said again; files of the same bytes say the same."""
-    file, read = spectra(tmp_path / "own.npz"), state()
-    configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 0, 1)]
-    unread, same, other = map(State.unread, configs)
-    with recorded(tmp_path, read, unread) as left:
-        ends(tmp_path)(left)
-    assert read_finished(tmp_path, same) == {"value": 1} and read_finished(tmp_path, other) is None
+    file = spectra(tmp_path / "own.npz")
+    configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 1)]
+    unread, other = map(State.from_config, configs)
+    run_once(tmp_path, replace(unread, data="d", split="s"), ends(tmp_path))
+    assert read_finished(tmp_path, unread) == {"value": 1} and read_finished(tmp_path, other) is None
     with file.open("ab") as stream:
         stream.write(b" ")
-    assert read_finished(tmp_path, State.unread(configs[0])) is None
+    assert read_finished(tmp_path, State.from_config(configs[0])) is None
+    assert read_finished(tmp_path, State.from_config(configs[0], "d", "s")) == {"value": 1}
     release = compose("dataset=rfid", f"dataset.root='{tmp_path}'", "model=mean")
-    before = State.unread(release)
+    before = State.from_config(release)
     (tmp_path / "more.txt").touch()
-    assert before and before != State.unread(release)
-    assert State.unread(compose("dataset=rfid", "dataset.root=null", "model=mean")) is None
+    assert before.tells_data and before != State.from_config(release)
+    assert not State.from_config(compose("dataset=rfid", "dataset.root=null", "model=mean")).tells_data
 
 
 def test_commits_of_comments_alone_made_every_cell_stale():
@@ -183,22 +176,70 @@ def test_text_after_a_colon_was_taken_for_a_docstring():
     assert "said" not in strip_comments('def f(\n    x,\n) -> int:\n    """said"""\n    return x\n')
 
 
-def test_a_plugin_s_helper_or_weights_were_edited_and_it_counted_as_done(tmp_path, monkeypatch):
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    """Write a module `lone_plugin`, which imports `lone_helper` and reads weights; return their folder."""
+    folder = tmp_path / "plugin"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+    (folder / "lone_plugin.py").write_text("import lone_helper\nREADS = ('*.npz',)\n")
+    (folder / "lone_helper.py").write_text('"""Of a value."""\nVALUE = 1\n')
+    (folder / "weights.npz").write_text("1")
+    importlib.import_module("lone_plugin")
+    yield folder
+    for name in ("lone_plugin", "lone_helper"):
+        sys.modules.pop(name, None)
+    ledger._hash_of_program.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "counts"),
+    [
+        ("lone_helper.py", "VALUE = 2\n", ["lone_helper"]),
+        ("weights.npz", "2", ["lone_plugin:*.npz"]),
+        ("lone_helper.py", '"""Of a value."""\n\nVALUE = 1  # in metres\n', []),
+        ("README.md", "other words", []),
+        ("lone_other.py", "VALUE = 2\n", []),  # a new program beside it that nobody imports
+    ],
+)
+def test_a_plugin_s_helper_or_weights_were_edited_and_it_counted_as_done(
+    tmp_path, plugin, file, text, counts
+):
     """Two jobs were done already, 2.93 dB where over 20 is right."""
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "lone_plugin.py").write_text("import lone_helper\n")
-    (tmp_path / "lone_parts").mkdir()
-    files = ["lone_helper.py", "weights.npz", "lone_parts/__init__.py", "lone_parts/table.csv"]
-    for name in files:
-        (tmp_path / name).write_text("1\n")
-    hashes = [package_hash("lone_plugin")]
-    for name in files:
-        (tmp_path / name).write_text("2\n")
-        hashes.append(package_hash("lone_plugin"))
-    assert len({*hashes}) == 5
-    (tmp_path / "outputs").mkdir()  # of runs
-    (tmp_path / "outputs" / "summary.json").write_text("{}")
-    assert package_hash("lone_plugin") == hashes[-1]
+    run_once(tmp_path, state(), ends(tmp_path, 1))
+    (plugin / file).write_text(text)
+    ledger._hash_of_program.cache_clear()  # another process
+    assert state().changes(read_summary(tmp_path / "job.json")) == counts
+    assert (read_finished(tmp_path, state()) is None) == bool(counts)
+    assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
+    assert run_once(tmp_path, state(), ends(tmp_path, 2)) == {"value": 2 if counts else 1}
+
+
+def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path, plugin):
+    run_once(tmp_path, state(), ends(tmp_path, 1))
+    (plugin / "lone_other.py").write_text("VALUE = 2\n")  # that nobody imports
+    assert read_finished(tmp_path, state()) == {"value": 1}
+
+
+def test_cells_were_current_whose_method_s_own_files_had_changed():
+    """The key of `gp` hashed 2 files, and none of those of its process."""
+    found = program()
+    assert "gsparc.evaluation.ledger" in found and "numpy" not in found and "json" not in found
+    for name in ("models.baselines.gp", "ops._native", "ops.cuda_library"):
+        importlib.import_module(f"gsparc.{name}")
+    wanted = ("processes.kernel", "ops._native", "ops.cuda_library:csrc/**/*.cu")
+    assert {f"gsparc.{name}" for name in wanted} <= {*program()}
+    assert edited({"program": program()}) == []
+
+
+def test_a_method_that_was_imported_by_an_interrupted_job_counts(tmp_path, plugin):
+    with pytest.raises(KeyboardInterrupt):
+        run_once(tmp_path, state(), cut_short(tmp_path))
+    (plugin / "lone_helper.py").write_text("VALUE = 2\n")
+    ledger._hash_of_program.cache_clear()
+    seen = []
+    run_once(tmp_path, state(), ends(tmp_path, 1, seen))
+    assert seen == [None]
 
 
 def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
@@ -211,47 +252,19 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
 
-def test_cells_were_current_whose_method_s_own_files_had_changed(tmp_path, monkeypatch):
-    """The key of `gp` hashed 2 files, and none of those of its process."""
-    _, files = program_files("gsparc")
-    assert "gsparc/processes/kernel.py" in files and any("ops/" in one for one in files)
-    package = tmp_path / "toy_program"
-    (package / "processes").mkdir(parents=True)
-    module, page = package / "processes" / "x.py", tmp_path / "page.md"
-    (package / "__init__.py").touch()
-    monkeypatch.syspath_prepend(tmp_path)
-    hashes = []
-    for text in ("VALUE = 1\n", "VALUE = 2\n"):
-        module.write_text(text)
-        hashes.append(package_hash("toy_program"))
-    assert len(set(hashes)) == 2
-    page.write_text("other words")
-    assert package_hash("toy_program") == hashes[-1]
-    module.write_text('"""Of a value."""\n\nVALUE = 2  # in metres\n')
-    commented = package_hash("toy_program")
-    module.write_text('"""Of another."""\nVALUE = 2\n')
-    assert package_hash("toy_program") == commented
-    sys.modules.pop("toy_program", None)
-
-
-def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path, monkeypatch):
-    package = tmp_path / "clone" / "gsparc"
-    (package / "models").mkdir(parents=True)
-    (tmp_path / "clone" / "mine").mkdir()
-    for name in ("mine/own.py", "own.py", "gsparc/__init__.py", "gsparc/models/new.py"):
-        (tmp_path / "clone" / name).touch()
-    found = spec_from_file_location("gsparc", package / "__init__.py")
-    monkeypatch.setattr(done, "find_spec", lambda name: found)
-    assert sorted(program_files("gsparc")[1]) == ["gsparc/__init__.py", "gsparc/models/new.py"]
+def test_records_of_an_older_program_are_reused_where_that_is_asked(tmp_path):
+    """They have one hash of all files, and settings that say where data lay."""
+    run_once(tmp_path, state(), ends(tmp_path, 1))
+    record = read_summary(tmp_path / "job.json")
+    record |= {"program": "0123456789ab", "settings": record["settings"] | {"dataset.file": "own.npz"}}
+    (tmp_path / "job.json").write_text(json.dumps(record))
+    assert read_finished(tmp_path, state()) is None and state().changes(record) == ["program"]
+    assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
 
 
 def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     caplog.set_level("INFO", "gsparc")
     run_once(tmp_path, state(), ends(tmp_path, 1))
     assert not caplog.messages
-    run_once(tmp_path, state(settings={"seed": 0, "effort": 2}, program="q"), ends(tmp_path, 1))
-    assert caplog.messages == [f"{tmp_path}: begun anew, as these changed: program, settings.effort"]
-    module = Path(gsparc.__file__).parent / "models" / "gsparc.py"
-    began = module.stat().st_mtime - 1e-3
-    said = state(program="q").changes({**vars(state()), "began": began})
-    assert said[0] == "program" and "gsparc/models/gsparc.py" in said
+    run_once(tmp_path, state(settings={"seed": 0, "effort": 2}), ends(tmp_path, 1))
+    assert caplog.messages == [f"{tmp_path}: begun anew, as these changed: settings.effort"]

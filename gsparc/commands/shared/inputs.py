@@ -1,0 +1,114 @@
+"""What a training begins with: checked settings, a method, data that are read, and their folds."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.data import heeded
+from gsparc.data.checks.describe import summarise
+from gsparc.data.datamodule import DataModule
+from gsparc.data.load import datamodule, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.data.walls import read_walls
+from gsparc.evaluation.align_site import align_to_site
+from gsparc.evaluation.experiment import options
+from gsparc.models import checkpoint
+from gsparc.models.method import MethodFactory
+from gsparc.models.registry import build, fill_defaults
+from gsparc.training import tracking
+from gsparc.training.effort import Effort
+
+log = logging.getLogger(__name__)
+log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """What a run begins with, before anything is fitted.
+
+    Attributes:
+        method: unfitted, or what chooses it.
+        module, split: the data, read, and their folds.
+        reads: which of the given options were heeded so far.
+        walls: known ones, drawn beside what is found.
+        learned: what a fold learns from instead, such as displaced or fewer measurements; None: these.
+    """
+
+    method: MethodFactory
+    module: DataModule
+    split: Split
+    reads: heeded.Reads
+    walls: Any = None
+    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None
+
+    @property
+    def data(self) -> Measurements:
+        """The measurements."""
+        return self.module.measurements
+
+
+def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInputs:
+    """Check the settings and read the data; nothing is written.
+
+    Args:
+        config: as composed from conf/train.yaml.
+        known: the measurements, where they were read before.
+
+    Raises:
+        ValueError: bad data, walls or settings, or a split without rows to learn from or to test on; one line
+            each.
+    """
+    method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
+    RunSettings.from_config(config)
+    tracking.refuse_missing_loggers(config)
+    reads = options.options_to_note(config, method)
+    with heeded.record_reads(reads):
+        module = _data(config, known)
+        split = split_for(to_dict(config.split), module.measurements)
+    file = config.get("known_walls") or OmegaConf.select(config, "init.file")
+    walls = None if file is None else read_walls(file)
+    split.check()
+    return RunInputs(method, module, split, reads, walls)
+
+
+def _data(config: DictConfig, known: Measurements | None) -> DataModule:
+    """The data, read or known, in coordinates and units of the model that training starts from, if any."""
+    path, start = config.ckpt_path, config.get("init_from")
+    if path is not None and not Path(path).exists():  # before anything is read or simulated
+        raise ValueError(f"ckpt_path={path}: no such file; give an interrupted run's folder or last.ckpt")
+    module = datamodule(config.dataset)
+    if known is not None:
+        module.measurements = known
+    module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
+    for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
+        given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
+        if given:
+            config.dataset[key] = str(Path(given).resolve())
+    if start is not None:
+        try:
+            module.measurements = align_to_site(module.measurements, checkpoint.read(start).site, whole=True)
+        except ValueError as error:
+            raise ValueError(f"init_from={start}: {error}") from None
+    return module
+
+
+def describe_inputs(config: DictConfig, inputs: RunInputs) -> None:
+    """Say what is learned from, and what is guessed."""
+    method = inputs.method
+    for topic, sentence in summarise(inputs.data, inputs.split):
+        log.info("%-10s%s", topic, sentence)
+    for guess in method.guesses:
+        log_of_models.info("guess: %s", guess)
+    guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
+    steps = config.trainer.max_steps
+    effort = Effort().scale_by(config.effort)
+    how = method.describe_fit(inputs.data, effort, None if steps == -1 else steps)
+    log.info("%-10s%s", "fitting", f"{method.name}{f': {how}' if how else ''}{guessed}")

@@ -1,0 +1,280 @@
+"""The ledger of fits: one is done when its settings, data, split and program are those of its record."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+import os
+import re
+import sys
+import sysconfig
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from hashlib import file_digest, sha256
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.assemble import content_hash, identity_hash
+from gsparc.data.errors import DataError, list_first
+from gsparc.data.files import SUMMARY, set_aside, write_whole
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.results import read_summary
+from gsparc.models.checkpoint import MODEL
+from gsparc.models.fitting import LAST, dotted_settings
+
+log = logging.getLogger(__name__)
+
+RECORD = "job.json"  # in a fit's folder: its state and program, when it began, and whether it has ended
+FAILURE = "failure.txt"  # why it has failed
+WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether, a fit is done
+OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
+WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
+LEFT = (  # by a training: of another one, all of it would be read beside this one's
+    *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
+    *("test.png", "found.png"),
+    *(f"{fold}{name}" for fold in ("", "fold*/") for name in (MODEL, "learning_curve.csv")),
+)
+PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
+READS = "READS"  # of a module: patterns, from its folder, of the data files that it reads
+STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
+REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
+# After the head of a definition, or its last line: text after other colons is read by a program.
+HEAD = r"(?m:^)[ \t]*(?:async def|def|class|\))[^\n]*:\n\s+"
+DOCSTRING = re.compile(rf'({HEAD}|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
+ENVIRONMENT = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+
+
+@dataclass(frozen=True)
+class State:
+    """What a result depends on, but for the program.
+
+    Attributes:
+        settings: resolved, by dotted name, without those that say where data lie.
+        files: SHA-256 of the files that settings name, by these.
+        data: SHA-256 of the measurements, whatever files they were read from; "" before they are read.
+        split: SHA-256 of the folds.
+        unread: SHA-256 of the files that data and folds are read from; a state before they are read is known
+            by these.
+    """
+
+    settings: dict[str, Any]
+    files: dict[str, str]
+    data: str = ""
+    split: str = ""
+    unread: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
+        """Return the state of a resolved configuration, of hashes of measurements and of their split."""
+        kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
+        whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
+        named = dict(dotted_settings(whole))
+        where = {name: named.pop(name) for name in OF_DATA if name in named}
+        files = {name: value for name, value in named.items() if isinstance(value, str)}
+        settings = json.loads(json.dumps(named, default=str))
+        return cls(settings, _hashes(files), data, split, {} if data else _hashes(where))
+
+    @property
+    def tells_data(self) -> bool:
+        """Whether what is read is known: its content, or the bytes of all files that it is read from."""
+        alone = self.settings.get("dataset._target_") == WHOLE and "dataset.file" in self.unread
+        return bool(self.data) or alone or "dataset.root" in self.unread
+
+    def changes(self, record: Mapping[str, Any], reuse: bool = False) -> list[str]:
+        """Return in what a record is of another state: `settings.effort`, modules.
+
+        `reuse`: whatever the program was.
+        """
+        names = ("settings", "files", *(("data", "split") if self.data else ("unread",)))
+        now, before = ({name: of.get(name) or {} for name in names} for of in (vars(self), record))
+        before["settings"] = {
+            n: v for n, v in before["settings"].items() if n not in OF_DATA
+        }  # older records
+        one, other = dict(dotted_settings(now)), dict(dotted_settings(before))
+        differing = [name for name in other | one if one.get(name) != other.get(name)]
+        return differing if reuse else differing + edited(record)
+
+
+def measurements_hash(data: Measurements) -> str:
+    """Return the SHA-256 of all that a method can learn from, of every file that was read."""
+    arrays = {name: value for name, value in vars(data).items() if isinstance(value, np.ndarray)}
+    arrays |= {f"release {i}": rows for i, rows in enumerate(data.release_split or ())}
+    whole = (identity_hash(data), content_hash(arrays), data.provenance.get("scene"))
+    return sha256(repr(whole).encode()).hexdigest()
+
+
+def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
+    """Return the summary of a fit that is done; None where it is not.
+
+    Args:
+        folder: of the fit.
+        state: of what is asked for; before data are read it answers where it `tells_data`.
+        reuse: whether a result of another program counts, too; its `git` says of which.
+    """
+    record = read_summary(folder / RECORD)
+    if record is None or not record.get("ended") or not state.tells_data or state.changes(record, reuse):
+        return None
+    return read_summary(folder / SUMMARY)
+
+
+def run_once(
+    folder: Path, state: State, work: Callable[[str | None], object], *, reuse: bool = False,
+    again: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the summary of a fit, which is done now where it is not done.
+
+    Args:
+        folder: its own, held by the caller.
+        state: of the fit.
+        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
+            interrupted try has left, None to begin anew.
+        reuse: see `read_finished`.
+        again: one that is done is done anew.
+
+    Raises:
+        DataError: the work has left no summary.
+    """
+    facts = None if again else read_finished(folder, state, reuse)
+    if facts is not None:
+        log.info("%s: already done", folder)
+        return facts
+    record, left = read_summary(folder / RECORD), None
+    changes = [] if record is None else state.changes(record)
+    if record is None or record.get("ended") or changes:
+        if changes:
+            log.info("%s: begun anew, as these changed: %s", folder, list_first(changes))
+        set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
+        record = {**asdict(state), "began": time.time()}
+    else:
+        left = _last_state(folder, record["began"])
+    (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
+
+    def write(ended: bool) -> None:
+        whole = {**record, "program": program(), "ended": ended}
+        write_whole(folder / RECORD, json.dumps(whole, indent=1))
+
+    write(False)
+    try:
+        work(left)
+    except BaseException:
+        with suppress(OSError):  # such as a full disk, which the error itself names
+            write(False)  # with what was imported meanwhile
+        raise
+    write(True)
+    facts = read_summary(folder / SUMMARY)
+    if facts is None:
+        raise DataError(f"{folder / SUMMARY}: missing after the run; was it removed meanwhile?")
+    return facts
+
+
+def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
+    """Move files of an earlier run aside, except those that a training resumes or starts from."""
+    taken = [Path(path).resolve() for path in begun_from if path]
+    goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
+    if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
+        log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
+
+
+def edited(record: Mapping[str, Any]) -> list[str]:
+    """Return which of the files that a record's program imported are others now."""
+    before = record.get("program")
+    if not isinstance(before, Mapping):  # an older record has one hash of all
+        return ["program"]
+    return [name for name, content in before.items() if _content(name) != content]
+
+
+def program() -> dict[str, str]:
+    """Return the content of every file imported so far, by module, and of the data files that it `READS`.
+
+    Those of the environment's packages are left out: their versions stand in each summary. Of gsparc itself
+    all count, wherever it is installed. Changes of comments and docstrings alone change nothing.
+    """
+    found = {"version": version("gsparc")}
+    for name, module in list(sys.modules.items()):
+        if _counts(name, getattr(module, "__file__", None)):
+            reads = [name, *(f"{name}:{pattern}" for pattern in getattr(module, READS, ()))]
+            found |= {one: _content(one) for one in reads}
+    return found
+
+
+@functools.cache
+def _counts(name: str, file: str | None) -> bool:
+    """Whether a module is of the program."""
+    if name in ("__main__", "__mp_main__") or not file or not os.path.isfile(file):
+        return False
+    return name.partition(".")[0] == "gsparc" or not os.path.abspath(file).startswith(ENVIRONMENT)
+
+
+def _content(name: str) -> str:
+    """Of an entry of `program`; "" where it is gone."""
+    module, _, pattern = name.partition(":")
+    if module == "version":
+        return version("gsparc")
+    file = getattr(sys.modules.get(module), "__file__", None)
+    with suppress(ImportError, ValueError, AttributeError):  # of a parent that is gone
+        file = file or getattr(find_spec(module), "origin", None)
+    if file is None or not os.path.isfile(file):
+        return ""
+    if pattern:
+        return _joined(Path(file).parent.glob(pattern), Path(file).parent)
+    return _hash_of_program(file)
+
+
+@functools.cache  # of a process, which runs what it has read
+def _hash_of_program(file: str) -> str:
+    return _hash_of(Path(file))
+
+
+def strip_comments(text: str) -> str:
+    """Return Python without comments and empty lines, and with empty docstrings.
+
+    By strings and comments alone: parsing every file of gsparc would take seconds at the start of each run.
+
+    >>> strip_comments("mark = '#'  # of a comment")
+    "mark = '#'"
+    """
+    code = REMARK.sub(lambda one: one[1] or "", text)
+    return DOCSTRING.sub(lambda one: one[2] or f'{one[1]}""', code)
+
+
+def _joined(files: Iterable[Path], root: Path) -> str:
+    hashes = {str(file.relative_to(root)): _hash_of(file) for file in sorted(files) if file.is_file()}
+    return sha256(repr(hashes).encode()).hexdigest()
+
+
+def _hashes(paths: Mapping[str, Any]) -> dict[str, str]:
+    """Of those settings that name a file, or the folder of a dataset."""
+    found = {name: _hash_of(Path(path)) for name, path in paths.items() if path and os.path.isfile(path)}
+    if (root := paths.get("dataset.root")) and os.path.isdir(root):
+        found["dataset.root"] = _joined(Path(root).rglob("*"), Path(root))
+    return found
+
+
+def _hash_of(file: Path) -> str:
+    """The hash of a file, of Python of what it does."""
+    if file.suffix == ".py":
+        text = file.read_text(encoding="utf-8", errors="replace")
+        return sha256(strip_comments(text).encode()).hexdigest()
+    with open(file, "rb") as stream:
+        return file_digest(stream, "sha256").hexdigest()
+
+
+def _last_state(folder: Path, began: float) -> str | None:
+    """The last checkpoint of this fit, not of one of another state before, or the folder of one of many
+    parts; None: it begins anew."""
+
+    def own(path: Path) -> bool:
+        return path.exists() and path.stat().st_mtime >= began
+
+    for name in LAST:
+        if own(folder / name):
+            return str(folder / name)
+    return str(folder) if any(own(path) for pattern in PARTS for path in folder.glob(pattern)) else None
