@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import take
 from gsparc.data.errors import DataError, list_first, suggest_name
 from gsparc.data.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
 from gsparc.data.row_order import find_copies, hash_rows
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
+from gsparc.data.spacing import group_visits
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
@@ -149,7 +151,11 @@ def _copies(arrays: Arrays, measured: str) -> np.ndarray:
     places = [end.astype(np.float64) for end in ends if end.shape == (rows, 3) and end.dtype.kind in "iuf"]
     if not places:  # one that repeats is no row's own
         return np.zeros(rows, bool)
-    place = hash_rows(*places)
+    place, whole = hash_rows(*places), np.hstack(places)
+    known = np.flatnonzero((np.abs(whole) <= FARTHEST).all(axis=1))
+    # A receiver's own position jitters while it logs a packet twice.
+    if len(known) > 1 and (near := group_visits(whole[known])) is not None:
+        place[known] = near
     # Two devices that read the same level at one place are two measurements.
     if device is not None:
         alike = np.unique(device.astype(str), return_inverse=True)[1].reshape(-1)

@@ -68,8 +68,8 @@ def fit(
     """
     refuse_seconds(arrays)
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
-    given = {name: np.asarray(value) for name, value in inputs.items() if value is not None}
-    raw = Raw(given, {}) if rssi is None else _raw_powers(given, np.asarray(rssi), unit)
+    given = {name: _array_of(value) for name, value in inputs.items() if value is not None}
+    raw = Raw(given, {}) if rssi is None else _raw_powers(given, _array_of(rssi), unit)
     raw.attributes["name"] = "arrays"  # the source is of messages
     try:
         reading = interpret(raw, "gsparc.fit")
@@ -94,6 +94,13 @@ def fit(
     if save is not None:
         checkpoint.save(save, method, extra={"train_s": report.seconds})
     return Predictor(method, replace(data.site, device_levels=method.fitted_site.device_levels))
+
+
+def _array_of(value: Any) -> np.ndarray:
+    """As an array; what is masked has no value."""
+    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "iuf":
+        value = value.astype(np.float64)
+    return value.filled(np.nan) if isinstance(value, np.ma.MaskedArray) else np.asarray(value)
 
 
 def _raw_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) -> Raw:

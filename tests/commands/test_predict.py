@@ -275,7 +275,7 @@ def test_watts_were_answered_in_decibels(tmp_path):
 
 
 BAD_TABLES = {
-    "latitude 95": ("lat,lon,height\n47,11,2\n95,11,2\n", r"column 'lat', line 3: 95: latitude is outside"),
+    "latitude 95": ("lat,lon,height\n47,11,2\n95,11,2\n", r"line 3: latitude 95 is outside -90 to 90"),
     "no value": ("lat,lon,height\n47,,2\n", r"column 'lon', line 2: no value"),
     "no coordinates": ("time,speed\n1,2\n",
         r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat"),

@@ -198,3 +198,21 @@ def test_the_faulty_rows_of_the_measured_plane():
     for end in (np.min, np.max):
         whole, some = (end(one[:, :2], axis=0) for one in (raw.arrays["rx_position"], read.data.rx_position))
         assert np.abs(whole - some - read.data.site.origin[:2]).max() < 0.03
+
+
+@pytest.mark.parametrize("jitter", [0.01, 0.3])
+def test_a_packet_logged_twice_beside_its_place_counted_as_two(jitter):
+    """The stated deviation was a hundredth of the true one: the noise was told by copies."""
+    rng = np.random.default_rng(0)
+    place = np.c_[rng.uniform(0, 3000, (300, 2)), np.full(300, 1.5)]
+    level = rng.normal(-80, 6, 300).round(2)
+    arrays = {
+        "rx_position": np.r_[place, place + np.array([jitter, 0, 0])], "tx_position": np.zeros((600, 3)),
+        "rssi_db": np.r_[level, level],
+    }  # fmt: skip
+    reading = part(Raw(arrays))
+    assert len(reading.data) == 300
+    assert any("copies of other rows" in note for note in reading.notes)
+    # Another level at nearly the same place is a measurement.
+    arrays["rssi_db"][300:] += rng.normal(0, 2, 300)
+    assert len(part(Raw(arrays)).data) == 600

@@ -91,3 +91,11 @@ def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch
 
 def test_other_tables_of_text_have_lines_as_long(write, refused):
     refused("line 2: .* characters; expected at most", read_csv, write("a,b\n" + "," * 2_000_000), "missing")
+
+
+def test_one_name_in_two_spellings_was_two_stations(write):
+    """Its accent as one letter or as two, or with a space of no width: rows that never were lay below."""
+    names = ["Z\u00fcrich", "Zu\u0308rich", "Z\u00fcrich\u200b"]
+    rows = "".join(f"{i},{i * i % 7},{-60 - i},{names[i % 3]}\n" for i in range(9))
+    data = interpret(parse_table(write("x,y,rssi,cell\n" + rows)), "drive").data
+    assert data.site.stations is None or len(data.site.stations) == 1

@@ -105,8 +105,8 @@ def runs_in(patch, folder: Path) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    runtime = SimpleNamespace(output_dir=folder)
-    patch.setattr(HydraConfig, "get", lambda: SimpleNamespace(runtime=runtime, mode=RunMode.RUN))
+    said = {"runtime": SimpleNamespace(output_dir=folder), "overrides": SimpleNamespace(task=[])}
+    patch.setattr(HydraConfig, "get", lambda: SimpleNamespace(mode=RunMode.RUN, **said))
 
 
 RENDERED = tuple(

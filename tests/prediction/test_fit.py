@@ -155,3 +155,11 @@ def test_two_rows_stated_a_deviation_without_a_word(caplog):
     assert "too few to tell errors" not in caplog.text
     gsparc.fit(rx=places[:2], tx=[20.0, 3, 2], rssi=-60 - places[:2, 0], model="gp")
     assert "2 places to learn from are too few to tell errors" in caplog.text
+
+
+def test_the_mask_of_an_array_was_thrown_away():
+    masked = np.ma.array(POWERS, mask=np.arange(60) % 3 == 0)
+    kept = ~masked.mask
+    one = gsparc.fit(rx=PLACES, tx=END, rssi=masked, model="gp")
+    other = gsparc.fit(rx=PLACES[kept], tx=END, rssi=POWERS[kept], model="gp")
+    assert np.allclose(one.rssi(rx=PLACES[:5]), other.rssi(rx=PLACES[:5]), atol=1e-3)

@@ -18,6 +18,7 @@ from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.apps.maps.levels import MAPPED, joint_levels, predicted_levels
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import sample_adaptively
+from gsparc.data import limits
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
 from gsparc.data.instantiate import suggest_or_list
@@ -30,6 +31,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import query_ends, to_local
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
+MOST_DB = 1000.0  # of a level
 ALL_CELLS = 40_000  # of a map that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
 BANDS = 1 << 16  # cells at a time of what follows from predictions
@@ -80,6 +82,7 @@ def predict_map(
     level = PowerUnit.from_name(unit, site.level_unit, levels=True)
     # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
+    limits.or_null(limits.number(-MOST_DB, MOST_DB)).check("noise_db", noise_db)
     noise_db = None if noise_db is None else noise_db - level.raised_db
     if dry:
         first = np.zeros_like(grid.inside)

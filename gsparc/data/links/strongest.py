@@ -9,7 +9,7 @@ were lost, in outages or at random, are missing beside strong ones, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,13 +39,16 @@ def number_lists(place: np.ndarray, station: np.ndarray) -> np.ndarray:
     first = np.r_[True, np.diff(place) != 0]
     if first.sum() > 2 * len(np.unique(place)):  # not in the order of time
         return np.unique(place, return_inverse=True)[1].reshape(-1)
-    number, seen, result = -1, set[int](), np.empty(len(place), np.int64)
+    number, turn, seen, before = -1, 0, set[int](), None
+    result = np.empty((len(place), 2), np.int64)
     for row, (begins, who) in enumerate(zip(first.tolist(), station.tolist(), strict=True)):
-        if begins or who in seen:
+        # A station twice in a row is a packet that was logged twice, of a list beside this one.
+        turn = turn + 1 if who == before and not begins else 0
+        if begins or (who in seen and not turn):
             number, seen = number + 1, set()
         seen.add(who)
-        result[row] = number
-    return result
+        result[row], before = (number, turn), who
+    return np.unique(result, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 Silent = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -84,7 +87,15 @@ class StrongestLists:
         return np.isfinite(self.level).sum(1) == self.length
 
     def are_strongest(self) -> bool:
-        """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak."""
+        """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak.
+
+        Stations of one place alone are missing elsewhere whatever ends a list: they are not asked.
+        """
+        of_places = [len(np.unique(self.place[rows], axis=0)) > 1 for rows in np.isfinite(self.level).T]
+        if not all(of_places):
+            level = self.level[:, of_places]
+            length = int(np.isfinite(level).sum(1).max(initial=0))
+            return replace(self, level=level, length=length).are_strongest()
         sizes = np.isfinite(self.level).sum(1)
         piled = self.full.mean() >= FULL and 2 * self.full.sum() > (sizes == self.length - 1).sum()
         if len(sizes) < LEAST_MOMENTS or not 2 <= self.length < self.level.shape[1] or not piled:

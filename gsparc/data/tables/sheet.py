@@ -23,6 +23,8 @@ SEXAGESIMAL = re.compile(
     re.IGNORECASE,
 )
 
+INVISIBLE = "[\u200b-\u200d\u2060\ufeff]"  # spaces of no width, which names are pasted with
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -74,7 +76,10 @@ class Sheet:
         missing = column.isna().to_numpy()
         if pd.api.types.is_float_dtype(column.dtype) and (column[~missing] % 1 == 0).all():
             column = column.astype("Int64")  # 212, not 212.0: a name that was read as a number
-        text = column.astype(str).str.strip().to_numpy(dtype=object)
+        texts = column.astype(str)
+        if not texts[~missing].map(str.isascii).all():  # one name may be written in several ways
+            texts = texts.str.normalize("NFC").str.replace(INVISIBLE, "", regex=True)
+        text = texts.str.strip().to_numpy(dtype=object)
         empty = missing | np.isin(np.char.lower(text.astype(str)), SHEET["missing"])
         return np.where(empty, "", text).astype(str)
 

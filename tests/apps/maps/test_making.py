@@ -262,3 +262,8 @@ def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(
     # No share was printed.
     share = f"{1 - found.summarise()['map/outage']:.1%} of the predicted squares with"
     assert any(note.startswith(share) for note in map_notes(found, None))
+
+
+def test_a_noise_of_a_billion_decibels_overflowed(predictor):
+    with pytest.raises(ValueError, match="noise_db"):
+        predict_map(predictor, step_m=20.0, noise_db=1e9)

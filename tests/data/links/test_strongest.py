@@ -238,3 +238,34 @@ def test_stations_that_short_lists_lack_were_taken_as_weak_though_they_were_off(
     data = reading.data
     silent = (data.moving + data.site.origin)[data.censored > 0].round(3)
     assert len(silent) and not short & {tuple(at) for at in silent}
+
+
+def four_everywhere() -> dict[str, np.ndarray]:
+    """Levels of four stations at 150 places each, link by link, the stronger ones of a place first."""
+    rng = np.random.default_rng(3)
+    place, post = rng.uniform(0, 300, (150, 2)), rng.uniform(0, 300, (4, 2))
+    far = np.linalg.norm(place[:, None] - post, axis=2)
+    level = -30 - 30 * np.log10(far) + rng.normal(0, 4, far.shape)
+    moment, who = np.repeat(np.arange(150), 4), np.argsort(-level, axis=1).ravel()
+    return {
+        "rx_position": np.c_[place[moment], np.full(600, 1.5)], "station": who,
+        "station_position": np.c_[post, np.full(4, 20.0)], "rssi_db": level[moment, who].round(2),
+    }  # fmt: skip
+
+
+def test_packets_logged_twice_with_another_last_digit_were_lists_of_the_two_strongest():
+    """784 rows that never were lay below: answers were 3 to 11 dB too low."""
+    once = four_everywhere()
+    twice = {name: one if name == "station_position" else np.repeat(one, 2, 0) for name, one in once.items()}
+    twice["rssi_db"] = twice["rssi_db"] + 0.01 * (np.arange(1200) % 2)
+    reading = interpret(Raw(twice), "drive")
+    assert not [note for note in reading.notes if "strongest" in note]
+    assert reading.data.censored is None or not reading.data.censored.any()
+
+
+def test_a_station_of_one_place_made_lists_of_the_strongest_of_all_others():
+    arrays = four_everywhere()
+    arrays["rx_position"] = arrays["rx_position"].copy()
+    arrays["rx_position"][arrays["station"] == 2] = [100.0, 100.0, 1.5]
+    reading = interpret(Raw(arrays), "drive")
+    assert not [note for note in reading.notes if "strongest" in note]
