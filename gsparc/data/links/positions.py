@@ -44,7 +44,7 @@ def _without_fix(check: Checker, measured: str) -> None:
             continue
         place = np.column_stack(pair)[:, :2].astype(np.float64)
         null, earth = (place == 0).all(axis=1), np.array(ON_EARTH)
-        off = ((place < earth[:, 0]) | (place > earth[:, 1])).any(axis=1) if degrees else np.zeros(rows, bool)
+        off = degrees * np.any((place < earth[:, 0]) | (place > earth[:, 1]), axis=1).astype(bool)
         known = place[~(null | off)]
         if not len(known):
             continue
