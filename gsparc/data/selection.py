@@ -153,7 +153,7 @@ def _copies(arrays: Arrays, measured: str) -> np.ndarray:
         return np.zeros(rows, bool)
     place, whole = hash_rows(*places), np.hstack(places)
     known = np.flatnonzero((np.abs(whole) <= FARTHEST).all(axis=1))
-    # A receiver's own position jitters while it logs a packet twice.
+    # The position of a packet that is logged twice may jitter; real visits differ in their levels.
     if len(known) > 1 and (near := group_visits(whole[known])) is not None:
         place[known] = near
     # Two devices that read the same level at one place are two measurements.

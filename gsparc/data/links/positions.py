@@ -44,7 +44,8 @@ def _without_fix(check: Checker, measured: str) -> None:
             continue
         place = np.column_stack(pair)[:, :2].astype(np.float64)
         null, earth = (place == 0).all(axis=1), np.array(ON_EARTH)
-        off = degrees * np.any((place < earth[:, 0]) | (place > earth[:, 1]), axis=1).astype(bool)
+        beyond = (place < earth[:, 0]) | (place > earth[:, 1])
+        off = np.asarray(degrees & beyond.any(axis=1))
         known = place[~(null | off)]
         if not len(known):
             continue

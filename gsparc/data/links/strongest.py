@@ -34,7 +34,7 @@ def number_lists(place: np.ndarray, station: np.ndarray) -> np.ndarray:
 
     Args:
         place: (n,) int64, number of each row's place.
-        station: (n,) of each row: one that comes again begins another list.
+        station: (n,) of each row: one that comes again begins another list, unless it comes twice in a row.
     """
     first = np.r_[True, np.diff(place) != 0]
     if first.sum() > 2 * len(np.unique(place)):  # not in the order of time
