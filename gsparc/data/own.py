@@ -24,8 +24,9 @@ from gsparc.data.links.expand import expand_links
 from gsparc.data.other_names import name_arrays
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Kind, Links, Measurements, Site
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
+from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 
 log = logging.getLogger(__name__)

@@ -14,6 +14,7 @@ from torch import Tensor
 from gsparc.data.blocks import take
 from gsparc.data.files import read_shipped_table
 from gsparc.data.query import Batch
+from gsparc.data.target import TARGETS, Kind, Target
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.row_factors import Freedom, describe_freedom
@@ -21,7 +22,6 @@ from gsparc.physics.row_factors import Freedom, describe_freedom
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
 
-Kind = Literal["spectrum", "csi", "rssi"]
 # Channels with unknown factors are compared after alignment, which is another figure.
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
@@ -173,6 +173,11 @@ class Site:
     device_levels: np.ndarray | None = field(default=None, compare=False)
 
     @property
+    def target(self) -> Target:
+        """What a target is: facts of its kind."""
+        return TARGETS[self.kind]
+
+    @property
     def scored(self) -> Scored:
         """The figures of merit that tell of it; rows with factors of their own are aligned first."""
         # Only channels have phases: powers and spectra are the same under any factor.
@@ -241,8 +246,7 @@ class Site:
             ValueError: another unit, or one that these levels cannot be turned into.
         """
         wanted = PowerUnit.from_name(unit, self.level_unit, levels=True)
-        # Powers scale linearly, amplitudes of channels and spectra with the root.
-        scale = self.target_scale * (wanted.scale if self.kind == "rssi" else wanted.scale**0.5)
+        scale = self.target_scale * wanted.scale ** (1 / self.target.exponent)
         return replace(self, level_unit=wanted.name, unit=wanted.name, target_scale=scale)
 
     def tones(self) -> np.ndarray:

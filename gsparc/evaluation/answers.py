@@ -15,7 +15,8 @@ from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
 from gsparc.data.files import whole_file
 from gsparc.data.query_places import QueryPlaces, read_query_places
-from gsparc.data.schema import End, Kind, Site
+from gsparc.data.schema import End, Site
+from gsparc.data.target import Kind
 from gsparc.data.units import PowerUnit
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction

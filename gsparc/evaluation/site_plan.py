@@ -76,9 +76,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     several = data.site.stations is not None and len(data.site.stations) > 1
     if data.site.kind == "spectrum":
         return None, ""
-    power = np.abs(data.target.reshape(len(data), -1)).astype(np.float64)
-    # Targets of powers are linear already, those of channels are amplitudes.
-    power = (power * data.site.target_scale) ** (1 if data.site.kind == "rssi" else 2)
+    power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))

@@ -179,7 +179,7 @@ class GaussianModel(nn.Module):
         if self.site.kind == "csi" and settings.channel == "mean":
             return 2 * math.prod(self.shape)
         complex_image = self.site.kind == "spectrum" and settings.image != "power"
-        return 2 if self.site.kind == "csi" or settings.array or complex_image else 1
+        return 2 if settings.array or complex_image else self.site.target.numbers
 
     @property
     def tells_unknown(self) -> bool:

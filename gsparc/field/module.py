@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsparc.data.query import Batch
 from gsparc.data.schema import Site
+from gsparc.data.target import Target
 from gsparc.field import edit
 from gsparc.field.confidence import weighted_loss
 from gsparc.field.distributed import process_count
@@ -104,7 +105,7 @@ class NetworkModule(L.LightningModule):
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
         size = len(batch)
-        errors = squared_error(mean, batch, str(self.site.kind))
+        errors = squared_error(mean, batch, self.site.target)
         figures = {"val/error": errors.mean()}
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
         if self.site.kind != "spectrum":
@@ -137,7 +138,7 @@ class NetworkModule(L.LightningModule):
 
     def test_step(self, batch: Batch, step: int) -> None:
         """Log the squared error of test rows; `gsparc evaluate` has all figures."""
-        error = squared_error(self.mean(batch), batch, self.site.kind).mean()
+        error = squared_error(self.mean(batch), batch, self.site.target).mean()
         self.log("test/error", error, batch_size=len(batch))
 
     @classmethod
@@ -246,14 +247,9 @@ class GaussianModule(NetworkModule):
         return f"Gaussian id {int(self.model.gaussians.ids[int(bad.nonzero()[0, 0])])}, {name}"
 
 
-def squared_error(mean: Tensor, batch: Batch, kind: str) -> Tensor:
+def squared_error(mean: Tensor, batch: Batch, target: Target) -> Tensor:
     """Return the squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
-    target = batch.target
-    if kind == "rssi":
-        error = 10 * (mean.clamp_min(1e-30).log10() - target.clamp_min(1e-30).log10())
-    else:
-        error = (mean - target).abs()
-    square = error.square()
+    square = (target.in_error_unit(mean) - target.in_error_unit(batch.target)).abs().square()
     if batch.mask is not None:
         square = torch.where(batch.mask, square, 0)
     return square.flatten(1).mean(1)

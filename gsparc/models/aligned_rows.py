@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.target_rows import TINY_POWER
+from gsparc.physics.decibels import TINY_POWER
 from gsparc.physics.row_factors import Freedom, align_factors, describe_freedom
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise

@@ -20,10 +20,8 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.mixture.weights import in_error_unit, to_real_entries
-from gsparc.models.target_rows import TINY_POWER
+from gsparc.models.mixture.weights import to_real_entries
 from gsparc.ops import Pose
-from gsparc.physics.decibels import RELATIVE_DB
 
 log = logging.getLogger(__name__)
 
@@ -139,16 +137,15 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
         return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
 
     def predict_entries(places: Tensor) -> Tensor:
-        return to_real_entries(in_error_unit(field.predict(batch_at(places)).mean, site))
+        return to_real_entries(site.target.in_error_unit(field.predict(batch_at(places)).mean))
 
     with torch.no_grad():
         result = field.predict(batch_at(moving))  # what is computed once and kept must not be so inside `jvp`
     assert result.variance is not None
     variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
-    if site.kind == "rssi":
-        # From linear powers to decibels, to first order.
-        variance = variance * (RELATIVE_DB / left.mean.flatten().double().clamp_min(TINY_POWER)).square()
-    true, mean = (to_real_entries(in_error_unit(values, site)) for values in (batch.target, left.mean))
+    target = site.target
+    answers, variance = target.moments_in_error_unit(left.mean, variance)
+    true, mean = (to_real_entries(values) for values in (target.in_error_unit(batch.target), answers))
     residual = true - mean
     parts = 2 if batch.target.is_complex() else 1
     # Half of a circular variance is in either part.

@@ -1,17 +1,14 @@
-"""Targets as real rows in the units interpolation is fair in, and back."""
+"""Rows that methods learn from: holes filled, and what was not heard."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsparc.data.blocks import take
-from gsparc.data.schema import Kind, Measurements
-from gsparc.physics.decibels import RELATIVE_DB
+from gsparc.data.schema import Measurements
+from gsparc.data.target import TARGETS
 from gsparc.processes.powers import PowerRows
-
-TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -32,48 +29,10 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     return np.where(measured, target, total.astype(target.dtype))
 
 
-def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
-    """Return stored targets (n, ...) as float32 rows (n, D).
-
-    Spectra are rows of pixels in [0, 1], channels real and imaginary parts in linear units, powers decibels.
-    """
-    if kind == "csi":
-        # ascontiguousarray: a view as pairs needs the last axis dense.
-        return np.ascontiguousarray(target, dtype=np.complex64).reshape(len(target), -1).view(np.float32)
-    rows = target.reshape(len(target), -1).astype(np.float32)
-    if kind == "rssi":
-        return 10 * np.log10(np.maximum(rows, TINY_POWER, dtype=np.float32))
-    return rows / np.float32(255) if target.dtype == np.uint8 else rows
-
-
-def decibels(power: Tensor) -> Tensor:
-    """Return powers in decibels, of none the least that has a logarithm."""
-    return 10 * power.clamp_min(TINY_POWER).log10()
-
-
-def to_targets(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
-    """Return float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
-    if kind == "csi":
-        return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
-    rows = rows.reshape(len(rows), *shape)
-    return (10 ** (rows / 10)) if kind == "rssi" else rows.clamp(0.0, 1.0)
-
-
-def linear_powers(decibels: Tensor) -> Tensor:
-    """Return decibels (B,) as linear targets (B, 1)."""
-    return to_targets(decibels[:, None], "rssi", (1,))
-
-
-def to_entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
-    """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry.
-
-    Complex entries hold two real numbers; decibels are carried to linear power to first order.
-    """
-    if kind == "csi":
-        return 2 * variance
-    if kind == "rssi":
-        return variance * (mean.flatten(1).mean(1) / RELATIVE_DB) ** 2
-    return variance
+def linear_moments(level: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return levels (B,) [dB] as linear targets (B, 1), and variances (B,) [dB^2] as those of targets."""
+    power = TARGETS["rssi"].to_targets(level[:, None], (1,))
+    return power, TARGETS["rssi"].entry_variance(variance, power)
 
 
 def heard_rows(data: Measurements, rows: np.ndarray) -> np.ndarray:
@@ -90,5 +49,5 @@ def unheard_note(data: Measurements, rows: np.ndarray, method: str) -> tuple[str
 
 def power_rows(data: Measurements, rows: np.ndarray) -> PowerRows:
     """Return powers of rows (n,) in decibels, levels where they are censored."""
-    decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+    decibels = data.site.target.to_real(training_targets(data, rows))[:, 0].astype(np.float64)
     return PowerRows(data.moving[rows], decibels, data.censored_side(rows))

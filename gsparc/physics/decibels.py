@@ -11,6 +11,7 @@ from torch import Tensor
 
 Powers = TypeVar("Powers", np.ndarray, Tensor)
 RELATIVE_DB = 10 / math.log(10)  # decibels of a small relative change of a power
+TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
 
 def to_decibels(power: Powers) -> Powers:
@@ -29,3 +30,14 @@ def from_decibels(level: Powers) -> Powers:
     array([  1., 100.])
     """
     return 10 ** (level / 10)
+
+
+def finite_decibels(power: Powers) -> Powers:
+    """Return levels (...) [dB] of powers (...), of none the least that has a logarithm.
+
+    >>> finite_decibels(np.array([0.0, 100.0]))
+    array([-300.,   20.])
+    """
+    if isinstance(power, Tensor):
+        return 10 * power.clamp_min(TINY_POWER).log10()
+    return 10 * np.log10(np.maximum(power, power.dtype.type(TINY_POWER)))

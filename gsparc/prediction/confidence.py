@@ -105,7 +105,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     known = np.concatenate([fold.train, fold.val])
     # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
-    parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
+    parts = principal_components(training_targets(data, few), data.site.target, COMPONENTS)
     return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean), 1)
 
 

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gsparc.data.links.stations import find_station
 from gsparc.data.query import Query
-from gsparc.data.schema import Kind, Site
+from gsparc.data.schema import Site
+from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
 from gsparc.models.device_offsets import find_device

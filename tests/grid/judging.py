@@ -11,7 +11,8 @@ from campaigns import compose
 from worlds import World, arrays
 
 from gsparc.commands.train import TrainedRun, train
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements
+from gsparc.data.target import Kind
 from gsparc.evaluation.baselines import baselines_for, fit_baseline
 from gsparc.evaluation.scores import score_methods
 

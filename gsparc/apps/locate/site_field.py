@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,6 @@ from gsparc.data.query import Query
 from gsparc.prediction.predictor import Predictor
 
 CHUNK = 1024  # values that are asked for at a time: all stations of some places, which share their work
-DB = 10 / np.log(10)
 
 
 @dataclass(frozen=True)
@@ -65,10 +63,9 @@ class SiteField:
         mean, variance = flatten_targets(prediction.mean), prediction.variance.double()[:, None]
         if site.kind == "spectrum":
             return HeardMoments(mean.double(), variance)
-        if site.kind == "rssi":
-            power = mean.double().clamp_min(1e-30)
-            return self._joined(10 * power.log10(), DB**2 * variance / power.square())
-        return self._joined(mean.to(torch.complex128), variance.expand(mean.shape))
+        mean, variance = site.target.moments_in_error_unit(mean, variance)
+        number = torch.complex128 if site.target.signed else torch.float64
+        return self._joined(mean.to(number), variance.expand(mean.shape))
 
     def _joined(self, mean: Tensor, variance: Tensor) -> HeardMoments:
         """Of rows by place and station (G T, p): (G, T p)."""

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.moments import number_moments
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.target import Kind
 
 PIXELS = 1_000  # about as many of a spectrum are compared: an array's have far fewer degrees of freedom
 
@@ -56,8 +57,7 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
     _, first, which = np.unique(moment, return_index=True, return_inverse=True)
     measured = flatten_targets(data.targets(rows))
     measured = measured.to(torch.complex128) if measured.is_complex() else measured.double()
-    if site.kind == "rssi":
-        measured = _decibels(measured)
+    measured = site.target.in_error_unit(measured)
     side = torch.from_numpy(data.censored_side(rows))
     if data.mask is not None:
         mask = flatten_targets(torch.from_numpy(data.mask[rows])) | (side != 0)[:, None]
@@ -87,10 +87,10 @@ def snapshots_of_values(
         ValueError: of another kind or shape than what the site was measured with, or nothing in it.
     """
     heard = torch.as_tensor(values)
-    count, each = site.stations and len(site.stations), {"spectrum": 3, "csi": 3, "rssi": 2}[site.kind]
+    count, each = site.stations and len(site.stations), site.target.axes
     ndim = each if count is None or site.kind == "rssi" else each + 1
     shaped = heard.ndim == ndim and (not count or heard.shape[1] == count)
-    if heard.is_complex() != (site.kind == "csi") or not shaped:
+    if heard.is_complex() != site.target.signed or not shaped:
         stations = "" if count is None else f" of {count} stations"
         raise ValueError(f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}")
     if silent is not None and (site.kind != "rssi" or np.shape(silent) != tuple(heard.shape)):
@@ -98,8 +98,8 @@ def snapshots_of_values(
     if torch.isnan(heard.real).flatten(1).all(1).any():
         raise ValueError("locate: there is a snapshot in which nothing was heard")
     scaled = heard.to(torch.complex128 if heard.is_complex() else torch.float64) / site.target_scale
-    flat = (scaled if count is None or site.kind == "rssi" else scaled.flatten(0, 1)).contiguous()
-    own = _decibels(flat) if site.kind == "rssi" else flatten_targets(flat).reshape(len(heard), -1)
+    flat = scaled if scaled.ndim == site.target.axes else scaled.flatten(0, 1)
+    own = flatten_targets(site.target.in_error_unit(flat)).reshape(len(heard), -1)
     parts = _without_silence(own, None if silent is None else torch.as_tensor(silent))
     return Scans(site.kind, *parts, np.full((len(heard), 3), np.nan))
 
@@ -110,10 +110,6 @@ def flatten_targets(targets: Tensor) -> Tensor:
         step = max(round((targets[0].numel() / PIXELS) ** 0.5), 1)
         targets = targets[:, step // 2 :: step, step // 2 :: step]
     return targets.flatten(1)
-
-
-def _decibels(power: Tensor) -> Tensor:
-    return 10 * power.clamp_min(1e-30).log10()
 
 
 def _without_silence(values: Tensor, silent: Tensor | None) -> tuple[Tensor, Tensor | None]:

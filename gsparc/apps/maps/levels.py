@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements
+from gsparc.data.target import Kind
 from gsparc.data.units import power_in_decibels
 from gsparc.models.method import Prediction
 from gsparc.prediction.predictor import Predictor
@@ -48,8 +49,7 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
     """Return the level (n,) [dB] of rows (n,), NaN where nothing was measured,
     and which side they are censored on.
     """
-    target = np.abs(data.target.reshape(len(data), -1)[rows]).astype(np.float64) * data.site.target_scale
-    power = target if data.site.kind == "rssi" else target**2
+    power = data.site.target.power(data.target.reshape(len(data), -1)[rows] * data.site.target_scale)
     side = data.censored_side(rows)
     if data.mask is not None:
         # Censored rows are masked out as targets, but their levels are known.

@@ -80,13 +80,7 @@ def distinct_places(data: Measurements) -> np.ndarray:
 
 
 def _targets(data: Measurements) -> str:
-    count, shape = len(data), data.target.shape[1:]
-    if data.site.kind == "spectrum":
-        return f"{count} images of {shape[0]} x {shape[1]} directions"
-    if data.site.kind == "csi":
-        many = ["s" * (n != 1) for n in shape]
-        return f"{count} channels of {shape[0]} antenna{many[0]} x {shape[1]} subcarrier{many[1]}"
-    return f"{count} received powers"
+    return data.site.target.describe(len(data), data.target.shape[1:])
 
 
 def spacing_words(positions: np.ndarray, wavelength: float | None) -> str:

@@ -76,7 +76,7 @@ def peak_magnitudes(values: np.ndarray, mask: np.ndarray | None = None) -> np.nd
 def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
     """Return rows (n,) by what is wrong with them."""
     amplitude = peak_magnitudes(data.target, data.mask)
-    amplitude = np.sqrt(amplitude) if data.site.kind == "rssi" else amplitude
+    amplitude = amplitude ** (data.site.target.exponent / 2)  # of powers their roots
     rows_by_fault = {
         "measure far more power than all others": np.flatnonzero(find_strong_outliers(amplitude)),
         "lie far outside the region of all others": np.flatnonzero(too_far(data.moving)),

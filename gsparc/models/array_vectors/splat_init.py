@@ -28,7 +28,7 @@ from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached, write_recovery_report
 from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_nearest, index_mirror_elements
 from gsparc.models.splat.left_out_images import LeftOut
-from gsparc.models.target_rows import to_real, training_targets
+from gsparc.models.target_rows import training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering_matrix
 from gsparc.processes.features import whitened_features
@@ -109,7 +109,7 @@ def learn_vector_process(
     matrix = steering_matrix(array, grid, wavelength).numpy()
     partner, places = index_mirror_elements(array), data.tx[rows]
     core = covering_rows(places, MOST_ROWS, seed)
-    images = to_real(training_targets(data, rows[core]), "spectrum")
+    images = data.site.target.to_real(training_targets(data, rows[core]))
     tuned = choose_kernel(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)
     kernel = tuned.kernel
     vectors = np.empty(recovery.vectors.shape, np.complex128)

@@ -22,7 +22,6 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import to_entry_variance
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.powers import PowerRows
@@ -221,4 +220,4 @@ class DistanceLaw(Differentiable):
     def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         mean = self._to_targets(self.law.mean(queries)[:, None].to(dtype))
         variance = torch.full((len(queries),), law_variance(self.law), dtype=dtype)
-        return Prediction(mean, variance=to_entry_variance(variance, mean, self.kind))
+        return Prediction(mean, variance=self.target.entry_variance(variance, mean))

@@ -16,13 +16,14 @@ from torch import Tensor
 from gsparc.data.blocks import row_blocks
 from gsparc.data.limits import check_arguments, choice, whole
 from gsparc.data.query import Query
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements
+from gsparc.data.target import Target
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
-from gsparc.models.target_rows import power_rows, to_entry_variance, to_real
+from gsparc.models.target_rows import power_rows
 from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
@@ -60,7 +61,7 @@ class Components:
     lost: float
 
 
-def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int = 2048) -> Components:
+def principal_components(targets: np.ndarray, target: Target, limit: int, block: int = 2048) -> Components:
     """Return all components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
 
     Works through blocks of `block` entries, so that thousands of byte images never become floats at once.
@@ -70,7 +71,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
     blocks = [flat[:, i : i + block] for i in range(0, flat.shape[1], block)]
     means, gram, energy = [], np.zeros((n, n)), 0.0
     for part in blocks:
-        rows = to_real(part, kind).astype(np.float64)
+        rows = target.to_real(part).astype(np.float64)
         means.append(rows.mean(0))
         rows -= means[-1]
         gram += rows @ rows.T
@@ -83,7 +84,7 @@ def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int
         solid[-1] = True
     values, vectors = values[solid], vectors[:, solid]
     length = np.sqrt(np.maximum(values, TINY))
-    axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
+    axes = [(vectors / length).T @ (target.to_real(p) - m) for p, m in zip(blocks, means, strict=True)]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
     # A small difference of large sums may round below 0.
     lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
@@ -144,7 +145,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
         self.powers = None
-        parts = principal_components(targets, self.kind, self.limit)
+        parts = principal_components(targets, self.target, self.limit)
         looked_at = draw_rows_half_heard(np.zeros(len(targets), bool), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
@@ -162,9 +163,9 @@ class GaussianProcess(Differentiable, ClosedForm):
         """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
         # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
         rows = covering_rows(positions, CHOSEN_ON, 0)
-        parts = principal_components(targets[rows], self.kind, self.limit)
+        parts = principal_components(targets[rows], self.target, self.limit)
         start = choose_left_out_kernel(positions[rows], parts.scores, len(parts.mean))
-        scores, self.lost = project_targets(targets, self.kind, parts.mean, parts.axes)
+        scores, self.lost = project_targets(targets, self.target, parts.mean, parts.axes)
         kernel, fit_note = choose_nearest_kernel(positions, scores, len(parts.mean), start, 0)
         once = torch.ones(len(scores), dtype=torch.float64)
         values = PlaceValues(positions, torch.from_numpy(scores), once)
@@ -199,14 +200,14 @@ class GaussianProcess(Differentiable, ClosedForm):
         if self.powers is not None:
             decibels, spread, share = self.powers.answer(queries)
             power = self._to_targets(decibels[:, None].to(dtype))
-            return Prediction(power, to_entry_variance(spread.to(dtype), power, self.kind), share.to(dtype))
+            return Prediction(power, self.target.entry_variance(spread.to(dtype), power), share.to(dtype))
         assert self.scores is not None
         result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
         mean = self._targets_of_scores(result.mean, dtype)
         # What the components leave out is an error of every prediction.
         variance = (kernel.amplitude * result.variance + self.lost).to(dtype)
         unknown = (result.variance / (1 + kernel.noise)).to(dtype)
-        return Prediction(mean, to_entry_variance(variance, mean, self.kind), unknown)
+        return Prediction(mean, self.target.entry_variance(variance, mean), unknown)
 
     def mean_at(self, query: Query) -> Tensor:
         """Return the mean (B, ...) of `predict` alone: the variance is most of a prediction."""
@@ -268,12 +269,12 @@ class GaussianProcess(Differentiable, ClosedForm):
 
 
 def project_targets(
-    targets: np.ndarray, kind: Kind, mean: np.ndarray, axes: np.ndarray
+    targets: np.ndarray, target: Target, mean: np.ndarray, axes: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond."""
     scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
     for part in row_blocks(targets):
-        rows = to_real(targets[part], kind) - mean
+        rows = target.to_real(targets[part]) - mean
         scores[part] = result = rows @ axes.T
         beyond += float((rows.astype(np.float64) ** 2).sum()) - float((result.astype(np.float64) ** 2).sum())
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import to_real
 
 SPACING_ON = 10_000  # rows whose spacing is looked at
 
@@ -49,7 +48,7 @@ class InverseDistance(Interpolator):
         distance, row = self.tree.query(queries, k=np.arange(1, count + 1))  # nearest first
         weight = 1 / np.maximum(distance, self.NEAR) ** self.power
         weight = torch.from_numpy(weight / weight.sum(1, keepdims=True)).float()
-        result = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
+        result = torch.from_numpy(self.target.to_real(self.targets[row.ravel()]))
         blend = torch.bmm(weight[:, None], result.view(*row.shape, -1))[:, 0]
         unknown = torch.from_numpy(-np.expm1(-distance[:, 0] / self.spacing)).float()
         return Prediction(self._to_targets(blend), unknown=unknown)

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.data.target import Kind, Target
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import heard_rows, power_rows, to_targets, training_targets, unheard_note
+from gsparc.models.target_rows import heard_rows, power_rows, training_targets, unheard_note
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
@@ -89,10 +90,15 @@ class Interpolator(Method):
     @property
     def kind(self) -> Kind:
         """Kind of the targets that were learned."""
-        return self.fitted_site.kind
+        return self.target.kind
+
+    @property
+    def target(self) -> Target:
+        """What the targets are that were learned."""
+        return self.fitted_site.target
 
     def _to_targets(self, rows: Tensor) -> Tensor:
-        return to_targets(rows, self.kind, self.shape)
+        return self.target.to_targets(rows, self.shape)
 
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:

@@ -22,7 +22,6 @@ from scipy.spatial.distance import cdist, pdist
 
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import to_entry_variance, to_real
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.stored import Stored
@@ -113,7 +112,7 @@ class Kriging(Interpolator):
         decibels, self.channels = self._to_decibels(targets), None
         first, self.values, _ = mean_at_places(positions, decibels)
         self.positions = positions[first]
-        if self.kind == "csi":
+        if self.target.signed:
             self.channels = mean_at_places(positions, targets.reshape(len(targets), -1))[1]
         self.variogram = fit_variogram(positions, decibels)
         self._factor_system()
@@ -124,11 +123,11 @@ class Kriging(Interpolator):
         return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m{few}",)
 
     def _to_decibels(self, targets: np.ndarray) -> np.ndarray:
-        if self.kind == "csi":
+        if self.target.signed:
             power = np.abs(targets.reshape(len(targets), -1)) ** 2
             floor = max(float(power.mean()) * 1e-8, SILENCE)
             return to_decibels(np.maximum(power, floor)).astype(np.float32)
-        rows = to_real(targets, self.kind)
+        rows = self.target.to_real(targets)
         if self.kind == "rssi":
             return rows  # already decibels
         return to_decibels(np.maximum(rows, np.float32(FLOOR)))
@@ -193,7 +192,7 @@ class Kriging(Interpolator):
             towards = weighted_sum(self.channels, torch.complex64)
             mean = torch.polar(from_decibels(decibels / 2), towards.angle()).view(-1, *self.shape)
         unknown = (variance / self.variogram.variance).clamp(0, 1)
-        return Prediction(mean, to_entry_variance(variance, mean, "rssi") if power else None, unknown)
+        return Prediction(mean, self.target.entry_variance(variance, mean) if power else None, unknown)
 
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)

@@ -8,7 +8,6 @@ import torch
 from gsparc.data.blocks import row_blocks
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import to_real
 
 
 class Mean(Interpolator):
@@ -19,9 +18,9 @@ class Mean(Interpolator):
     stored = ("value",)
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        total = np.zeros(int(np.prod(self.shape)) * (2 if self.kind == "csi" else 1))
+        total = np.zeros(int(np.prod(self.shape)) * self.target.numbers)
         for part in row_blocks(targets):  # thousands of byte images never become floats at once
-            total += to_real(targets[part], self.kind).sum(0, dtype=np.float64)
+            total += self.target.to_real(targets[part]).sum(0, dtype=np.float64)
         self.value = torch.from_numpy(total / len(targets)).float()
         return ()
 

@@ -17,8 +17,7 @@ from scipy.stats import norm, t
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.models.target_rows import TINY_POWER, decibels
-from gsparc.physics.decibels import RELATIVE_DB
+from gsparc.physics.decibels import RELATIVE_DB, TINY_POWER
 
 LEAST_HELD = 4  # rows, for weights to mean anything
 LEAST_GAIN_DB = 0.1  # for which a query may take several times as long
@@ -93,14 +92,7 @@ def explained_variance(predicted: Tensor, target: Tensor, remove_mean: bool) -> 
 
 def in_error_unit(values: Tensor, site: Site) -> Tensor:
     """Return values in the unit that errors are counted in: powers in decibels."""
-    return decibels(values) if site.kind == "rssi" else values
-
-
-def mix_means(first: Tensor, second: Tensor, weight: float, site: Site) -> Tensor:
-    """Return the mean (n, ...) of two predictions in the unit of errors, the other's of this weight."""
-    if site.kind != "rssi":
-        return first.lerp(second, weight)
-    return first.clamp_min(TINY_POWER) ** (1 - weight) * second.clamp_min(TINY_POWER) ** weight
+    return site.target.in_error_unit(values)
 
 
 def to_real_entries(values: Tensor) -> Tensor:

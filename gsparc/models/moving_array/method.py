@@ -31,7 +31,7 @@ from gsparc.models.moving_array.triangulate import (
     pixel_exponent,
     site_problem,
 )
-from gsparc.models.target_rows import heard_rows, to_real, training_targets
+from gsparc.models.target_rows import heard_rows, training_targets
 from gsparc.physics.lags import BLOCK, SpectrumLags
 from gsparc.physics.separable import Separable, fit_separable
 from gsparc.processes.kernel import Kernel
@@ -287,7 +287,7 @@ class MovingArrayField(Differentiable, ClosedForm):
     _query: ImageRenderer | None = None
 
     def _to_images(self, targets: np.ndarray) -> Tensor:
-        return torch.from_numpy(to_real(targets, "spectrum")).reshape(targets.shape)
+        return torch.from_numpy(self.fitted_site.target.to_real(targets)).reshape(targets.shape)
 
     def _blocks(self, targets: np.ndarray) -> Iterator[Tensor]:
         return (self._to_images(targets[i : i + BLOCK]) for i in range(0, len(targets), BLOCK))

@@ -16,10 +16,12 @@ import torch
 
 from gsparc.data.limits import Checked, choice, setting, whole
 from gsparc.data.query import Query
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.data.target import Kind
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import heard_rows, to_real
+from gsparc.models.target_rows import heard_rows
+from gsparc.physics.decibels import finite_decibels
 from gsparc.simulate.calibration import (
     GENERIC,
     Material,
@@ -199,10 +201,8 @@ class CalibratedRayTracer(Checked, Method):
 
 def _measured_decibels(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Powers (n,) of `rows` in decibels of stored units; of channels the mean over tones."""
-    if data.site.kind == "rssi":
-        return to_real(data.target[rows], "rssi")[:, 0].astype(np.float64)
-    measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
-    squared = np.abs(data.target[rows].astype(np.complex128)) ** 2
+    power = data.site.target.power(data.target[rows]).reshape(len(rows), -1)
+    measured = np.ones(power.shape, bool) if data.mask is None else data.mask[rows].reshape(power.shape)
     # A row without any measured tone has power 0, not 0 / 0.
-    power = (squared * measured[rows]).sum(axis=(1, 2)) / np.maximum(measured[rows].sum(axis=(1, 2)), 1)
-    return to_real(power, "rssi")[:, 0].astype(np.float64)
+    power = (power * measured).sum(axis=1) / np.maximum(measured.sum(axis=1), 1)
+    return finite_decibels(power)

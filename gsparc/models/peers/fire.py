@@ -15,8 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.query import Batch, Query
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.data.target import Kind
 from gsparc.models.method import Prediction
 from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer, perceptron
 from gsparc.models.uplink.interface import UplinkMethod, root_mean_power

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.query import Batch
-from gsparc.data.schema import Kind
+from gsparc.data.target import Kind
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.losses import LossSettings, task_loss
 from gsparc.models.peers.gaussians import (

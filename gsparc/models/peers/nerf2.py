@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.query import Batch
-from gsparc.data.schema import Kind
+from gsparc.data.target import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron, smooth_root
 from gsparc.ops import Pose

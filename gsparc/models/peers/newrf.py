@@ -24,7 +24,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsparc.data.query import Batch
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import Measurements
+from gsparc.data.target import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron

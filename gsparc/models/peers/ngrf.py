@@ -19,7 +19,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Kind
+from gsparc.data.target import Kind
 from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer
 from gsparc.ops import Pose
 from gsparc.physics.array_response import bartlett_spectrum, normalise_spectrum, steering_matrix

@@ -21,8 +21,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from gsparc.data.schema import Kind
 from gsparc.data.site_objects import GaussianCloud
+from gsparc.data.target import Kind
 from gsparc.models.peers.gaussians import (
     MOST_STRETCH,
     SHIFT,

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.query import Batch, Query
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.data.target import Kind
 from gsparc.field.gradient_stage import interruptible, make_trainer, read_trainer_result, requested_steps
 from gsparc.field.losses import LossSettings, task_loss
 from gsparc.field.module import NetworkModule

@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Kind
+from gsparc.data.target import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     MOST_STRETCH,

@@ -33,7 +33,8 @@ from gsparc.models.powers.settings import (
     choose_candidate,
     mix_candidates,
 )
-from gsparc.models.target_rows import linear_powers, power_rows, to_entry_variance
+from gsparc.models.target_rows import linear_moments, power_rows
+from gsparc.physics.decibels import from_decibels
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import Exact, approximation_label
 from gsparc.processes.powers import PowerProcess, condition_on_powers, trend_about_rows
@@ -173,9 +174,8 @@ class PowerField(ClosedForm):
         parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
         joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
         mean, spread, share, explained = joined
-        power = linear_powers(mean)
-        explained_power = linear_powers(explained) if self.count_components() else None
-        return Prediction(power, to_entry_variance(spread, power, "rssi"), share, explained_power)
+        explained_power = from_decibels(explained[:, None]) if self.count_components() else None
+        return Prediction(*linear_moments(mean, spread), share, explained_power)
 
     def left_out(self) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
@@ -195,8 +195,7 @@ class PowerField(ClosedForm):
                 decibels, torch.from_numpy(places), torch.from_numpy(nearest_distances(places)), self.known
             )
             spread = spread * factor
-        mean = linear_powers(decibels.float())
-        return LeftOutRows(self.known, mean, to_entry_variance(spread.float(), mean, "rssi"))
+        return LeftOutRows(self.known, *linear_moments(decibels.float(), spread.float()))
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

@@ -25,7 +25,7 @@ from gsparc.models.array_vectors.splat_init import start_from_vectors
 from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
 from gsparc.models.mixture.weights import LEAST_HELD
 from gsparc.models.splat.left_out_images import LeftOut, means_and_variances
-from gsparc.models.target_rows import to_real, training_targets
+from gsparc.models.target_rows import training_targets
 from gsparc.ops import Pose
 from gsparc.ops.transforms import full_precision
 from gsparc.processes.factor import Factor
@@ -76,7 +76,7 @@ def _fit_kernel(data: Measurements, rows: np.ndarray, limit: int, seed: int) -> 
     draw = np.random.default_rng(seed)
     chosen = rows if len(rows) <= limit else np.sort(draw.choice(rows, limit, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
-    parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
+    parts = principal_components(training_targets(data, looked_at), data.site.target, COMPONENTS)
     return chosen, choose_left_out_kernel(data.moving[looked_at], parts.scores, len(parts.mean), 1)
 
 
@@ -154,7 +154,9 @@ def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weigh
     gram = weights.mT @ weights
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
     batch = data.batch(rows)
-    images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
+    images = torch.from_numpy(data.site.target.to_real(training_targets(data, rows))).flatten(
+        1
+    )  # holes filled
     emission = Factor.from_gram(gram + ridge).solve(weights.mT @ images.mT).mT
     distance = model.relative_distances(batch.tx)
     attenuation = model.attenuation(distance)

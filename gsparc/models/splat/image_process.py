@@ -19,7 +19,6 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
-from gsparc.models.mixture.weights import mix_means
 from gsparc.models.reduced import Settings, average_with_process, without_variance
 from gsparc.models.splat.auto_settings import resolve_auto
 from gsparc.models.splat.method import LearnedField
@@ -121,7 +120,7 @@ class ImageProcess(LearnedField):
         # The process without its variance is float32 and has no slopes, which float64 is asked for.
         exact = query.tx.dtype == torch.float64
         other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
-        return replace(own, mean=mix_means(own.mean, other, weight, self.fitted_site))
+        return replace(own, mean=self.fitted_site.target.blend(own.mean, other, weight))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -136,7 +135,7 @@ class ImageProcess(LearnedField):
         if self._average is None:
             return result
         process, weight = self._average
-        return average_with_process(result, process, partial(mix_means, weight=weight, site=self.fitted_site))
+        return average_with_process(result, process, partial(self.fitted_site.target.blend, weight=weight))
 
     def count_components(self) -> int:
         """Return the number of Gaussians."""

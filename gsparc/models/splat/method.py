@@ -391,7 +391,7 @@ class LearnedField(Method):
             batch = data.batch(fold.val)
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
-            error = squared_error(result.mean.clamp(0, 1), batch, "spectrum")
+            error = squared_error(result.mean.clamp(0, 1), batch, model.site.target)
             model.error.set_error_law(*fit_level_and_power(result.unknown.numpy(), error.double().numpy()))
 
     # -- answering ---------------------------------------------------------------------------------

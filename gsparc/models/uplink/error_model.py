@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.models.target_rows import TINY_POWER
 from gsparc.models.uplink.interface import mean_power
 from gsparc.models.uplink.search import Sources
+from gsparc.physics.decibels import TINY_POWER
 from gsparc.physics.plane_waves import Aperture
 
 LEAST = 1e-9  # of a feature: a logarithm is taken

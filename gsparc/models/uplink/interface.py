@@ -11,7 +11,7 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.method import Method, Prediction
-from gsparc.models.target_rows import TINY_POWER
+from gsparc.physics.decibels import TINY_POWER
 
 
 @runtime_checkable

@@ -9,6 +9,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.load import load, split_for
+from gsparc.data.target import TARGETS
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, choose_left_out_kernel, principal_components
 from gsparc.processes.density import LeftOutDensity
@@ -18,7 +19,7 @@ from gsparc.training.context import FitContext
 
 def test_chosen_kernel_is_a_minimum(campaign):
     data = campaign("spectrum", 40)
-    scores = torch.from_numpy(principal_components(data.target, "spectrum", 512).scores)
+    scores = torch.from_numpy(principal_components(data.target, data.site.target, 512).scores)
     kernel = choose_left_out_kernel(data.moving, scores.numpy(), 288, 1)
     places = torch.from_numpy(data.moving)
     at = {
@@ -33,8 +34,8 @@ def test_chosen_kernel_is_a_minimum(campaign):
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
 def test_components_are_the_principal_ones(campaign, kind):
     target = campaign(kind, 20).target
-    parts = principal_components(target, kind, limit=3, block=5)
-    whole = principal_components(target, kind, limit=512)
+    parts = principal_components(target, TARGETS[kind], limit=3, block=5)
+    whole = principal_components(target, TARGETS[kind], limit=512)
     rows = whole.mean + whole.scores @ whole.axes
     reference = PCA(n_components=parts.scores.shape[1], svd_solver="full").fit(rows)
     assert np.allclose(parts.axes @ parts.axes.T, np.eye(len(parts.axes)), atol=1e-5)

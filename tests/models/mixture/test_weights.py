@@ -1,5 +1,4 @@
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +9,7 @@ from gsparc.models.mixture.weights import (
     best_weights,
     choose_weights,
     explained_variance,
-    in_error_unit,
     mean_and_error,
-    mix_means,
     mixture_errors,
     share_of_second,
     stacking_weights,
@@ -47,13 +44,6 @@ def test_complex_predictions_are_weighed_as_they_are_summed():
     both = found[0] * turned + found[1] * other
     told = [explained_variance(one, target, False) for one in (both, turned, other)]
     assert told[0] > max(told[1:])
-
-
-def test_powers_that_are_weighed_in_decibels_were_averaged_as_such():
-    site = SimpleNamespace(kind="rssi")
-    own, other = torch.tensor([1e-6]), torch.tensor([1e-10])
-    assert float(in_error_unit(mix_means(own, other, 0.25, site), site)) == pytest.approx(-70)
-    assert float(mix_means(own, other, 0.25, SimpleNamespace(kind="csi"))) == pytest.approx(0.75e-6, rel=1e-4)
 
 
 def test_silent_targets_still_give_weights():

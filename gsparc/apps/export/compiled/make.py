@@ -12,8 +12,9 @@ from gsparc.apps.export.compiled.blob import Form
 from gsparc.apps.export.compiled.channels import compile_sources
 from gsparc.apps.export.compiled.powers import compile_powers
 from gsparc.apps.export.compiled.spectra import compile_array, compile_view
-from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.data.target import Kind
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm

@@ -33,7 +33,7 @@ from gsparc.models.powers.together.learning import (
 )
 from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
 from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, rows_of_stations
-from gsparc.models.target_rows import linear_powers, to_entry_variance
+from gsparc.models.target_rows import linear_moments
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.places import moving_end, other_end
@@ -159,8 +159,7 @@ class JointPowerField(ClosedForm):
                 spread[chosen], share[chosen] = inflation * left, left / self.whole
         share = (share + self._law_share(moving_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
-        power = linear_powers(mean)
-        return Prediction(power, to_entry_variance(spread, power, "rssi"), share)
+        return Prediction(*linear_moments(mean, spread), share)
 
     @torch.no_grad()
     def predict_joint(self, moving: Tensor, stations: Tensor) -> JointLevels:
@@ -200,9 +199,8 @@ class JointPowerField(ClosedForm):
             loud = process.extra == 0
             means.append((process.given_values()[:, 0] - error)[loud])
             spreads.append(variance[loud])
-        mean = linear_powers(torch.cat(means).float())
-        variance = to_entry_variance(torch.cat(spreads).float(), mean, "rssi")
-        return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), mean, variance)
+        moments = linear_moments(torch.cat(means).float(), torch.cat(spreads).float())
+        return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), *moments)
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

@@ -1,0 +1,158 @@
+"""What a target is: facts of spectra, channels and powers, whatever the site."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.physics.decibels import RELATIVE_DB, TINY_POWER, finite_decibels
+
+Kind = Literal["spectrum", "csi", "rssi"]
+Values = TypeVar("Values", np.ndarray, Tensor)
+
+
+class Target:
+    """A kind of measurement; rows are first in all arrays.
+
+    Attributes:
+        kind: its name in files and settings.
+        words: what one is, for people.
+        numbers: real numbers of an entry.
+        exponent: of an entry's magnitude that is its power.
+        axes: of an array of them, rows among them.
+        signed: whether entries have a sign, or a phase.
+    """
+
+    kind: ClassVar[Kind]
+    words: ClassVar[str]
+    numbers: ClassVar[int] = 1
+    exponent: ClassVar[int] = 2
+    axes: ClassVar[int] = 3
+    signed: ClassVar[bool] = False
+
+    def describe(self, count: int, shape: tuple[int, ...]) -> str:
+        """Return how many of which shape (`shape` of one) there are, for people."""
+        raise NotImplementedError
+
+    def to_real(self, target: np.ndarray) -> np.ndarray:
+        """Return stored targets (n, ...) as float32 rows (n, D), in units in which interpolation is fair.
+
+        >>> TARGETS["rssi"].to_real(np.array([[1.0], [0.1]])).tolist()
+        [[0.0], [-10.0]]
+        """
+        return target.reshape(len(target), -1).astype(np.float32)
+
+    def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """Return rows (B, D) of `to_real` as targets (B, *shape) in stored units."""
+        raise NotImplementedError
+
+    def entry_variance(self, variance: Tensor, mean: Tensor) -> Tensor:
+        """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry
+        about targets `mean` (B, ...).
+        """
+        return variance * self.numbers
+
+    def in_error_unit(self, values: Tensor) -> Tensor:
+        """Return values in the unit that errors are counted in."""
+        return values
+
+    def moments_in_error_unit(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return means (B, ...) and the variance (B,) or (B, 1) of their entries, in the unit of errors."""
+        return self.in_error_unit(mean), variance
+
+    def blend(self, first: Tensor, second: Tensor, weight: float) -> Tensor:
+        """Return the mean (n, ...) of two in the unit of errors, the second's of this weight."""
+        return first.lerp(second, weight)
+
+    def power(self, values: Values) -> Values:
+        """Return the power of entries (...) in physical units, float64."""
+        magnitude = abs(values)
+        double = magnitude.double() if isinstance(magnitude, Tensor) else magnitude.astype(np.float64)
+        return double**self.exponent
+
+
+class Spectrum(Target):
+    """Amplitudes over directions (H, W), in [0, 1]."""
+
+    kind = "spectrum"
+    words = "spectra"
+
+    def describe(self, count: int, shape: tuple[int, ...]) -> str:
+        """See `Target.describe`."""
+        return f"{count} images of {shape[0]} x {shape[1]} directions"
+
+    def to_real(self, target: np.ndarray) -> np.ndarray:
+        """Return pixels in [0, 1]; see `Target.to_real`."""
+        rows = super().to_real(target)
+        return rows / np.float32(255) if target.dtype == np.uint8 else rows
+
+    def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """Return images clamped to [0, 1]; see `Target.to_targets`."""
+        return rows.reshape(len(rows), *shape).clamp(0.0, 1.0)
+
+
+class Channel(Target):
+    """Complex gains (antennas, subcarriers)."""
+
+    kind = "csi"
+    words = "channels"
+    numbers = 2
+    signed = True
+
+    def describe(self, count: int, shape: tuple[int, ...]) -> str:
+        """See `Target.describe`."""
+        many = ["s" * (n != 1) for n in shape]
+        return f"{count} channels of {shape[0]} antenna{many[0]} x {shape[1]} subcarrier{many[1]}"
+
+    def to_real(self, target: np.ndarray) -> np.ndarray:
+        """Return real and imaginary parts in linear units; see `Target.to_real`."""
+        # ascontiguousarray: a view as pairs needs the last axis dense.
+        return np.ascontiguousarray(target, dtype=np.complex64).reshape(len(target), -1).view(np.float32)
+
+    def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """See `Target.to_targets`."""
+        return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
+
+
+class Power(Target):
+    """Received powers (1,), linear; their errors are of decibels."""
+
+    kind = "rssi"
+    words = "received powers"
+    exponent = 1
+    axes = 2
+
+    def describe(self, count: int, shape: tuple[int, ...]) -> str:
+        """See `Target.describe`."""
+        return f"{count} received powers"
+
+    def to_real(self, target: np.ndarray) -> np.ndarray:
+        """Return decibels; see `Target.to_real`."""
+        return finite_decibels(super().to_real(target))
+
+    def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """See `Target.to_targets`."""
+        return 10 ** (rows.reshape(len(rows), *shape) / 10)
+
+    def entry_variance(self, variance: Tensor, mean: Tensor) -> Tensor:
+        """Carry decibels to linear power, to first order; see `Target.entry_variance`."""
+        return variance * (mean.flatten(1).mean(1) / RELATIVE_DB) ** 2
+
+    def in_error_unit(self, values: Tensor) -> Tensor:
+        """Return levels [dB]."""
+        return finite_decibels(values)
+
+    def moments_in_error_unit(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return levels [dB] and their variance, to first order."""
+        slope = RELATIVE_DB / mean.to(variance.dtype).reshape(variance.shape).clamp_min(TINY_POWER)
+        return self.in_error_unit(mean), variance * slope.square()
+
+    def blend(self, first: Tensor, second: Tensor, weight: float) -> Tensor:
+        """Return a mean of levels; see `Target.blend`."""
+        return first.clamp_min(TINY_POWER) ** (1 - weight) * second.clamp_min(TINY_POWER) ** weight
+
+
+TARGETS: dict[Kind, Target] = {one.kind: one for one in (Spectrum(), Channel(), Power())}
