@@ -21,25 +21,32 @@ from gsparc.training.context import FitContext, FitReport
 
 log = logging.getLogger(__name__)
 
-# `zero` has NMSE 1 by definition: what is worse is worse than saying nothing.
-BASELINES = ("zero", "mean", "nearest", "idw", "gp")
+# What a reader could have without gsparc, in the order of tables. `zero` has NMSE 1 by definition: what is
+# worse is worse than saying nothing.
+PLAIN = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp", "ridge")
 
 
 def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     """Return names of all plain methods that serve these measurements and rows."""
+    powers, channels = data.site.kind == "rssi", data.site.kind == "csi"
+    # Both fit decibels over distance, which only powers have; a linear map is of a band from the other.
+    serves = {"distance_law": powers, "kriging": powers, "ridge": data.uplink is not None}
+    serves["complex_gp"] = channels and _have_carriers(data) and _know_all_stations(data, split)
+    return tuple(name for name in PLAIN if serves.get(name, True))
+
+
+def _have_carriers(data: Measurements) -> bool:
+    """Whether a kernel that oscillates with the wavelength is defined."""
     site = data.site
-    # Of a band from the other at the same moment, a linear map is the plainest.
-    names = BASELINES if data.uplink is None else (*BASELINES, "ridge")
-    if site.kind == "rssi":
-        # Both fit decibels over distance, which only powers have.
-        return (*names, "distance_law", "kriging")
     carriers = (site.carrier_hz, None if site.stations is None else site.stations.carrier_hz)
-    # The kernel of `complex_gp` oscillates with the wavelength: without a carrier it is not defined.
-    if site.kind != "csi" or all(one is None for one in carriers):
-        return names
-    folds = split.folds if data.station is not None else ()  # of all stations of test rows enough are known
+    return any(one is not None for one in carriers)
+
+
+def _know_all_stations(data: Measurements, split: Split) -> bool:
+    """Whether enough rows of all stations of test rows are learned."""
+    folds = split.folds if data.station is not None else ()
     few = (stations_of_fold(method_class("complex_gp")(), data, fold).only_tested.any() for fold in folds)
-    return names if any(few) else (*names, "complex_gp")
+    return not any(few)
 
 
 def same_as_baseline(config: DictConfig, method: MethodFactory) -> str | None:

@@ -53,22 +53,36 @@ GIVEN_HEARD = "rmse_db: of levels given that they are heard or listed"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
-# Order matters: `DECIDING` takes the first of each.
-TABLES: dict[Scored, tuple[str, ...]] = {
-    "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
-    "csi": ("nmse", "nmse_scalar", "snr_db"),
-    "aligned csi": ("nmse_aligned", "tone_rmse_db", "snr_db"),
-    "rssi": ("rmse_db", "mae_db"),
+
+
+@dataclass(frozen=True)
+class KindFigures:
+    """Figures of what is measured, by where they are shown.
+
+    Attributes:
+        columns: of tables; methods, fronts and effects are compared by the first.
+        second: beside the score in comparisons.
+        of_sample: of a single sample, in decibels.
+        distributions: over samples, drawn after a sweep.
+    """
+
+    columns: tuple[str, ...]
+    second: str
+    of_sample: str
+    distributions: tuple[str, ...]
+
+
+OF_KIND: dict[Scored, KindFigures] = {
+    "spectrum": KindFigures(
+        ("psnr_db", "ssim_gauss", "ssim", "mse"), "ssim", "psnr_db", ("ssim_gauss", "psnr_db", "mse")
+    ),
+    "csi": KindFigures(("nmse", "nmse_scalar", "snr_db"), "snr_db", "snr_db", ("snr_db", "error_power")),
+    "aligned csi": KindFigures(
+        ("nmse_aligned", "tone_rmse_db", "snr_db"), "tone_rmse_db", "snr_db", ("snr_db", "error_power")
+    ),
+    "rssi": KindFigures(("rmse_db", "mae_db"), "mae_db", "error_db", ("error_db",)),
 }
-"""The columns of a kind's tables; methods, fronts and effects are compared by the first."""
-DECIDING: dict[Scored, str] = {kind: names[0] for kind, names in TABLES.items()}
-PER_SAMPLE: dict[Scored, str] = {
-    "spectrum": "psnr_db",
-    "csi": "snr_db",
-    "aligned csi": "snr_db",
-    "rssi": "error_db",
-}
-"""The figure of a single sample, in decibels."""
+DECIDING: dict[Scored, str] = {kind: figures.columns[0] for kind, figures in OF_KIND.items()}
 
 
 def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:

@@ -22,12 +22,13 @@ import pandas as pd
 
 from gsparc.data.executor import SAY_S
 from gsparc.data.files import write_whole
+from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.metric_formats import (
     BEST_SERVER,
     CALIBRATION,
     GIVEN_HEARD,
     LISTED,
-    TABLES,
+    OF_KIND,
     WITH_SILENT,
     judged_by,
     main_figure,
@@ -42,7 +43,6 @@ from gsparc.training.cost import LINE
 
 _Found = TypeVar("_Found")
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
-ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 MOST_LEARNED = 3  # notes of a fit below the table; the log has all
 RIGHT_CHI2 = 0.25, 4.0  # std wrong by a factor of two; 73 runs of public and simulated data had .6 to 2.2
@@ -130,12 +130,12 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
     """
     # Silent rows, stations and variances are not of all data and methods.
     beside = [name for name in (WITH_SILENT, BEST_SERVER, CALIBRATION) if f"{prefix}/{name}" in facts]
-    wanted = [*TABLES[facts["dataset/kind"]], "skill", *beside]
+    wanted = [*OF_KIND[facts["dataset/kind"]].columns, "skill", *beside]
     own, *others = result_rows(facts, prefix)
     figures = [own.get(name) for name in wanted]
     # A baseline that the method is was fitted once: its row is the method's own.
     kept = [o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures]
-    kept.sort(key=lambda row: ORDER.index(row["method"]) if row["method"] in ORDER else len(ORDER))
+    kept.sort(key=lambda row: PLAIN.index(row["method"]) if row["method"] in PLAIN else len(PLAIN))
     named = [row | {"method": f"{method} (baseline)"} if row["method"] == method else row for row in kept]
     alone = facts_under(facts, "field")
     fields = [row_of_method(f"{method}, Gaussians alone", alone, alone)] if alone else []

@@ -6,18 +6,15 @@ import pytest
 import torch
 
 from gsparc.data.schema import Scored
-from gsparc.evaluation.experiment import table
 from gsparc.evaluation.metric_formats import (
     DECIDING,
     FIGURES,
-    PER_SAMPLE,
-    TABLES,
+    OF_KIND,
     lower_is_better,
     score_heading,
     score_of,
 )
 from gsparc.evaluation.metrics import METRICS
-from gsparc.evaluation.report import plots
 
 OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quantiles of a figure with an entry
 
@@ -32,10 +29,11 @@ def figure_names(kind):
     return set(metric.summary(metric.compute())) - {"samples", "silent_samples"}
 
 
-@pytest.mark.parametrize("kind", TABLES)
+@pytest.mark.parametrize("kind", OF_KIND)
 def test_every_figure_has_an_entry(kind):
     assert figure_names(kind) - OF_ANOTHER <= set(FIGURES)
-    assert set(TABLES[kind]) <= figure_names(kind) and PER_SAMPLE[kind] in FIGURES
+    figures = OF_KIND[kind]
+    assert {*figures.columns, figures.second} <= figure_names(kind) and figures.of_sample in FIGURES
 
 
 def test_every_figure_knows_which_way_is_better():
@@ -49,5 +47,5 @@ def test_every_figure_knows_which_way_is_better():
 def test_channels_that_are_scored_after_their_freedom_had_no_table():
     """`gsparc compare` and reports of Wi-Fi channels ended in a KeyError."""
     scored = set(get_args(Scored))
-    assert set(table.SECOND) == set(plots.CDFS) == scored
+    assert set(OF_KIND) == set(METRICS) == scored
     assert all(score_heading(DECIDING[one]) for one in scored)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.schema import Scored
+from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.experiment.latency import SPEED, TIMED
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
-    DECIDING,
     GIVEN_HEARD,
+    OF_KIND,
     WITH_SILENT,
     heading_of,
     lower_is_better,
@@ -26,11 +26,6 @@ from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Row, Table, value_with_error
 
-SECOND: dict[Scored, str] = {
-    "spectrum": "ssim", "csi": "snr_db", "aligned csi": "tone_rmse_db", "rssi": "mae_db"
-}  # fmt: skip
-# Plain methods that a reader could have without gsparc; remarks say where one of them wins.
-SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 BESIDE = {  # figures beside the score, and their headings, by their columns
     "coverage": ("interval/coverage_90", Column("in 90 % interval", ".2f", of="coverage")),
     "outage": ("outage/brier", Column("outage, Brier score", ".4f", of="outage")),
@@ -55,7 +50,8 @@ CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spr
 
 def _scored(own: Row) -> dict[str, Any]:
     """What a comparison reads of a cell, beside the columns of all results."""
-    second = DECIDING[own["kind"]] if own["figure"] == WITH_SILENT else SECOND[own["kind"]]
+    figures = OF_KIND[own["kind"]]
+    second = figures.columns[0] if own["figure"] == WITH_SILENT else figures.second
     label = str(own["label"] or "")
     return {
         "result": own, "score_db": score_db(own), "second_figure": second, "second_value": own.get(second),
@@ -176,12 +172,12 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
         lines.append(gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure))
-    if first.method in SIMPLE and not block.method.isin(SIMPLE).all():
+    if first.method in PLAIN and not block.method.isin(PLAIN).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
         if own is None or lead is None or lead.sure:
             lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
     for row in rows[1:]:
-        if own is None or row.method not in SIMPLE or row.score_db <= own.score_db:
+        if own is None or row.method not in PLAIN or row.score_db <= own.score_db:
             continue
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:

@@ -19,7 +19,7 @@ from PIL import Image
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.drawing import save
-from gsparc.evaluation.metric_formats import LISTED, PER_SAMPLE, judged_by
+from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
 from gsparc.evaluation.report import plots, tables
 from gsparc.evaluation.results import STUDY, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
@@ -73,7 +73,7 @@ def make_sections(
         several = [tables.table_of_seeds] * (len(firsts) < len(own))
         kinds = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
         swept = [columns for name, columns in fronts if name == dataset]
-        of_sample = [PER_SAMPLE[own.kind.iloc[0]]]
+        of_sample = [OF_KIND[own.kind.iloc[0]].of_sample]
         pictures = [
             (f"{setting}{what}", _png(run.folder / name))
             for setting, run in zip(firsts.setting[:MOST_PICTURES], firsts.run, strict=False)

@@ -14,9 +14,8 @@ import pandas as pd
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from gsparc.data.schema import Scored
 from gsparc.evaluation.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
-from gsparc.evaluation.metric_formats import heading_of, score_of
+from gsparc.evaluation.metric_formats import OF_KIND, heading_of, score_of
 from gsparc.evaluation.report.tables import groups_of, interval_of_figure
 from gsparc.evaluation.results import Run, distinct_baselines, own_rows
 from gsparc.evaluation.table import Row
@@ -25,10 +24,6 @@ from gsparc.prediction.pareto import pareto_front
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
 TIMES = "render_ms"  # of single queries, beside the figures of samples
-CDFS: dict[Scored, tuple[str, ...]] = {
-    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"),
-    "aligned csi": ("snr_db", "error_power"), "rssi": ("error_db",),
-}  # fmt: skip
 
 
 def to_svg(figure: Figure) -> str:
@@ -114,7 +109,7 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path) -> None:
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
     own = own_rows(rows)
-    names = [name for name in CDFS[own.kind.iloc[0]] if name in own.run.iloc[0].samples]
+    names = [name for name in OF_KIND[own.kind.iloc[0]].distributions if name in own.run.iloc[0].samples]
     names += [TIMES] if any(len(run.render_ms) for run in own.run) else []
     if not names:  # nothing was tested
         return

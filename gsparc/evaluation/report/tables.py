@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.metric_formats import CALIBRATION, PER_SAMPLE, TABLES, heading_of, number_format
+from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
 from gsparc.evaluation.results import distinct_baselines, own_rows
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
@@ -108,7 +108,7 @@ def accuracy_column(figure: str, note: str = "") -> Column:
 
 def _figures(rows: pd.DataFrame) -> list[str]:
     """Figures of these data, first the one that decides: with silent rows it is none of the usual ones."""
-    return list(dict.fromkeys([rows.figure.iloc[0], *TABLES[rows.kind.iloc[0]]]))
+    return list(dict.fromkeys([rows.figure.iloc[0], *OF_KIND[rows.kind.iloc[0]].columns]))
 
 
 def groups_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
@@ -212,7 +212,7 @@ def differing_settings(rows: pd.DataFrame) -> dict[str, str]:
 def table_of_worst(rows: pd.DataFrame) -> Table:
     """Return the three test positions with the largest error of each run."""
     own = own_rows(rows)
-    name = PER_SAMPLE[own.kind.iloc[0]]
+    name = OF_KIND[own.kind.iloc[0]].of_sample
     rival = f"baseline/gp/{name}"
     beside = ("gp there",) if any(rival in run.samples for run in own.run) else ()
     numbers = [Column(head, ".2f") for head in (heading_of(name), *beside, "confidence")]

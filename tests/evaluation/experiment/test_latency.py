@@ -16,6 +16,8 @@ WAITS = {"quick": 0.0, "slow": 0.2, "endless": 0.7}  # [s]
 class Waiting:
     """Reads whole batches, as methods that need an uplink do: positions alone are not enough."""
 
+    threads_pay = False
+
     def __init__(self, name: str, watch: WoundClock) -> None:
         self.name, self.watch, self.asked = name, watch, []
 
