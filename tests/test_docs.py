@@ -89,6 +89,7 @@ def headings(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
+@pytest.mark.slow
 def test_commands_compose():
     """Commands, settings and choices that the documents name exist."""
     given, alike = commands(), defaultdict(dict)

@@ -66,6 +66,7 @@ def words_of_code(tree: ast.AST) -> set[str]:
     return set(re.findall(r"[A-Za-z_]\w*", " ".join(words)))
 
 
+@pytest.mark.slow
 def test_docstrings_named_functions_that_are_gone():
     """`fit_factors`, `Behind` and `rows_of` were looked for in vain."""
     files = [file for folder in PACKAGES for file in sorted((ROOT / folder).rglob("*.py"))]

@@ -104,6 +104,7 @@ def arrows() -> dict[tuple[str, str], set[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_rooms_import_what_the_list_allows_and_nothing_else():
     found = arrows()
     allowed = {(room, other) for room, others in ARROWS.items() for other in others.split()}

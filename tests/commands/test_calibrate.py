@@ -247,6 +247,7 @@ def _trained(folder, *more: str, run: str = "run"):
     return train(plain(spectra(folder / "own.npz"), "nearest", *more), folder / run)[1]
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_path) -> None:
     """`last.ckpt` and `refit/last.ckpt` took any split for their own: 38 dB where 29 were true."""
     file = spectra(tmp_path / "own.npz")

@@ -40,6 +40,7 @@ def test_help_waited_seconds_for_torch(words):
     assert re.search(said.get(words[0], "usage: gsparc check"), done.stdout)
 
 
+@pytest.mark.slow
 def test_composing_waited_seconds_for_torch():
     """The classes of all methods, or of the one chosen, were imported for their settings."""
     code = """
@@ -141,6 +142,7 @@ def with_advice(config):
     raise KeyboardInterrupt("go on with ckpt_path=last.ckpt")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "line"), [
     (while_a_library_cleans_up, "error: interrupted"),
     (in_compiled_code, "error: interrupted: Invalid bounding box"),

@@ -32,6 +32,7 @@ def compare(tmp_path, *more: str) -> tuple[int, str]:
     return answer.status, "\n".join([*answer.out, *answer.err])
 
 
+@pytest.mark.slow
 def test_a_comparison_left_files_that_its_page_did_not_name(tmp_path):
     """The page said compare.png where there is one picture a dataset, and not cells.csv."""
     spectra(tmp_path / "own.npz")

@@ -66,6 +66,7 @@ def said_in(file: Path) -> dict:
     return OmegaConf.to_container(under)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "file", [f for group in ("experiment", "paper") for f in sorted((CONF / group).rglob("*.yaml"))], ids=str
 )

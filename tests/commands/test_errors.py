@@ -92,6 +92,7 @@ def made(prints, spectra_gp, spectra_file) -> dict[str, Path]:
     return {"town": town, "spectra": spectra_gp, "prints": prints, "file": spectra_file}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "message"), REFUSED)
 def test_what_cannot_be_done_is_one_line(line, message, made, tmp_path, monkeypatch):
     monkeypatch.delenv("GSPARC_TOKEN", raising=False)

@@ -42,6 +42,7 @@ def test_the_command_leaves_summary_samples_and_table(trained, tmp_path):
     assert all(word in table for word in ("query", "nearest", "complex_gp"))
 
 
+@pytest.mark.slow
 def test_every_command_repeated_how_columns_are_read(tmp_path, monkeypatch):
     """Ten lines stood above each answer; evaluate said nothing, of another file either."""
     rng = np.random.default_rng(0)

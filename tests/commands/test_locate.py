@@ -59,6 +59,7 @@ def test_places_areas_and_pictures_are_written(trained, tmp_path):
     assert "locate" in checkpoint.read(trained).extra
 
 
+@pytest.mark.slow
 def test_a_file_without_places_is_located_too(trained, tmp_path):
     file = tmp_path / "other.npz"
     with np.load(spectra(tmp_path / "all.npz", rows=80)) as stored:
@@ -70,6 +71,7 @@ def test_a_file_without_places_is_located_too(trained, tmp_path):
     assert np.median(np.linalg.norm(found - true, axis=1)) < 0.3
 
 
+@pytest.mark.slow
 def test_a_table_was_refused_and_after_the_calibration(tmp_path):
     """Rows of another file were npz alone, though training reads tables."""
     rng = np.random.default_rng(0)
@@ -109,6 +111,7 @@ def roofs(tmp_path_factory):
     return ckpt, folder, degrees(east_north[100:])
 
 
+@pytest.mark.slow
 def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
     """`no coordinates among ...; say dataset.columns.x=COLUMN`, where Python located the same levels."""
     ckpt, folder, true = roofs
@@ -123,6 +126,7 @@ def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
     assert np.median(np.linalg.norm(off, axis=1)) < 30
 
 
+@pytest.mark.slow
 def test_a_long_log_was_refused_though_it_has_times(roofs, tmp_path, caplog):
     """`which are of one moment? expected one row a moment`, though rows of one scan have one time."""
     ckpt, folder, _ = roofs
@@ -167,6 +171,7 @@ def test_a_final_model_spoke_of_test_rows_alone(roofs, tmp_path):
         located(tmp_path / "run", f"ckpt={roofs[0]}")
 
 
+@pytest.mark.slow
 def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, monkeypatch, caplog):
     """Areas were calibrated anew by every call, though the checkpoint held what was learned."""
     monkeypatch.setattr(locator, "HELD_OUT", 6)
@@ -183,6 +188,7 @@ def test_each_call_calibrated_anew_for_minutes(roofs, tmp_path, monkeypatch, cap
     assert "calibration 1 of 2" in caplog.text
 
 
+@pytest.mark.slow
 def test_200_snapshots_left_out_were_each_sought_twice_from_the_coarse_grid_on(
     roofs, tmp_path, monkeypatch, caplog
 ):
@@ -201,6 +207,7 @@ def test_200_snapshots_left_out_were_each_sought_twice_from_the_coarse_grid_on(
     ] * 20
 
 
+@pytest.mark.slow
 def test_the_log_showed_trust_as_an_object(roofs, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(locator, "HELD_OUT", 3)
     given = f"ckpt={roofs[0]}", "store=false", "eval_on=train", "rows=1", "calibrate=2"
@@ -209,6 +216,7 @@ def test_the_log_showed_trust_as_an_object(roofs, tmp_path, monkeypatch, caplog)
     assert "3 snapshots left out: areas of 100.0 %" in caplog.text and "Trust(" not in caplog.text
 
 
+@pytest.mark.slow
 def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monkeypatch, caplog):
     """A plan that changed under its name was not noticed, and `calibrate=0` took whatever was stored."""
     monkeypatch.setattr(locator, "HELD_OUT", 6)
@@ -242,6 +250,7 @@ def test_ctrl_c_lost_all_that_was_located(tmp_path):
     assert (tmp_path / "locate.csv").read_text().split() == ["x", "0", "1", "2"]
 
 
+@pytest.mark.slow
 def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsaid(tmp_path, capsys):
     """Areas of 90 % held none of 35 places of a hall's other part, without a word."""
     rng = np.random.default_rng(0)
@@ -263,6 +272,7 @@ def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsa
     assert facts["locate/beyond"] <= 0.2 * len(found)
 
 
+@pytest.mark.slow
 def test_nobody_is_located_in_a_wall(trained, tmp_path):
     plan = np.full((40, 100, 3), 255, np.uint8)
     plan[:, 50:] = 0  # the right half of the room

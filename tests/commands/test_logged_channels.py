@@ -20,6 +20,7 @@ def logged(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_a_default_run_is_ahead_of_every_plain_method(logged, tmp_path):
     config = campaigns.compose(
         "dataset=own", f"dataset.file={logged / 'logged.npz'}", "model=gsparc", "logger=none"

@@ -40,6 +40,7 @@ def mapped(model, tmp_path_factory):
     return folder, "\n".join(done.out)
 
 
+@pytest.mark.slow
 def test_every_layer_and_a_table(mapped):
     folder, said = mapped
     layers = ("power", "best_server", "sinr", "outage", "expected_error", "width", "stations/power_west",
@@ -115,6 +116,7 @@ def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_pat
     assert_refused(answer, "train with stations=together", tmp_path)
 
 
+@pytest.mark.slow
 def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
     """Two stations, of which none can be left out; gains stood in no file."""
     path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
@@ -144,6 +146,7 @@ def test_a_best_place_was_not_said_to_be_like_others(tmp_path, monkeypatch):
     assert any(told in line for line in done.out)
 
 
+@pytest.mark.slow
 def test_a_single_candidate_was_not_told_apart_from_no_others(tmp_path, monkeypatch):
     path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
 
@@ -155,6 +158,7 @@ def test_a_single_candidate_was_not_told_apart_from_no_others(tmp_path, monkeypa
     assert any(line.endswith("of the gain 0.0 to 20.0 points") for line in done.out), done
 
 
+@pytest.mark.slow
 def test_a_station_among_others_of_no_known_place_was_no_number_of_metres_away(tmp_path):
     """`place` ended in `TypeError: unsupported format string`."""
     values = dict(np.load(town_file(tmp_path / "town.npz")))
@@ -166,6 +170,7 @@ def test_a_station_among_others_of_no_known_place_was_no_number_of_metres_away(t
     assert done.status == 0 and not any("from the next" in line for line in done.out), done
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
     began = []
 

@@ -35,7 +35,7 @@ def _composed(line: tuple[str, ...]) -> bool:
 
 
 RUN = [line for line in commands() if not _composed(line)]
-OFTEN = 3  # of a command's lines that the slow tests run; the others are like them
+OFTEN = 1  # of a command's lines that the slow tests run; the others are like them
 
 
 def _parts() -> list:

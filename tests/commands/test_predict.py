@@ -90,6 +90,7 @@ def answered(model, folder, heads, rows, **how):
     return read(predict_file(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"])
 
 
+@pytest.mark.slow
 def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
     """Three commands; held-out places of the measured city are predicted better than by the mean."""
     drive = city_drive(tmp_path)

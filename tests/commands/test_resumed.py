@@ -180,6 +180,7 @@ def test_a_method_without_a_field_has_no_module(others):
         load_module(others["nearest"])
 
 
+@pytest.mark.slow
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     """The settings it did not name were the defaults, and each of them stood in the refusal."""
     stopped = "callbacks.stop={_target_: lost.Interrupt, step: 15}"

@@ -21,6 +21,7 @@ LINES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LINES)
 def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypatch):
     runs_in(monkeypatch, tmp_path)

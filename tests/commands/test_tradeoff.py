@@ -46,6 +46,7 @@ def swept(field, tmp_path_factory):
         return facts, folder, ckpt, said
 
 
+@pytest.mark.slow
 def test_dashboards_get_the_points_that_nothing_beats(swept):
     facts, _, _, said = swept
     ((loggers, name, heads, rows),) = said
@@ -151,6 +152,7 @@ def test_a_model_of_two_moving_ends_could_not_be_timed():
     assert np.isfinite(ask(0)).all()
 
 
+@pytest.mark.slow
 def test_silent_rows_did_not_count_beside_other_methods(tmp_path, monkeypatch):
     """Inverse distances, of heard rows alone, had 2.4 dB beside 2.8; of all rows they have more."""
     file = town_file(tmp_path / "town.npz", 200)

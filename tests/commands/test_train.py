@@ -159,6 +159,7 @@ def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monk
 # -- the objective of a search --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
 def test_the_objective_is_for_searches_alone(tmp_path, way):
     """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`, exit 1."""

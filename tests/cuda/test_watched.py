@@ -138,6 +138,7 @@ def test_watched_kernels_have_nothing_to_report(watch, record):
     assert int(done.stdout.split()[0]) > 60
 
 
+@pytest.mark.slow
 def test_shared_memory_without_a_barrier_is_reported(tmp_path):
     """Neighbours in a warp need its barrier, warps that of the block; a shuffle is not one."""
     source = tmp_path / "race.cpp"

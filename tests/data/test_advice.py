@@ -50,6 +50,7 @@ def assert_advice_works(path, settings: dict) -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_advice_to_a_stranger_works(write, name):
     content, settings, *_ = CASES[name]
@@ -102,6 +103,7 @@ def test_a_table_too_small_for_the_test_of_columns_says_so(tmp_path):
     assert "from 60 links on, here are 40" in said(tmp_path / "log.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not GIVEN, reason=f"{REAL}, measured data beside this checkout, has no files of strangers"
 )

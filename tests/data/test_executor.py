@@ -22,6 +22,10 @@ from gsparc.data.limits import SettingError
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 COUNT = 12
 ENGINES = ["process", "joblib", "ray"]
+ELSEWHERE = [
+    "joblib",
+    pytest.param("ray", marks=pytest.mark.rare),
+]  # half a minute each, alike
 
 
 class Stored:
@@ -87,7 +91,7 @@ def test_settings_that_cannot_be_are_refused(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES[1:])
+@pytest.mark.parametrize("engine", ELSEWHERE)
 def test_a_piece_whose_process_dies_is_begun_again_and_no_stored_one(tmp_path, engine, elsewhere):
     elsewhere(engine)
     found = dict(run_each(Stored(tmp_path, killed=4), range(COUNT)))
@@ -102,7 +106,7 @@ def test_a_piece_whose_process_dies_is_begun_again_and_no_stored_one(tmp_path, e
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES[1:])
+@pytest.mark.parametrize("engine", ELSEWHERE)
 def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, elsewhere):
     elsewhere(engine)
     with pytest.raises(Exception) as raised:
@@ -114,7 +118,7 @@ def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, el
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES[1:])
+@pytest.mark.parametrize("engine", ELSEWHERE)
 def test_an_error_is_raised_as_it_is_and_the_others_are_cancelled(engine, elsewhere):
     elsewhere(engine)
     list(run_each(abs, [1, 2]))  # workers are there
@@ -123,7 +127,7 @@ def test_an_error_is_raised_as_it_is_and_the_others_are_cancelled(engine, elsewh
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("nodes", [2, 4])
+@pytest.mark.parametrize("nodes", [2, pytest.param(4, marks=pytest.mark.rare)])
 def test_a_node_of_ray_is_lost_half_way(tmp_path, nodes, elsewhere):
     cluster = elsewhere("ray", nodes=nodes)
     found, lost = {}, None
@@ -153,7 +157,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES[1:])
+@pytest.mark.parametrize("engine", ELSEWHERE)
 def test_an_interrupt_ends_the_work(tmp_path, engine):
     pytest.importorskip(engine, reason=f"{engine} is not installed")
     (tmp_path / "work.py").write_text(INTERRUPTED)

@@ -21,6 +21,7 @@ from gsparc.training.context import FitContext
 NONE = np.zeros(0, np.int64)
 
 
+@pytest.mark.slow
 def test_listed_rows_were_judged_by_levels_listed_or_not():
     """Kriging, of listed rows alone, looked better between the moments of one drive: 3.3 for 3.9 dB."""
     data = network(3, moments=300, asked=2).data(6)
@@ -48,6 +49,7 @@ def test_listed_rows_were_judged_by_levels_listed_or_not():
     assert any("given that they are heard" in line for line in remarks(facts))
 
 
+@pytest.mark.slow
 def test_heard_rows_beside_silent_ones_were_judged_by_levels_heard_or_not():
     """A drive above -112 dBm: heard rows 7.1 dB, kriging of these 4.3; given that they are heard 4.1."""
     rng = np.random.default_rng(0)

@@ -192,6 +192,7 @@ def plugin(tmp_path, monkeypatch):
     ledger._hash_of_program.cache_clear()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "text", "counts"),
     [

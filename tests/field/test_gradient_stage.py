@@ -37,6 +37,7 @@ def whole(tmp_path_factory):
     return run(folder, CostLedger()), folder
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(whole, tmp_path):
     torch.set_num_threads(1)
     before = signal.getsignal(signal.SIGINT)
@@ -49,6 +50,7 @@ def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(whole, tmp_path)
     assert all(torch.equal(value, resumed[key]) for key, value in whole[0].items())
 
 
+@pytest.mark.slow
 def test_a_run_cut_off_where_a_solved_field_is_edited_could_not_go_on(tmp_path, monkeypatch):
     """The edit looked for the batch of the step before: so ended every run of rfid that was resumed."""
     torch.set_num_threads(1)
@@ -63,6 +65,7 @@ def test_a_run_cut_off_where_a_solved_field_is_edited_could_not_go_on(tmp_path, 
     assert all(torch.equal(whole[key], resumed[key]) for key in whole)
 
 
+@pytest.mark.slow
 def test_a_look_that_was_due_where_a_run_was_cut_off_was_left_out(tmp_path):
     """Of the learning curve, and of what is kept; a checkpoint of step 10 was written before the look."""
     torch.set_num_threads(1)

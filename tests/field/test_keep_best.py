@@ -38,6 +38,7 @@ def held_out(method, measured):
     return float((method.predict(batch).mean - batch.target).square().mean())
 
 
+@pytest.mark.slow
 def test_steps_that_pay_are_kept_and_a_resumed_run_keeps_the_same(measured, tmp_path):
     before = fitted(measured, tmp_path / "none", steps=1)
     whole = fitted(measured, tmp_path / "whole", every=10)

@@ -79,6 +79,7 @@ KINDS = {  # what is measured, and overrides; as many rows as make the longest p
 EVERY = [pytest.param(kind, marks=() if kind == "powers" else pytest.mark.slow) for kind in KINDS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EVERY)
 def test_an_interrupt_ends_every_phase_within_a_second(kind, tmp_path):
     """Of powers 26 s, of a wide room ten minutes went by."""

@@ -15,6 +15,7 @@ from gsparc.commands.train import train
 FAR = 1e5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", ["tx", "rx"])
 def test_a_translated_campaign_predicts_the_same(tmp_path, moving):
     predictors, figures = [], []

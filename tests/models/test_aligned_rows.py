@@ -26,6 +26,7 @@ def logged():
     return set_freedom(packets.measurements(given, packets.logged(channel, tones, 0)), "auto")
 
 
+@pytest.mark.slow
 def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
     fold = packets.shares(logged, 0)
     turned, _ = align_phases(logged, fold)
@@ -78,6 +79,7 @@ def test_a_free_gain_is_a_unit_row(logged):
     assert np.allclose(np.abs(told), 2, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_rows_in_parts_are_turned_as_all_at_once(logged, monkeypatch):
     """Ten thousand rows of 64 tones before four antennas took 8 GB."""
     whole = align_rows(Snapshots.from_rows(logged, np.arange(300)), "phase", logged.site)
@@ -111,6 +113,7 @@ def test_another_file_is_scored_after_the_freedom_of_the_model(logged):
     assert align_to_site(few, logged.site).site.freedom == "phase+delay"
 
 
+@pytest.mark.slow
 def test_packets_of_one_place_are_averaged(logged):
     """Twelve packets of each place were rows of one process: `gp` of a corridor had .665, of means .534."""
     draw, tones = np.random.default_rng(0), logged.site.subcarriers_hz

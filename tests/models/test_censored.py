@@ -57,6 +57,7 @@ def predicted(model: str, data: Measurements, rows: np.ndarray, asked: np.ndarra
 MODELS = ["gsparc.models.baselines.distance_law.DistanceLaw", "gsparc.models.baselines.gp.GaussianProcess"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "margin"), list(zip(MODELS, (0.93, 0.85), strict=True)))
 def test_silent_rows_tell_of_a_half_silent_town(model, margin):
     """Over all places, learned from and not: the truth is nearer when silence counts as "below the level"."""
@@ -74,6 +75,7 @@ def test_silent_rows_tell_of_a_half_silent_town(model, margin):
     assert 0.84 < np.mean(inside) < 0.96, np.mean(inside)  # of 90 %
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_noise_was_learned_as_signal(model):
     """Half of the powers lie below a receiver's noise, which it reports: levels below that were refused."""

@@ -104,6 +104,7 @@ def same(one: Method, two: Method, batch) -> None:
             torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6 * float(a.abs().max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_every_kind_is_predicted_better_than_by_its_mean(name):
     fitted = default(name)
@@ -139,6 +140,7 @@ def test_what_is_chosen_is_named(name):
     assert f"gsparc is model={NAMED[name]} here" in default(name).lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["images", "channels from nowhere known", "powers"])
 def test_what_is_chosen_answers_the_same_by_its_own_name(name):
     count = ("model.field.count=40",) if name == "images" else ()
@@ -196,6 +198,7 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     assert f" {fitted.report.seconds:.1f} s in all" in last or " s unused" in last
 
 
+@pytest.mark.slow
 def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
     equal = lambda found, *unused: (1 / len(found),) * len(found)  # noqa: E731
     monkeypatch.setattr(solution_weights, "stacking_weights", equal)

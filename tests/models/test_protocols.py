@@ -216,6 +216,7 @@ def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.
     return predictor.predict_linear(**{data.site.moving_end: places}).mean / data.site.target_scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in built_in_methods() if name != "calibrated_raytracer"])
 def test_what_is_scored_is_what_is_served(name):
     """`answer` of rows and `predict` of places were two ways, each with code of its own."""

@@ -95,6 +95,7 @@ def _fitted(data, fold, **settings):
     return fitting.fit_or_resume(Gsparc(**settings), data, fold, BRIEF)
 
 
+@pytest.mark.slow
 def test_known_errors_of_places_cost_less_than_unknown_ones():
     """15 mm of 125 mm: the held-out error falls by a quarter and more, .27 to .15 when this was written."""
     exact, moved, fold = _channels(0.015)
@@ -104,6 +105,7 @@ def test_known_errors_of_places_cost_less_than_unknown_ones():
     assert "positions refined by" in report.notes[0] and report.cost.stages["measured places"] > 0
 
 
+@pytest.mark.slow
 def test_an_error_of_zero_changes_nothing():
     exact, _, fold = _channels(0.0)
     plain, zero = (_fitted(exact, fold, **settings)[0] for settings in ({}, {"position_std": 0.0}))
@@ -118,6 +120,7 @@ def test_exact_places_stay_though_errors_are_claimed():
     assert _missed(method, exact, fold) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["powers", "channels of an array", "powers of several stations"])
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)

@@ -64,6 +64,7 @@ def answers(file, name, tmp_path, leave_out):
     return method.predict(data.batch(np.setdiff1d(fold.test, [7]))).mean * data.site.target_scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind,name,wrong", cases())
 def test_left_out_it_had_never_been_and_kept_it_is_finite_or_refused(files, tmp_path, kind, name, wrong):
     spoilt = answers(files[kind, wrong], name, tmp_path, "outliers")

@@ -136,6 +136,7 @@ def test_every_instruction_set(name, dtype, projection):
         assert_equals_reference(scene, poses(3), GRIDS["hemisphere"], dtype, projection=projection)
 
 
+@pytest.mark.slow
 @PROJECTIONS
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("seed", [3, 4])

@@ -25,6 +25,7 @@ def worst(found: torch.Tensor, want: np.ndarray, certain: np.ndarray) -> float:
     return float(np.abs(np.where(certain, found.numpy() - want, 0)).max(initial=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_pictures_equal_those_of_the_definitions(backend):
     counts = np.zeros(3)  # pixels that are certain, all, and those with a layer

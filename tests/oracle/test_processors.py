@@ -37,8 +37,13 @@ def assert_all_pass(setting: str, *paths: str) -> None:
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-1000:]
 
 
+OFTEN = "OpenBLAS Haswell"  # where the suite failed once; the others are alike, each as long
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize(
+    "setting", [pytest.param(one, marks=() if one == OFTEN else pytest.mark.rare) for one in SETTINGS]
+)
 def test_problems_and_hard_cases_pass(setting):
     assert_all_pass(setting, "tests/oracle", *HARD)
 

@@ -34,6 +34,7 @@ def test_kernels_compute_what_their_references_do(projection):
             assert torch.allclose(ours, theirs.to(ours.dtype), rtol=1e-3, atol=1e-3), case.name
 
 
+@pytest.mark.slow
 def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(bench, "run_directory", lambda: tmp_path)
     monkeypatch.setattr(

@@ -22,6 +22,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("model", ["gp", "gsparc"])
 def test_arrays_of_every_kind_become_a_predictor_that_is_stored(kind, model, tmp_path):
@@ -68,6 +69,7 @@ UNITS = {"dBm": lambda level: level, "dBW": lambda level: level - 30, "mW": lamb
 UNITS |= {"W": lambda level: 10 ** (level / 10 - 3), "pW": lambda level: 10 ** (level / 10 + 9)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "several"), [("gp", False), ("gp", True), ("gsparc", True), ("kriging", False)]
 )

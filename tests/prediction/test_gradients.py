@@ -294,6 +294,7 @@ PROPERTIES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_gradients(name):
     for hold in PROPERTIES:

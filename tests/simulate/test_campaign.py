@@ -192,6 +192,7 @@ def test_interrupted_run_is_resumed(tmp_path):
 MASTS = [{"name": "a", "position_m": [1.0, 1.5, 2.6]}, {"name": "b", "position_m": [5.0, 4.0, 2.5]}]
 
 
+@pytest.mark.slow
 def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     """Interrupted and resumed; a place is tested on with all transmitters or with none."""
     both = plan(
@@ -399,6 +400,7 @@ def put_together(out: Path, receivers: int) -> int:
         gc.set_threshold(*usual)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
     """They were all held at once: at 100,000 receivers tens of gigabytes."""
     monkeypatch.setattr(blocks, "BIG", 2**16)

@@ -169,6 +169,7 @@ def test_the_environment_s_mode_of_wandb_was_overridden_by_the_configuration(off
     assert said["mode"] == "disabled" and not said["offline"]
 
 
+@pytest.mark.slow
 def test_wandb_warned_of_what_the_program_itself_had_said(tmp_path):
     code = f"from gsparc.training.tracking import wandb_logger as w; w(save_dir={str(tmp_path)!r}).experiment"
     env = {name: value for name, value in os.environ.items() if not name.startswith("WANDB")}
@@ -182,6 +183,7 @@ def rises(steps) -> bool:
     return len(steps) > 0 and list(steps) == sorted(set(steps))
 
 
+@pytest.mark.slow
 def test_dashboards_knew_neither_settings_nor_name_nor_sweep_and_a_refit_began_its_series_again(sweep):
     for folder, (job, count) in zip(sweep, COUNTS.items(), strict=True):
         run = offline_run(folder)

@@ -255,6 +255,7 @@ def test_places_that_python_refuses_were_answered_by_the_library(library, exampl
     field.close()
 
 
+@pytest.mark.slow
 def test_the_stated_error_missed_the_metres_under_a_station(monkeypatch):
     """Of 256 draws over 400 x 400 m none was there; and it was linear, which a few strong places decide."""
     monkeypatch.setitem(make.ANSWERED, "rssi", 1500)
@@ -322,6 +323,7 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
     assert float(said.split("first value ")[1].split(",")[0]) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_distilled_form_was_wrong_by_the_law_of_distance_outside_its_box():
     """19 dB far away, where the training box was told to .011 dB."""
     predictor = of_powers(80, "kriging")

@@ -232,6 +232,7 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
     assert asked > 0.9 * count and np.nanmax(np.abs(exact - every)) < 1e-4
 
 
+@pytest.mark.slow
 def test_channels_have_a_power(tmp_path):
     data = load_own(channels(tmp_path / "own.npz"))
     method, rows = method_class("image_source_gp")(), np.arange(len(data))

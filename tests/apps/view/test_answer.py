@@ -19,6 +19,7 @@ def test_a_fade_is_said_to_be_one():
     assert "their powers" not in said
 
 
+@pytest.mark.slow
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
     spectrum = predict_answer(spectrum_view.viewed.predictor_of(None), spectrum_view.initial_places(None))
     assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None

@@ -13,6 +13,7 @@ from gsparc.data.checks.column_effects import LevelsAtPlaces, find_effects
 from gsparc.data.datasets.own import read_any
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     "head, kind", [("node", "transmitter"), ("hop", "transmitter"), ("phone", "device"), ("power", "number")]
@@ -43,6 +44,7 @@ def test_columns_of_chance_and_qualities_say_nothing(seed):
     assert not find_effects(links, np.arange(ROWS), texts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", ["node", "phone", "power"])
 def test_the_advice_of_a_message_works_as_written(tmp_path, head):
     """As a shell takes it, in `check`: the message is gone, and nothing else is said of the column."""

@@ -18,6 +18,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(WRONG))
 def test_places_of_another_measure_are_named_and_the_setting_mends_them(name):
     found = 0
@@ -33,6 +34,7 @@ def test_places_of_another_measure_are_named_and_the_setting_mends_them(name):
     assert found >= 3
 
 
+@pytest.mark.slow
 def test_right_places_are_not_doubted():
     for seed in range(20, 32):
         assert not convention_warnings(from_arrays(flight(seed)))

@@ -23,6 +23,7 @@ def unexplained(found: np.ndarray, truth: np.ndarray) -> float:
     return 1 - np.abs(np.vdot(found, truth)) ** 2 / (np.vdot(found, found) * np.vdot(truth, truth)).real
 
 
+@pytest.mark.slow
 def test_the_channel_comes_back_up_to_a_factor_for_each_run(tmp_path):
     for i in range(2):
         drive(tmp_path / f"L{i}", f"t{i}", seed=i)

@@ -253,6 +253,7 @@ def test_the_list_tells_size_licence_and_source(capsys):
     assert "github.com/wenchaozheng/WRF-GSplus at e564f31844" in listed and "no licence stated" in listed
 
 
+@pytest.mark.slow
 def test_more_than_the_known_size_is_not_read(mirror, monkeypatch, tmp_path):
     """A mirror that sent 300 MB for 386 kB was read thrice to its end."""
     sent = []

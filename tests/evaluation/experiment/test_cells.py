@@ -65,6 +65,7 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
         names("rfid/rndom/*")
 
 
+@pytest.mark.slow
 def test_every_method_of_the_default_comparison_composes():
     config = OmegaConf.to_container(compose(config="compare"), resolve=True)
     for contender in read_entries("methods", Contender, config["methods"]).values():

@@ -180,6 +180,7 @@ def warned(caplog) -> list[str]:
     return [one.message for one in caplog.records if "without effect" in one.message]
 
 
+@pytest.mark.slow
 def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
     """`model.attenuation.inverse_distance=true` on powers was ignored without a word."""
     falls = "model.attenuation.inverse_distance=true"
@@ -190,6 +191,7 @@ def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
     assert torch.equal(answers, fitted("power", "model=gsparc")[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("world", "options", "unused", "said"), [
     ("image", "model=nearest trainer.max_steps=1200", {"trainer.max_steps"},
      "(nearest takes no gradient steps here: model=splat does)"),
@@ -210,6 +212,7 @@ def test_what_decides_nothing_here_is_named_with_why(world, options, unused, sai
     assert [line.endswith(said) for line in warned(caplog)] == [True] * bool(unused)
 
 
+@pytest.mark.slow
 def test_hidden_units_beside_a_process_with_all_the_weight(caplog):
     """It was exactly the Gaussian process, printed as hidden=16; then hidden=16 "without effect", which cost
     the start in closed form and .3 dB.
@@ -253,9 +256,15 @@ FOUND_NOTHING = {("tone", "visibility"), ("antennas", "visibility"), ("stations"
 ALONE = {("power", "power"), ("moving", "moving_array")}
 
 
+SWITCHED = [(world, switch) for world in WORLDS for switch in EffectSettings.__dataclass_fields__]
+OFTEN = {*np.random.default_rng(11).permutation(len(SWITCHED))[:12].tolist()}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("world", WORLDS)
-@pytest.mark.parametrize("switch", EffectSettings.__dataclass_fields__)
+@pytest.mark.parametrize(
+    ("world", "switch"),
+    [pytest.param(*one, marks=() if i in OFTEN else pytest.mark.rare) for i, one in enumerate(SWITCHED)],
+)
 def test_a_term_switched_off_changes_answers_or_is_named_or_refused(world, switch):
     """Of `image` and `residual` some were counted as heeded that decide nothing."""
     if world in ("array", "image", "moving") and switch == "visibility":
@@ -265,6 +274,7 @@ def test_a_term_switched_off_changes_answers_or_is_named_or_refused(world, switc
     assert same == bool(unused) or (world, switch) in FOUND_NOTHING | ALONE
 
 
+@pytest.mark.slow
 def test_residual_false_left_a_moving_array_its_residual():
     given = "model=gsparc", "model.effects.residual=false"
     unused, answers = fitted("moving", *given)

@@ -49,6 +49,7 @@ def run(folder, names, conditions=AS_IT_IS, rounds=1, data=None, split=None):
     return average_rounds(fits, conditions, data, split, CLOCK), fits
 
 
+@pytest.mark.slow
 def test_what_cannot_be_is_left_out_and_every_round_has_another_seed_once(tmp_path, caplog):
     caplog.set_level("INFO")
     rows, fits = run(tmp_path, ["mean", "impossible", "gp"], rounds=2, split=divide(48, 2))
@@ -62,6 +63,7 @@ def test_what_cannot_be_is_left_out_and_every_round_has_another_seed_once(tmp_pa
         run(tmp_path, ["impossible"])
 
 
+@pytest.mark.slow
 def test_errors_cost_an_interpolator_and_not_the_mean(tmp_path):
     conditions = DataChanges("", errors_m=[0.001, 0.3]).conditions()
     rows, fits = run(tmp_path, ["gp", "mean"], conditions)

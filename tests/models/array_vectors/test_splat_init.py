@@ -57,6 +57,7 @@ def process(trained):
     return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
 
 
+@pytest.mark.slow
 def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     method, data, fold = trained
     model, batch = method.fitted_model(), data.batch(fold.test)
@@ -118,6 +119,7 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
     assert torch.isfinite(model.fitted_model().emission.weight2).all()
 
 
+@pytest.mark.slow
 def test_a_number_of_gaussians_that_changes_nothing_was_swept_without_a_word(known_campaign, tmp_path):
     """100 and 500 of them gave the same figures: more than an array needs span the same vectors."""
     data, fold = known_campaign[0], Fold(np.arange(40), np.arange(0), np.arange(40, 60))

@@ -58,6 +58,7 @@ def test_dense_receivers_tell_and_far_away_nothing_is_said(dense, tmp_path):
     assert far.mean.abs().max() < 1e-3 and far.confidence.max() < 1e-3
 
 
+@pytest.mark.slow
 def test_many_rows_are_told_by_the_nearest(dense, tmp_path, monkeypatch):
     data, fold, whole, _ = dense
     monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)

@@ -85,6 +85,7 @@ def test_a_probe_gains_what_the_likelihood_rises():
         probe = probe.add_wave(waves[0], level)
 
 
+@pytest.mark.slow
 def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
     data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
     groups, prior = _bare(data)

@@ -93,6 +93,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
     assert not torch.allclose(powers[0], powers[1])
 
 
+@pytest.mark.slow
 def test_one_field_of_all_ends_is_better_than_plain_processes():
     data = _ceiling(ends=4, count=40, shift=(0.03, -0.02, 0.0))
     fold = fold_of(data)
@@ -136,6 +137,7 @@ def test_runs_of_all_ends_differ_by_one_phase():
     assert right < 0.5 * nmse(turned.numpy(), batch.target.numpy())
 
 
+@pytest.mark.slow
 def test_stations_together_are_asked_for_any_pair():
     data = _ceiling(ends=4, count=36)
     rows = np.flatnonzero(data.station < 3)

@@ -236,6 +236,7 @@ def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
     assert error(method, data, fold.test) < 1.1
 
 
+@pytest.mark.slow
 def test_the_conference_room_from_43_receivers():
     """A search finds nothing there: NMSE 1.1; a network along the rays leaves 0.17."""
     data = load({"name": "newrf", "file": str(real("newrf-conference.npz"))})

@@ -208,6 +208,7 @@ def test_a_table_top_is_found_by_its_reflections():
     torch.testing.assert_close(found, true, atol=0.4, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
     """A raster of 35 cm cells over 40 km asked for six terabytes."""
     left, _ = _beside_a_table(60)
@@ -277,6 +278,7 @@ def test_an_infinite_mirror_becomes_finite():
     assert (learned == told).float().mean() > 0.85
 
 
+@pytest.mark.slow
 def test_a_pillar_is_clutter_and_an_empty_room_has_none(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():

@@ -51,6 +51,7 @@ def small(tmp_path_factory):
     return told, data, fold, *fitted(data, fold, tmp_path_factory.mktemp("run"))
 
 
+@pytest.mark.slow
 def test_first_order_images_are_found_and_the_channel_extrapolates(small):
     told, data, fold, method, report = small
     assert found_share(method, told, order=1) == 1.0 and method.count_components() >= 7
@@ -148,6 +149,7 @@ def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     assert 2 <= len(method.members) <= 2 + torch.get_num_threads()
 
 
+@pytest.mark.slow
 def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     array = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1, array=array)
@@ -157,6 +159,7 @@ def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     assert error(method, data, fold.test) < 0.03
 
 
+@pytest.mark.slow
 def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     frequency = 2.4e9 + np.arange(16) * 2e6
     _, data, fold = shoebox(100, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=frequency)
@@ -221,7 +224,9 @@ def test_scatterers_are_found_beside_images(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offsets", ["none", "phase", "phase_timing"])
+@pytest.mark.parametrize(
+    "offsets", [*(pytest.param(one, marks=pytest.mark.rare) for one in ("none", "phase")), "phase_timing"]
+)
 def test_sources_are_found_through_unknown_offsets_that_are_estimated(offsets, tmp_path):
     """After one free complex number per sample: unseen snapshots have unknown phases too."""
     rng, tones = np.random.default_rng(0), 2.4e9 + np.arange(16) * 5e6

@@ -64,6 +64,7 @@ def four(tmp_path_factory):
     return fitted(data, fold, tmp_path_factory.mktemp("run"))[0], data, fold
 
 
+@pytest.mark.slow
 def test_four_antennas_at_a_hundred_places(four, tmp_path):
     method, data, fold = four
     missed = error(method, data, fold.test)
@@ -148,6 +149,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
         spherical_waves(rows, points)
 
 
+@pytest.mark.slow
 def test_rotated_array_and_tones(tmp_path):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     data, fold = _uplink(50, antennas=2, tones=CARRIER + 5e6 * np.arange(2), rotation=turn)

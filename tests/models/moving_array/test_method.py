@@ -63,6 +63,7 @@ def missed(field, data, rows):
     return float((field.predict(batch).mean - batch.target).square().mean())
 
 
+@pytest.mark.slow
 def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
     assert field.terms == ("moving_array", "residual")
     np.testing.assert_array_equal(field.found.sources[0], np.float32(data.site.static_position))
@@ -97,6 +98,7 @@ def test_left_out_rows_are_about_as_wrong_as_new_ones(data, field):
     assert 0.5 < float(error.mean()) / missed(field, data, np.arange(1, 160, 2)) < 2
 
 
+@pytest.mark.slow
 def test_the_strong_images_are_found(data):
     """The transmitter and images in the near walls, from pictures alone; the far ones are 14 dB weaker."""
     site = data.site

@@ -63,6 +63,7 @@ def test_lobes_that_come_and_go_are_learned(tmp_path, name, settings, share):
     assert error(fitted(name, data, fold, tmp_path, **settings), data, fold.test) < share * known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "share"), [("swiftwrf", 0.05), ("wrfgs", 0.15)])
 def test_deformed_gaussians_follow_what_moves(tmp_path, name, share):
     """A few Gaussians are enough when they move along; standing still they would show the mean picture."""
@@ -72,6 +73,7 @@ def test_deformed_gaussians_follow_what_moves(tmp_path, name, share):
     assert error(method, data, fold.test) < share * known
 
 
+@pytest.mark.slow
 def test_ngrf_finds_the_waves_of_a_room_that_interpolation_cannot(tmp_path):
     data, fold, _ = room(160)
     plain = error(fitted("gp", data, fold, tmp_path), data, fold.test)
@@ -79,6 +81,7 @@ def test_ngrf_finds_the_waves_of_a_room_that_interpolation_cannot(tmp_path):
     assert error(method, data, fold.test) < min(0.5 * plain, 0.3)
 
 
+@pytest.mark.slow
 def test_ngrf_shows_its_waves_through_an_array(tmp_path):
     """Sixteen elements in a traced room, a tag carried along a path."""
     grid, array = SphereGrid.hemisphere(18, 36), planar_array(4, 4, 0.16)
@@ -130,6 +133,7 @@ def test_newrf_opaque_samples_give_no_nan(tmp_path):
     assert all(torch.isfinite(p.grad).all() for p in method.network.parameters() if p.grad is not None)
 
 
+@pytest.mark.slow
 def test_newrf_predicts_where_no_direction_was_measured(tmp_path):
     data, fold, _ = room(80, directions=True)
     settings = {"width": 48, "depth": 3, "octaves": 3, "samples": 24, "max_steps": 250, "rate": 4e-3}

@@ -57,12 +57,14 @@ def test_gains_of_nodes_were_shadows_of_links(tmp_path):
     torch.testing.assert_close(again.predict(batch).mean, method.predict(batch).mean)
 
 
+@pytest.mark.slow
 def test_links_without_gains_have_none():
     data = mesh(0.0)
     best = candidate_priors(power_rows(data, np.arange(KNOWN)), data.site, 0, KNOWN)[0]
     assert all(term.share < 0.05 for term in best.kernel.signals if isinstance(term, EndShadowing))
 
 
+@pytest.mark.slow
 def test_silent_links_and_more_than_one_factor_holds(monkeypatch):
     data = mesh(3.0, silent_below=-82.0)
     assert 20 < (data.censored_side(np.arange(len(data))) > 0).sum() < 150

@@ -43,6 +43,7 @@ def test_powers_are_fitted_by_waves():
     assert min(np.median(np.abs(one - decibels)) for one in found) < 0.5
 
 
+@pytest.mark.slow
 def test_fringes_predict_better_than_the_process_alone(interfering):
     data, field, notes = interfering
     batch = data.batch(np.arange(400, 500))
@@ -52,6 +53,7 @@ def test_fringes_predict_better_than_the_process_alone(interfering):
     assert field.terms == ("phase", "residual") and errors[0] < 0.95 * errors[1], (errors, notes)
 
 
+@pytest.mark.slow
 def test_fringes_were_judged_beside_a_process_of_some_rows(monkeypatch):
     """A plane of 16,000 rows: 42 % between rows for waves, 2.16 dB, where the process alone has 2.07."""
     monkeypatch.setattr("gsparc.models.powers.fringes.MOST_ROWS", 150)
@@ -98,6 +100,7 @@ def test_state_makes_it_again(interfering, tmp_path):
     assert torch.allclose(field.left_out().mean, again.left_out().mean, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_few_rows_have_no_fringes():
     data, rows = plane(100), np.arange(100)
     field, notes = fitted_to(PowerField(), data, rows)

@@ -71,12 +71,14 @@ def errors_db(number: int, rows: int, seed: int, split: SplitSettings) -> tuple[
     return own, alone
 
 
+@pytest.mark.slow
 def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
     """7.24 dB in squares of 300 m where ordinary kriging has 6.31: the likeliest process was taken alone."""
     own, alone = errors_db(7, 300, 106, SplitSettings("blocks", side_m=300.0, seed=1))
     assert own < 0.96 * alone, (own, alone)
 
 
+@pytest.mark.slow
 def test_random_rows_were_predicted_by_the_mean_that_squares_prefer():
     """2.374 dB where the likeliest process alone has 2.353."""
     own, alone = errors_db(4, 600, 0, SplitSettings("random"))

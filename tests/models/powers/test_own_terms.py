@@ -181,6 +181,7 @@ def test_a_term_may_have_the_name_of_one_of_ours():
     assert isinstance(stored.from_plain(stored.to_plain(Walls())), Walls)
 
 
+@pytest.mark.slow
 def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):
     data, file = town(60), tmp_path / "town.npz"
     levels = {"rx_position": data["rx"], "tx_position": STILL, "rssi_db": data["rssi"]}

@@ -150,6 +150,7 @@ def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
     assert mean[0] - mean[1] > 10
 
 
+@pytest.mark.slow
 def test_settings_of_many_rows_come_from_near_rows_too():
     """Chosen on 1,000 of 3,300 rows of a city alone, short lengths were missed: 1 % behind in three draws."""
     rng = np.random.default_rng(0)

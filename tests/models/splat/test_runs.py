@@ -16,6 +16,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.run_factors import RunFactors
 
 
+@pytest.mark.slow
 def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
     """The default had 17 times the error of complex_gp, whose rows were the same."""
     world = World("tone", 5, 1, "rx", "metres", "none", "random", 300)

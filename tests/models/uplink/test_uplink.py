@@ -123,6 +123,7 @@ MAKES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKES)
 def test_methods_answer_and_keep(name, tmp_path) -> None:
     make, data = MAKES[name], city("all" if name == "uplink" else 0)

@@ -40,6 +40,7 @@ def missed(field, data, rows: np.ndarray) -> float:
     return nmse(field.predict(batch).mean.numpy(), data.targets(rows).numpy())
 
 
+@pytest.mark.slow
 def test_known_walls_tell_all_from_few_rows(room):
     """A search on the same 60 rows misses most of them."""
     _, data, fold, file = room

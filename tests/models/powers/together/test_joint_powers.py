@@ -329,6 +329,7 @@ def test_stations_at_one_place_are_told_apart_by_their_numbers():
     assert np.abs(db(method.predict(batch).mean) - db(batch.target)).max() < 2
 
 
+@pytest.mark.slow
 def test_halls_gain_over_a_process_of_each_sensor():
     data = BLE(file=str(real("real/ble-hall-1.npz"))).load()
     fold = fold_of(data, name="blocks", side_m=3.0)

@@ -65,6 +65,7 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
     return mean + 10 * np.log10(site.target_scale), spread
 
 
+@pytest.mark.slow
 def test_a_network_with_two_wrong_azimuths(tmp_path):
     one = network(1, wrong=2, moments=220, asked=120)
     method, report = fitted(one, 6, tmp_path)
@@ -99,6 +100,7 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     assert np.allclose(levels(again, one)[0], levels(method, one)[0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_sites_without_azimuths_have_no_pattern(tmp_path):
     one = network(2, moments=180, asked=100)
     method, report = fitted(one, 6, tmp_path, azimuths=False)
@@ -107,6 +109,7 @@ def test_sites_without_azimuths_have_no_pattern(tmp_path):
     assert not any("beams" in note for note in report.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0, 2])
 def test_azimuths_were_contradicted_by_a_receivers_noise(wrong, monkeypatch):
     """Six of thirty that were right were turned; of several that are wrong a line named the first alone."""
@@ -122,6 +125,7 @@ def test_azimuths_were_contradicted_by_a_receivers_noise(wrong, monkeypatch):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 def test_right_azimuths_were_turned_beside_wrong_ones(seed, monkeypatch):
     """Up to eight of thirty in tables of all cells: wrong ones had bent the pattern that all share."""
@@ -152,6 +156,7 @@ def notes_of_azimuths(data: Measurements, monkeypatch) -> list[str]:
 RARE = pytest.mark.rare
 
 
+@pytest.mark.slow
 def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
     one = network(1, wrong=2, moments=220, asked=120)
     method, report = fitted(one, 6, tmp_path)
