@@ -9,6 +9,10 @@ from gsparc.data.schema import Measurements
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
+LEAST, FEW = 3, 0.02  # places, and their share of all, that tell a unit of their own
+SPOT = 100  # of a box's width, what places in kilometres take among metres
+NEAR = 3  # widths of a box, about it
+DEGREE_M = 111e3
 
 
 def unit_warnings(data: Measurements) -> list[str]:
@@ -21,6 +25,11 @@ def unit_warnings(data: Measurements) -> list[str]:
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + site.origin
         hints = next(filter(None, map(_position_hints, places)), [])
+        still = np.zeros((0, 2)) if site.stations is None else site.stations.position[:, :2] + site.origin[:2]
+        mixed = {"rows": _find_other_unit(places[1][:, :2]), "stations": _find_other_unit(still)}
+        hints = [f"of {who} {said}" for who, said in mixed.items() if said] or hints
+        if site.kind != "csi":  # an array's antennas stand close together
+            hints += _compare_reaches(still, places[1][:, :2])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -69,3 +78,40 @@ def _position_hints(positions: np.ndarray) -> list[str]:
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []
+
+
+def _find_other_unit(places: np.ndarray) -> str:
+    """Name the unit of some of places (n, 2), which lie in a spot as others lie in metres; empty: none."""
+    places = np.unique(places[np.isfinite(places).all(axis=1)], axis=0)
+    if len(places) < 2 * LEAST:
+        return ""
+    side = float(np.ptp(places, axis=0).max()) / SPOT
+    which, counts = np.unique(np.floor(places / side), axis=0, return_inverse=True, return_counts=True)[1:]
+    middle = np.median(places[which.reshape(-1) == counts.argmax()], axis=0)
+    near = (np.abs(places - middle) < side).all(axis=1)
+    spot, rest = places[near], places[~near]
+    if min(len(spot), len(rest)) < max(LEAST, FEW * len(places)):
+        return ""
+    small, wide = (float(np.ptp(some, axis=0).max()) for some in (spot, rest))
+    inside = (1e3 * spot > rest.min(axis=0) - 0.5 * wide) & (1e3 * spot < rest.max(axis=0) + 0.5 * wide)
+    alike = {"kilometres": inside.mean() > 0.9 and wide < 3e3 * small < 9 * wide,
+             "degrees": np.abs(spot).max() <= 180 and wide < 3 * DEGREE_M * small < 9 * wide}  # fmt: skip
+    said = f"{len(spot)} of {len(places)} places lie within {small:.2g} m, the others over {wide:.4g} m: in "
+    return next((f"{said}{unit}? give all of them in one unit" for unit, suits in alike.items() if suits), "")
+
+
+def _compare_reaches(still: np.ndarray, moving: np.ndarray) -> list[str]:
+    """Name axes along which stations (T, 2), or rows (n, 2), lie where the others do in thousandths."""
+    still, hints = np.unique(still[np.isfinite(still).all(axis=1)], axis=0), []
+    for one, other, who in ((still, moving, "stations"), (moving, still, "rows")):
+        if len(still) < LEAST:
+            return []
+        (low, high), (least, most) = ((some.min(axis=0), some.max(axis=0)) for some in (one, other))
+        around = most - least
+        inside = (1e3 * low > least - NEAR * around) & (1e3 * high < most + NEAR * around)
+        small = inside & (SPOT * (high - low) < around)
+        if small.any():
+            axes = " and ".join(np.array(["x", "y"])[small])
+            reach = f"{(high - low)[small].max():.3g} m, the others over {around.max():.4g}"
+            hints += [f"{axes} of {who} reach over {reach}: in kilometres? convert them"]
+    return hints
