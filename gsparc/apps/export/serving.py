@@ -281,6 +281,8 @@ def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
             fault = "Content-Length beside Transfer-Encoding"
         elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
             fault, status = "Authorization: Bearer TOKEN is needed", 401
+        elif scope.get("query_string"):
+            fault, status = "nothing is read after ? in the address; leave it out", 422
         refused = JSONResponse({"detail": fault}, status, {"connection": "close"})
         await (refused if fault else app)(scope, receive, send)
 

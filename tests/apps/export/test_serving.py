@@ -436,3 +436,10 @@ def test_a_repeated_key_answered_the_second(served):
 
 def test_no_page_loads_scripts_from_elsewhere(served):
     assert [ask_http(served.port, "GET", path, None, {})[0] for path in ("/docs", "/redoc")] == [404, 404]
+
+
+@pytest.mark.parametrize("path", ["/predict?unit=dBm", "/std?a", "/healthz?verbose=1", "/?="])
+def test_what_stands_after_a_question_mark_was_read_nowhere(served, path):
+    body = as_json([[1, 2, 1]])
+    status, answer = ask_http(served.port, "POST", path, body, {"Content-Type": "application/json"})[:2]
+    assert status == 422 and b"nothing is read after ?" in answer
