@@ -23,7 +23,7 @@ NAMED = 5  # wild rows that a station may have, however few its rows
 SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
-REPEATS = 3
+REPEATS, FEW_APART = 3, 0.02
 NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
 HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
@@ -72,6 +72,11 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         but = f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB," if others else ""
         return [f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"]
     low, high = float(values.min()), float(values.max())
+    below = int(np.searchsorted(np.sort(values), different[np.diff(different).argmax()], "right"))
+    few = max(REPEATS, FEW_APART * len(values))
+    if np.diff(different).max() > APART_DB and min(below, len(values) - below) >= few:
+        parts = [f"{part[0]:.4g} to {part[-1]:.4g}" for part in np.split(np.sort(values), [below])]
+        return [f"levels of {parts[0]}, {below}, and of {parts[1]}, {len(values) - below}: in two units?"]
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]

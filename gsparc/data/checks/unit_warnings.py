@@ -13,6 +13,7 @@ LEAST, FEW = 3, 0.02  # places, and their share of all, that tell a unit of thei
 SPOT = 100  # of a box's width, what places in kilometres take among metres
 NEAR = 3  # widths of a box, about it
 DEGREE_M = 111e3
+HERTZ = 3e6, 1e12  # of carriers that links are measured at
 
 
 def unit_warnings(data: Measurements) -> list[str]:
@@ -35,6 +36,10 @@ def unit_warnings(data: Measurements) -> list[str]:
         if reach > LONG_ARRAY * site.wavelength:
             waves = f"{reach / site.wavelength:.3g} wavelengths"
             hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
+    carriers = [] if site.stations is None or site.stations.carrier_hz is None else site.stations.carrier_hz
+    hertz = np.append(carriers, [] if site.carrier_hz is None else site.carrier_hz)
+    if len(hertz) and not (HERTZ[0] <= hertz.min() and hertz.max() <= HERTZ[1]):
+        hints.append(f"carriers of {hertz.min() / 1e6:g} to {hertz.max() / 1e6:g} MHz: another unit?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         # Steps in radians taken for degrees: the columns then span 2 pi degrees.

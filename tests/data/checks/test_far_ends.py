@@ -67,3 +67,8 @@ def test_stations_below_the_ground_are_named():
     """A height of -25 m was good."""
     (said,) = [note for note in reading(station_height=np.array(-25.0)).notes if "below 0" in note]
     assert said.startswith("a static end at a height of -25 m")
+
+
+def test_heights_of_stations_in_kilometres_are_named():
+    (said,) = [note for note in reading(station_height=np.array(0.025)).notes if "static ends" in note]
+    assert said == "static ends at heights of 0.025 m at most: in kilometres?"

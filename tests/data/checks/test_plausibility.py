@@ -306,3 +306,22 @@ def test_places_of_stations_beside_rows_in_kilometres_are_named(axes, who):
     key = {"stations": "station_position", "rows": "rx_position"}[who]
     found = unit_warnings(from_arrays({**files, key: files[key] / axes}))
     assert any(f"of {who} reach over" in line and "in kilometres?" in line for line in found), found
+
+
+@pytest.mark.parametrize("other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10)])
+@pytest.mark.parametrize("each", [2, 10])
+def test_some_levels_in_another_unit_are_named(other, each):
+    _, level, _ = walk(0)
+    assert not plausibility.level_warnings(level)
+    level[::each] = other(level[::each])
+    (said,) = plausibility.level_warnings(level)
+    assert said.startswith("levels of ") and said.endswith("in two units?"), said
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_carriers_that_no_link_has_are_named(factor):
+    place, level = room()
+    arrays = {"rx_position": place, "tx_position": np.zeros(3), "rssi_db": level}
+    assert not unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9)}))
+    (said,) = unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9 * factor)}))
+    assert said.startswith("carriers of ") and said.endswith("MHz: another unit?")
