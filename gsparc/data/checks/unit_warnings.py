@@ -98,25 +98,27 @@ def _find_other_unit(places: np.ndarray) -> str:
     if min(len(spot), len(rest)) < max(LEAST, FEW * len(places)):
         return ""
     small, wide = (float(np.ptp(some, axis=0).max()) for some in (spot, rest))
-    inside = (1e3 * spot > rest.min(axis=0) - 0.5 * wide) & (1e3 * spot < rest.max(axis=0) + 0.5 * wide)
-    alike = {"kilometres": inside.mean() > 0.9 and wide < 3e3 * small < 9 * wide,
-             "degrees": np.abs(spot).max() <= 180 and wide < 3 * DEGREE_M * small < 9 * wide}  # fmt: skip
-    said = f"{len(spot)} of {len(places)} places lie within {small:.2g} m, the others over {wide:.4g} m: in "
-    return next((f"{said}{unit}? give all of them in one unit" for unit, suits in alike.items() if suits), "")
+    kilometres = wide < 3e3 * small < 9 * wide and _are_thousandths(spot, rest, 0.5).all()
+    if kilometres or (wide < 3 * DEGREE_M * small < 9 * wide and np.abs(spot).max() <= 180):
+        said = f"{len(spot)} of {len(places)} places lie within {small:.2g} m, the others over {wide:.4g} m: "
+        return f"{said}in {'kilometres' if kilometres else 'degrees'}? give all of them in one unit"
+    return ""
+
+
+def _are_thousandths(places: np.ndarray, others: np.ndarray, beyond: float) -> np.ndarray:
+    """Tell along which axes places (n, 2), times 1000, lie where others (m, 2) do, or widths beyond (2,)."""
+    least, most = others.min(axis=0), others.max(axis=0)
+    around, (low, high) = most - least, (1e3 * places.min(axis=0), 1e3 * places.max(axis=0))
+    inside = (low > least - beyond * around) & (high < most + beyond * around)
+    return np.asarray(inside & (SPOT * np.ptp(places, axis=0) < around))
 
 
 def _compare_reaches(still: np.ndarray, moving: np.ndarray) -> list[str]:
     """Name axes along which stations (T, 2), or rows (n, 2), lie where the others do in thousandths."""
     still, hints = np.unique(still[np.isfinite(still).all(axis=1)], axis=0), []
     for one, other, who in ((still, moving, "stations"), (moving, still, "rows")):
-        if len(still) < LEAST:
-            return []
-        (low, high), (least, most) = ((some.min(axis=0), some.max(axis=0)) for some in (one, other))
-        around = most - least
-        inside = (1e3 * low > least - NEAR * around) & (1e3 * high < most + NEAR * around)
-        small = inside & (SPOT * (high - low) < around)
-        if small.any():
+        if len(still) >= LEAST and (small := _are_thousandths(one, other, NEAR)).any():
+            reach, wide = (float(np.ptp(some[:, small], axis=0).max()) for some in (one, other))
             axes = " and ".join(np.array(["x", "y"])[small])
-            reach = f"{(high - low)[small].max():.3g} m, the others over {around.max():.4g}"
-            hints += [f"{axes} of {who} reach over {reach}: in kilometres? convert them"]
+            hints += [f"{axes} of {who} reach over {reach:.3g} m, the others over {wide:.4g}: in kilometres?"]
     return hints
