@@ -237,7 +237,10 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
     @app.post("/predict")
     async def predict(request: Request) -> Response:
         # Media types are compared without case (RFC 9110, 8.3.1).
-        body, raw = bytearray(), request.headers.get("content-type", "").lower().startswith(RAW)
+        kinds = {one.partition(";")[0].strip().lower() for one in request.headers.getlist("content-type")}
+        if len(kinds) > 1:
+            raise HTTPException(422, f"Content-Type twice: {', '.join(sorted(kinds))}; say one")
+        body, raw = bytearray(), kinds == {RAW}
         try:
             async for part in request.stream():
                 body += part
