@@ -72,14 +72,14 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         but = f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB," if others else ""
         return [f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"]
     low, high = float(values.min()), float(values.max())
+    if low < 0 and high > HIGHEST_DBM:
+        count = int((values > HIGHEST_DBM).sum())
+        return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
     below = int(np.searchsorted(np.sort(values), different[np.diff(different).argmax()], "right"))
     few = max(REPEATS, FEW_APART * len(values))
     if np.diff(different).max() > APART_DB and min(below, len(values) - below) >= few:
         parts = [f"{part[0]:.4g} to {part[-1]:.4g}" for part in np.split(np.sort(values), [below])]
         return [f"levels of {parts[0]}, {below}, and of {parts[1]}, {len(values) - below}: in two units?"]
-    if low < 0 and high > HIGHEST_DBM:
-        count = int((values > HIGHEST_DBM).sum())
-        return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
     if low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
         return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
