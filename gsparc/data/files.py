@@ -21,6 +21,7 @@ import yaml
 from gsparc.data.errors import DataError, readable
 
 SUMMARY = "summary.json"  # of a finished run, written last
+LEAST_CONTENT = 5  # characters for each line, tag or bracket of a large file
 LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
 MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
 LEAST_NODES = 10_000  # of YAML that are not counted
@@ -57,6 +58,15 @@ def check_line_length(path: str | Path, number: int, line: str) -> str:
         fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
         raise DataError(f"{path}, line {number}: {fault}")
     return line
+
+
+def check_content(path: str | Path, text: str | bytes, marks: str) -> None:
+    """Raise `DataError` of a large text of which hardly more is left without one of marks than the marks."""
+    for mark in marks if len(text) > LONGEST_LINE else "":
+        if LEAST_CONTENT * text.count(mark if isinstance(text, str) else mark.encode()) > len(text):  # type: ignore[arg-type]
+            raise DataError(
+                f"{path}: nearly nothing but {mark!r} in {len(text):,} characters; expected values"
+            )
 
 
 def load_yaml(text: str, source: str | Path) -> Any:

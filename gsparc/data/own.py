@@ -19,6 +19,7 @@ from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
+from gsparc.data.errors import Caution
 from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
 from gsparc.data.other_names import name_arrays
@@ -321,7 +322,7 @@ def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any
     if fault and certain:
         check.problems.add(check.source, fault)
     elif fault:
-        check.notes.append(fault)
+        check.notes.append(Caution(fault))
 
 
 def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) -> None:

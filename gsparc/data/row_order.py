@@ -101,11 +101,11 @@ def content_order(data: Measurements) -> np.ndarray:
     np.add.at(together, moment, row)
     # The largest moment of a place first: counting visits then finds the same moments again.
     largest = -np.bincount(moment)[moment]
-    return np.lexsort((row, together[moment], largest, hash_rows(data.moving), _along_curve(data.moving)))
+    return np.lexsort((row, together[moment], largest, hash_rows(data.moving), along_curve(data.moving)))
 
 
-def _along_curve(places: np.ndarray) -> np.ndarray:
-    """Numbers (n,) of places (n, D) along a curve that fills their box (bits of coordinates in turns)."""
+def along_curve(places: np.ndarray) -> np.ndarray:
+    """Return numbers (n,) of places (n, D) along a curve that fills their box: bits of axes in turns."""
     bits, axes = 3 * BITS // places.shape[1], places.shape[1]
     low, width = places.min(axis=0), float(np.ptp(places, axis=0).max()) or 1.0
     cell = ((places - low) / width * (2**bits - 1)).astype(np.uint64)

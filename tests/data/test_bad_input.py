@@ -2,6 +2,8 @@
 # ruff: noqa: E501 (a case is a row of a table)
 
 import io
+import json
+import time
 import warnings
 import zipfile
 from pathlib import Path
@@ -12,6 +14,7 @@ import pytest
 from releases import SPOILT
 
 from gsparc.data.datasets.newrf import read_newrf
+from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
@@ -273,3 +276,32 @@ def test_a_channel_beyond_float32_is_refused_without_a_warning_before(csi_arrays
     channels[3, 0, 0] = value * (1 + 1j)
     with pytest.raises(DataError, match=r"csi, row 3: (beyond float32|not finite)"):
         from_arrays({**csi_arrays, "csi": channels})
+
+
+HOLLOW = {
+    "a.json": "[" + "{}," * 10**6 + "{}]", "b.json": "[{" + "[" * 2**21, "c.json": "{}\n" * 10**6,
+    "d.json": "<a>" * 10**6, "e.csv": "\n" * 2**21, "f.csv": "#\r\n" * 10**6, "g.csv": ",,\n" * 10**6,
+    "h.json": '{"a": [1, 2], "b": [' + "1," * 10**6 + "1]}",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOLLOW)
+def test_files_of_nothing_but_brackets_or_lines_took_minutes(tmp_path, name):
+    """60 MB of brackets took 27 s, blank lines of a gz file did not end: by a character's count now."""
+    (tmp_path / name).write_text(HOLLOW[name])
+    began = time.process_time()
+    with pytest.raises(DataError, match=r"nearly nothing but|more than 10,000 values") as refused:
+        read_any(tmp_path / name)
+    assert time.process_time() - began < 2 and len(refused.value.problems) == 1
+
+
+def test_rows_of_records_keep_their_numbers_and_keys_stand_once(tmp_path):
+    """A null between records moved all numbers by one; of two keys of one name the second counted."""
+    rows = [{"x": i, "y": i % 7, "rssi": -50 - i} for i in range(30)]
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps([*rows[:3], None, *rows[3:]]))
+    names = read_any(file).data.row_names
+    assert names[:4] == ["row 0", "row 1", "row 2", "row 4"]
+    file.write_text(json.dumps(rows).replace('"x": 7,', '"x": 7, "at": {"z": 1, "z": 2},'))
+    with pytest.raises(DataError, match="'z' is twice in one record"):
+        read_any(file)

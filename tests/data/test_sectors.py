@@ -1,6 +1,7 @@
 """Lists of sites with their sectors, and slots of scanners."""
 
 import csv
+import re
 
 import numpy as np
 import pytest
@@ -205,3 +206,59 @@ def test_frequencies_in_kilohertz_and_channels_of_nr(tmp_path):
     site, notes = read_list(tmp_path, Frequency=[1842500])
     assert site.carrier_hz == 1842.5e6 and "carrier_hz in kHz" in notes
     np.testing.assert_allclose(earfcn_hz(np.array([632628.0, 422000.0])), [3489.42e6, 2110e6])
+
+
+def change(folder, head, values, every=True):
+    """All cautions of a list in which the cells of a column are values, or only the fourth is one."""
+    _, drive, heads, sites = drive_of(folder, moments=30)
+    column = [name.partition(" [")[0] for name in heads].index(head.partition(" [")[0])
+    heads[column] = head
+    for i, site in enumerate(sites):
+        site[column] = values(site[column]) if every or i == 3 else site[column]
+    try:
+        notes = read_any(drive, stations_file=write(folder / "sites.csv", heads, sites)).notes
+    except DataError as refused:
+        return [str(refused)]
+    return [note for note in notes if isinstance(note, Caution) and "'Vendor'" not in note]
+
+
+@pytest.mark.parametrize(("head", "values", "says"), [
+    ("Tx Power [dBm]", lambda v: 20, r"holds 20 in line 5; .* 43 of most; in W\? then write so, as '20 W'"),
+    ("Tx Power", lambda v: 43000, r"holds 43000 in line 5; .* as '43000 mW'"),
+    ("HBW", lambda v: 1.1345, r"holds 1.1345 in line 5; .* as '1.1345 rad'"),
+    ("HBW [deg]", lambda v: 0.065, r"holds 0.065 in line 5"),
+    ("M-Tilt", lambda v: -v, r"holds -2 in line 5; .* of 0 to 30"),
+    ("E-Tilt", lambda v: 10 * v + 40, r"holds \d+ in line 5; .* of 0 to 30"),
+    ("Antenna Height [m]", lambda v: -25, r"holds -25 in line 5; "),
+])  # fmt: skip
+def test_a_single_value_in_another_unit_was_believed(tmp_path, head, values, says):
+    said, *_ = change(tmp_path, head, values, every=False)
+    assert re.search(says, said), said
+    assert not change(tmp_path, head, lambda v: v)
+
+
+def test_the_unit_of_a_cell_that_a_warning_advises_is_read(tmp_path):
+    """20 W among dBm were 20 dBm; what is no unit of powers was cut off in silence."""
+    assert not change(tmp_path, "Tx Power [dBm]", lambda v: "20 W", every=False)
+    assert not change(tmp_path, "Tx Power [W]", lambda v: "43 dBm")
+    (said,) = change(tmp_path, "Tx Power [dBm]", lambda v: "20 parsecs", every=False)
+    assert "'20 parsecs' in line 5: no station_power_db; unknown" in said
+
+
+@pytest.mark.parametrize(("head", "values", "says"), [
+    ("Azimuth", np.radians, r"as in 'Azimuth \[rad\]'"),
+    ("HBW", np.radians, r"as in 'HBW \[rad\]'"),
+    ("Tx Power", lambda v: 20, r"as in 'Tx Power \[W\]', where W or mW or dBm would fit"),
+    ("Antenna Height", lambda v: -25, r"holds -25 in line 2"),
+])  # fmt: skip
+def test_a_column_in_another_unit_was_believed(tmp_path, head, values, says):
+    said, *_ = change(tmp_path, head, values)
+    assert re.search(says, said), said
+    unit = re.search(r"\[(\w+)\]", says)
+    assert unit is None or not change(tmp_path, f"{head} [{unit[1]}]", values)
+
+
+def test_powers_of_0_beside_others_are_unknown(tmp_path):
+    site, notes = read_list(tmp_path, **{"Tx Power [dBm]": [0, 43, 46]})
+    power = site.stations.sector[:, 4]
+    assert set(power[np.isfinite(power)]) == {43, 46} and "station_power_db, 0 unknown" in notes

@@ -237,7 +237,10 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
     @app.post("/predict")
     async def predict(request: Request) -> Response:
         # Media types are compared without case (RFC 9110, 8.3.1).
-        body, raw = bytearray(), request.headers.get("content-type", "").lower().startswith(RAW)
+        kinds = {one.partition(";")[0].strip().lower() for one in request.headers.getlist("content-type")}
+        if len(kinds) > 1:
+            raise HTTPException(422, f"Content-Type twice: {', '.join(sorted(kinds))}; say one")
+        body, raw = bytearray(), kinds == {RAW}
         try:
             async for part in request.stream():
                 body += part
@@ -281,6 +284,8 @@ def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
             fault = "Content-Length beside Transfer-Encoding"
         elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
             fault, status = "Authorization: Bearer TOKEN is needed", 401
+        elif scope.get("query_string"):
+            fault, status = "nothing is read after ? in the address; leave it out", 422
         refused = JSONResponse({"detail": fault}, status, {"connection": "close"})
         await (refused if fault else app)(scope, receive, send)
 

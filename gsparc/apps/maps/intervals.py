@@ -103,7 +103,10 @@ class IntervalScales:
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
             return norm.cdf(standard)
-        chance = np.interp(standard, self.tail, TAIL)
+        # Beyond the rarest error that was seen it is rarer still, as of a normal one.
+        known, normal = np.interp(standard, self.tail, TAIL), norm.cdf(standard)
+        chance = np.where(standard > self.tail[-1], np.maximum(known, normal), known)
+        chance = np.where(standard < self.tail[0], np.minimum(known, normal), chance)
         return np.where(np.isfinite(standard), chance, np.nan)
 
 
@@ -129,7 +132,10 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     station = _of_stations(used, level)
     used = replace(used, spread_db=used.spread_db * station[used.station])
     count = int(np.clip(min(heard.sum() // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
-    first = [float(part[0]) for part in np.array_split(np.sort(used.distance[heard]), count)[1:]]
+    away = np.sort(used.distance[heard])
+    # Rows of a raster share few distances: no bin is empty.
+    first = sorted({float(part[0]) for part in np.array_split(away, count)} - {float(away[0])})
+    count = len(first) + 1
     which = np.searchsorted(first, used.distance, side="right")
     bins = [used.subset(np.flatnonzero(which == number)) for number in range(count)]
     middle = np.array([float(np.median(one.distance)) for one in bins])

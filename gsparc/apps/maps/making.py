@@ -94,6 +94,10 @@ def predict_map(
     if threshold_db <= np.ceil(lowest):
         said = f"threshold_db={threshold_db + level.raised_db:g} is at or below what was measured"
         notes.append(f"{said} (lowest {lowest + level.raised_db:.4g}): it says nothing of weaker places")
+    highest = np.inf if promise is None else float(promise.evidence.level_db.max())
+    if threshold_db > highest:
+        said = f"threshold_db={threshold_db + level.raised_db:g} is above all that was measured"
+        notes.append(f"{said} (highest {highest + level.raised_db:.4g}): hardly any place can reach it")
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     every, computed, stride = np.flatnonzero(grid.inside), 0, 1
     if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:

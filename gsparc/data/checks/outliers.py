@@ -96,6 +96,8 @@ def outlier_warnings(data: Measurements) -> list[str]:
 WIDTHS = 30.0  # of the rows' box
 DISTANT_M, TOO_DISTANT_M = 1e4, 1e6  # from there on positions in float32 move in steps of centimetres
 APART_M = 200.0  # in height, between a station and all rows
+LOW_M = 0.1  # no station's height above ground where rows are higher
+BENEATH_M = 2.0  # the same of one that is below 0, too: rooms may be measured from a table
 
 
 def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None) -> tuple[str, bool]:
@@ -132,4 +134,11 @@ def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeferenc
         side = "below" if below > above else "above"
         fault = f"a static end {max(below, above):.4g} m {side} all rows"
         return f"{fault}: heights above the sea beside heights above the ground?", False
+    if 0 < np.abs(still[:, 2]).max() < LOW_M < low[2]:
+        return f"static ends at heights of {np.abs(still[:, 2]).max():.2g} m at most: in kilometres?", False
+    if below > BENEATH_M and still[:, 2].min() < 0 <= low[2]:
+        return (
+            f"a static end at a height of {still[:, 2].min():.4g} m, below 0 and all rows: its sign?",
+            False,
+        )
     return "", False

@@ -11,6 +11,7 @@ from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.data.errors import Severe, list_first
@@ -22,17 +23,18 @@ NAMED = 5  # wild rows that a station may have, however few its rows
 SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
-REPEATS = 3
+REPEATS, FEW_APART = 3, 0.02
 NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
 HIGHEST_DBM = 60.0  # a kilowatt received
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
 NEIGHBOURS = 5  # rows on each side
 LONG_GAP = 20  # rows without a value, or at one place, in one piece
+LEAST = 5  # rows, of levels that all agree but for one, and of stations at one place or with one content
 STILL_DB = 10.0  # between levels of one place, at least: fading of who stands still is faster than it is deep
-EDGE = 10  # rows beside it
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
 WEAK_DB = 6.0  # above the weakest value: heard only just
+BESIDE, ODDS = 6, 3.0  # values around; of missing ones to lie beside weak ones, for one of values
 
 
 def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
@@ -43,7 +45,7 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         steps: `find_level_steps` them.
     """
     severe = map(Severe, [*level_warnings(levels.level_db), *floor_warnings(levels)])
-    warnings = [*severe, *still_warnings(levels), *outlier_row_warnings(levels)]
+    warnings = [*severe, *twin_warnings(levels), *still_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
 
@@ -64,12 +66,20 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     values = level_db[np.isfinite(level_db)]
     if len(values) < 2:
         return []
-    if not np.ptp(values):
-        return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
+    different, counts = np.unique(values, return_counts=True)
+    others = len(values) - counts.max()
+    if others <= min(1, len(values) // LEAST):
+        but = f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB," if others else ""
+        return [f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"]
     low, high = float(values.min()), float(values.max())
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
+    below = int(np.searchsorted(np.sort(values), different[np.diff(different).argmax()], "right"))
+    few = max(REPEATS, FEW_APART * len(values))
+    if np.diff(different).max() > APART_DB and min(below, len(values) - below) >= few:
+        parts = [f"{part[0]:.4g} to {part[-1]:.4g}" for part in np.split(np.sort(values), [below])]
+        return [f"levels of {parts[0]}, {below}, and of {parts[1]}, {len(values) - below}: in two units?"]
     if low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
         return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
@@ -174,18 +184,38 @@ def still_warnings(levels: LinkLevels) -> list[str]:
     Where nothing moves, levels differ from row to row as much as they do in all (J. von Neumann, 1941).
     """
     still: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
+    alone: dict[str, float] = {}
     for t, used in levels.heard():
         moves = np.flatnonzero(np.diff(levels.position[used], axis=0).any(axis=1)) + 1
+        if not len(moves) and len(used) >= LEAST and np.ptp(levels.level_db[used]) > STILL_DB:
+            alone[levels.names[t]] = float(np.ptp(levels.level_db[used]))
+            continue
         for piece in np.split(used, moves):
             level = levels.level_db[piece]
             if len(piece) >= LONG_GAP and np.ptp(level) > STILL_DB and np.diff(level).var() < level.var() / 2:
                 where = levels.rows[piece[0]], levels.rows[piece[-1]], len(piece)
                 still[where][levels.names[t]] = float(np.ptp(level))
-    return [
+    said = f"all rows{_of([*alone], len(levels.names))} are at one place, while levels change by up to "
+    return [f"{said}{max([0.0, *alone.values()]):.0f} dB: elsewhere nothing is learned of it"] * bool(
+        alone
+    ) + [
         f"{first} to {last}: one place for {count} rows, while levels change by {max(who.values()):.0f} dB"
         f"{_of([*who], len(levels.names))}: did the fix stand still? take them out"
         for (first, last, count), who in still.items()
     ]
+
+
+def twin_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of stations whose names differ by capitals alone, or that hold equal levels at equal places."""
+    alike: dict[tuple[str, object], list[str]] = defaultdict(list)
+    for t, used in levels.heard():
+        rows = np.column_stack([levels.position[used], levels.level_db[used]])
+        alike["differ by capitals alone", levels.names[t].casefold()].append(levels.names[t])
+        if len(np.unique(levels.level_db[used])) >= LEAST:
+            content = rows[np.lexsort(rows.T)].tobytes()
+            alike["hold the same levels at the same places", content].append(levels.names[t])
+    named = [(how, names) for (how, _), names in alike.items() if len(names) > 1]
+    return [f"stations {list_first(names)} {how}: one, under several names?" for how, names in named]
 
 
 def outlier_row_warnings(levels: LinkLevels) -> list[str]:
@@ -251,8 +281,8 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
 def gap_warnings(levels: LinkLevels) -> list[str]:
     """Warn of missing levels: long runs of rows (a station was off), scattered ones (not heard?).
 
-    A long run is no outage but out of reach where the values beside it are near the station's weakest, and
-    where fading makes its edges ragged.
+    Missing values count as not heard where they lie beside weak ones far oftener than values do: places
+    tell, not the order of rows. A long run of others is an outage.
     """
     names, rows, warnings = levels.names, levels.rows, list[str]()
     outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)  # by first row, last row, length
@@ -264,20 +294,18 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         if missing.all() or not missing.any():
             silent += [name] * bool(missing.all())
             continue
-        weak = float(np.percentile(level[~missing], 1)) + WEAK_DB
-        absent, count, around = np.flatnonzero(missing), 0, list[float]()
+        beside = _levels_beside(levels.position[used], level)
+        weak = beside < float(np.percentile(level[~missing], 1)) + WEAK_DB
+        sides = [(weak[rows].sum() + 1, (~weak[rows]).sum() + 1) for rows in (missing, ~missing)]
+        unheard = (weak & missing).sum() >= FEW * len(used)
+        unheard &= sides[0][0] * sides[1][1] >= ODDS * sides[0][1] * sides[1][0]
+        absent, count = np.flatnonzero(missing & ~(weak & unheard)), int(missing.sum())
         for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
-            start, stop = int(piece[0]), int(piece[-1]) + 1
-            beside = np.concatenate([level[max(0, start - 3) : start], level[stop : stop + 3]])
-            beside = beside[np.isfinite(beside)]
-            ragged = missing[max(0, start - EDGE) : start].any() or missing[stop : stop + EDGE].any()
-            if len(piece) >= LONG_GAP and not (ragged and len(beside) and np.median(beside) < weak):
-                outages[rows[used[start]], rows[used[stop - 1]], len(piece)].append(name)
-            else:
-                count, around = count + len(piece), [*around, *beside]
+            if len(piece) >= LONG_GAP:
+                outages[rows[used[piece[0]]], rows[used[piece[-1]]], len(piece)].append(name)
+                count -= len(piece)
         if count:
-            often = count >= FEW * len(used) and len(around) > 0
-            (faint if often and np.median(around) < weak else plain)[name] = count
+            (faint if unheard else plain)[name] = count
     if faint:
         # First of all: what is not heard and not said so leaves weak stations far too strong.
         lost = f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the weakest ones"
@@ -292,6 +320,14 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
         lost = f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}"
         warnings.append(f"{lost}, few or beside strong ones: lost or not listed; they are not used")
     return warnings
+
+
+def _levels_beside(place: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Mean levels (n,) of the values nearest to each place (n, d) of one station, its own left out."""
+    heard = np.flatnonzero(np.isfinite(level))
+    near = heard[cKDTree(place[heard]).query(place, range(1, min(BESIDE + 1, len(heard)) + 1))[1]]
+    others = near != np.arange(len(place))[:, None]
+    return (level[near] * others).sum(axis=1) / others.sum(axis=1).clip(1)
 
 
 def _of(who: list[str], total: int) -> str:

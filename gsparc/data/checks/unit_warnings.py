@@ -9,6 +9,11 @@ from gsparc.data.schema import Measurements
 
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
+LEAST, FEW = 3, 0.02  # places, and their share of all, that tell a unit of their own
+SPOT = 100  # of a box's width, what places in kilometres take among metres
+NEAR = 3  # widths of a box, about it
+DEGREE_M = 111e3
+HERTZ = 3e6, 1e12  # of carriers that links are measured at
 
 
 def unit_warnings(data: Measurements) -> list[str]:
@@ -21,11 +26,21 @@ def unit_warnings(data: Measurements) -> list[str]:
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + site.origin
         hints = next(filter(None, map(_position_hints, places)), [])
+        still = np.zeros((0, 2)) if site.stations is None else site.stations.position[:, :2] + site.origin[:2]
+        mixed = {"rows": _find_other_unit(places[1][:, :2]), "stations": _find_other_unit(still)}
+        hints = [f"of {who} {said}" for who, said in mixed.items() if said] or hints
+        if site.kind != "csi":  # an array's antennas stand close together
+            hints += _compare_reaches(still, places[1][:, :2])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
             waves = f"{reach / site.wavelength:.3g} wavelengths"
             hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
+    hertz = np.array([] if site.carrier_hz is None else [site.carrier_hz])
+    if site.stations is not None and site.stations.carrier_hz is not None:
+        hertz = np.append(hertz, site.stations.carrier_hz)
+    if len(hertz) and not (HERTZ[0] <= hertz.min() and hertz.max() <= HERTZ[1]):
+        hints.append(f"carriers of {hertz.min() / 1e6:g} to {hertz.max() / 1e6:g} MHz: another unit?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         # Steps in radians taken for degrees: the columns then span 2 pi degrees.
@@ -69,3 +84,42 @@ def _position_hints(positions: np.ndarray) -> list[str]:
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []
+
+
+def _find_other_unit(places: np.ndarray) -> str:
+    """Name the unit of some of places (n, 2), which lie in a spot as others lie in metres; empty: none."""
+    places = np.unique(places[np.isfinite(places).all(axis=1)], axis=0)
+    if len(places) < 2 * LEAST:
+        return ""
+    side = float(np.ptp(places, axis=0).max()) / SPOT
+    which, counts = np.unique(np.floor(places / side), axis=0, return_inverse=True, return_counts=True)[1:]
+    middle = np.median(places[which.reshape(-1) == counts.argmax()], axis=0)
+    near = (np.abs(places - middle) < side).all(axis=1)
+    spot, rest = places[near], places[~near]
+    if min(len(spot), len(rest)) < max(LEAST, FEW * len(places)):
+        return ""
+    small, wide = (float(np.ptp(some, axis=0).max()) for some in (spot, rest))
+    kilometres = wide < 3e3 * small < 9 * wide and _are_thousandths(spot, rest, 0.5).all()
+    if kilometres or (wide < 3 * DEGREE_M * small < 9 * wide and np.abs(spot).max() <= 180):
+        said = f"{len(spot)} of {len(places)} places lie within {small:.2g} m, the others over {wide:.4g} m: "
+        return f"{said}in {'kilometres' if kilometres else 'degrees'}? give all of them in one unit"
+    return ""
+
+
+def _are_thousandths(places: np.ndarray, others: np.ndarray, beyond: float) -> np.ndarray:
+    """Tell along which axes places (n, 2), times 1000, lie where others (m, 2) do, or widths beyond (2,)."""
+    least, most = others.min(axis=0), others.max(axis=0)
+    around, (low, high) = most - least, (1e3 * places.min(axis=0), 1e3 * places.max(axis=0))
+    inside = (low > least - beyond * around) & (high < most + beyond * around)
+    return np.asarray(inside & (SPOT * np.ptp(places, axis=0) < around))
+
+
+def _compare_reaches(still: np.ndarray, moving: np.ndarray) -> list[str]:
+    """Name axes along which stations (T, 2), or rows (n, 2), lie where the others do in thousandths."""
+    still, hints = np.unique(still[np.isfinite(still).all(axis=1)], axis=0), []
+    for one, other, who in ((still, moving, "stations"), (moving, still, "rows")):
+        if len(still) >= LEAST and (small := _are_thousandths(one, other, NEAR)).any():
+            reach, wide = (float(np.ptp(some[:, small], axis=0).max()) for some in (one, other))
+            axes = " and ".join(np.array(["x", "y"])[small])
+            hints += [f"{axes} of {who} reach over {reach:.3g} m, the others over {wide:.4g}: in kilometres?"]
+    return hints

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.links.absent import add_absent, add_unlisted
-from gsparc.data.links.hearing import POWERS, censor_rows, check_said
+from gsparc.data.links.hearing import POWERS, censor_rows, check_said, forget_unknown
 from gsparc.data.links.positions import positions_in_metres
 from gsparc.data.links.stations import (
     SECTOR,
@@ -140,6 +140,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
     stations = split_by_carrier(
         check, _selected(check, measured, stations, part) or stations, measured in POWERS
     )
+    if measured == "rssi_db":
+        forget_unknown(check, ends[0])  # before lists are looked for, in which they would be strong
     absent = check.raw.attributes.get("absent", "auto")
     unlisted = add_unlisted(check, stations, static, absent) if measured == "rssi_db" else 0
     if absent == "silent":

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.blocks import is_big
-from gsparc.data.checks.plausibility import find_marks, find_saturation
+from gsparc.data.checks.plausibility import APART_DB, find_marks, find_saturation
 from gsparc.data.errors import Caution
 from gsparc.data.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.own_checks import Checker
@@ -53,7 +53,7 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         unlisted: rows that lists of the strongest leave out.
     """
     if measured == "rssi_db" and links.static_end is not None:
-        _forget_unknown(check, f"{OTHER[links.static_end]}_position")
+        forget_unknown(check, f"{OTHER[links.static_end]}_position")
     values, arrays, before = check.raw.arrays[measured], check.raw.arrays, len(check.problems)
     floor = _stated_floor(check, measured, values)
     if len(check.problems) > before:
@@ -150,8 +150,13 @@ def _below_floor(
     return below
 
 
-def _forget_unknown(check: Checker, moving: str) -> None:
-    """Make marks that lie beside strong levels as well as beside weak ones NaN: no value, and not unheard."""
+def forget_unknown(check: Checker, moving: str) -> None:
+    """Make marks that lie beside strong levels as well as beside weak ones NaN: no value, and not unheard.
+
+    Args:
+        check: of rows of links, whose `raw` is changed; takes notes.
+        moving: name of the array of their places.
+    """
     values, place = check.raw.arrays["rssi_db"], check.raw.arrays.get(moving, np.zeros(0))
     if (
         check.raw.attributes.get("not_heard") is not None
@@ -160,7 +165,10 @@ def _forget_unknown(check: Checker, moving: str) -> None:
     ):
         return
     station = check.raw.arrays.get("station", np.zeros(len(values), np.int64))
-    marks = find_marks(values)
+    marks, rest = find_marks(values), values[np.isfinite(values) & (values != 0)]
+    # However few, 0 beside levels far below is what a receiver says that knows none.
+    alone = 0 < (values == 0).sum() < LEAST_MARKS and rest.max(initial=-np.inf) < -APART_DB
+    marks += [0.0] if alone and 0.0 not in marks and len(rest) >= LEAST_MARKS else []
     heard = np.isfinite(values) & ~np.isin(values, marks) & np.isfinite(place).all(1)
     for mark in marks:
         beside: list[bool] = []
@@ -173,12 +181,12 @@ def _forget_unknown(check: Checker, moving: str) -> None:
             level = values[own].astype(float)
             beside += (level[near].mean(1) < np.median(level)).tolist()
         # A coin that falls on either side: of few marks nothing is told.
-        if len(beside) < LEAST_MARKS or np.mean(beside) > WEAK_SHARE:
+        if not (mark == 0 and alone) and (len(beside) < LEAST_MARKS or np.mean(beside) > WEAK_SHARE):
             continue
         check.raw.arrays["rssi_db"] = np.where(values == mark, np.nan, check.raw.arrays["rssi_db"])
         share = f"{int((values == mark).sum())} of {len(values)} levels"
-        said = f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others, beside strong levels "
-        said += "as well as weak ones: no value, left out"
+        where = "" if mark == 0 and alone else ", beside strong levels as well as weak ones"
+        said = f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others{where}: no value, left out"
         check.notes.append(Caution(f"{said}; dataset.not_heard=[{mark:.12g}] takes them as not heard"))
 
 

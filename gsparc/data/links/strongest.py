@@ -15,6 +15,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.row_order import along_curve, hash_rows
+
 FULL = 0.15  # of the moments, that hold as many as any: .03 at most where hearing alone ends lists
 LEAST_MOMENTS = 20
 ABOVE_DB = 6.0  # of a neighbour's weakest, where a station drops out of lists, at most
@@ -79,7 +81,9 @@ class StrongestLists:
         number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)
         table[which.reshape(-1), who] = level
-        return cls(int(np.isfinite(table).sum(1).max()), first, table, at[first])
+        # By what they hold: the file's order is chance, and draws are by number.
+        order = np.lexsort((hash_rows(np.nan_to_num(table)), along_curve(np.nan_to_num(at[first]))))
+        return cls(int(np.isfinite(table).sum(1).max()), first[order], table[order], at[first[order]])
 
     @property
     def full(self) -> np.ndarray:

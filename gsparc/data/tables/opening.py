@@ -16,7 +16,7 @@ from pathlib import Path
 import pandas as pd
 
 from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
-from gsparc.data.files import check_line_length
+from gsparc.data.files import check_content, check_line_length
 from gsparc.data.raw import ARRAY_SUFFIXES
 from gsparc.data.tables import is_table
 from gsparc.data.tables.heads import SHEET, parse_head
@@ -127,6 +127,7 @@ def _decoded(path: Path) -> tuple[str, str]:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
         raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
+    check_content(path, content, "\n\r")
     for start, what in SHEET["others"].items():
         if content.lstrip().startswith(start.encode("latin-1")):
             raise DataError(f"{path}: not a table of text but {what}")

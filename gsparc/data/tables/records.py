@@ -11,7 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
+from gsparc.data.files import check_content
+
 POINTS = {"trkpt", "wpt", "Placemark"}  # of GPX and KML
+MOST_VALUES = 10_000  # of a cell
 PLACE = ("longitude", "latitude", "height")  # as GeoJSON and KML order coordinates
 
 
@@ -24,6 +27,7 @@ def read_records(path: Path) -> pd.DataFrame:
         ValueError, ElementTree.ParseError: no JSON, or no XML.
     """
     text = path.read_text(encoding="utf-8-sig")
+    check_content(path, text, "[{<\n")
     frame = pd.json_normalize(_of_xml(text) if text.lstrip().startswith("<") else _of_json(text))
     while (name := next((name for name in frame if frame[name].map(_holds_records).any()), None)) is not None:
         frame = frame.explode(name, ignore_index=True)
@@ -33,6 +37,8 @@ def read_records(path: Path) -> pd.DataFrame:
         padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
         places = pd.DataFrame([one[:3] for one in padded], dtype=float)
         frame = frame.join(places.rename(columns=dict(enumerate(PLACE))).loc[:, lambda p: p.notna().any()])
+    for name in [name for name in frame if frame[name].map(_is_long).any()]:
+        raise ValueError(f"more than {MOST_VALUES:,} values in {name!r} of one record; expected one in each")
     short = Counter(name.rpartition(".")[2] for name in frame)
     return frame.rename(columns=lambda name: last if short[last := name.rpartition(".")[2]] == 1 else name)
 
@@ -41,9 +47,13 @@ def _holds_records(value: Any) -> bool:
     return isinstance(value, list) and any(isinstance(one, dict) for one in value)
 
 
+def _is_long(value: Any) -> bool:
+    return isinstance(value, list) and len(value) > MOST_VALUES
+
+
 def _of_json(text: str) -> list[dict[str, Any]]:
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=_of_pairs)
     except json.JSONDecodeError as whole:  # a record a line
         if "\n" not in text.strip():
             raise
@@ -55,14 +65,22 @@ def _of_json(text: str) -> list[dict[str, Any]]:
         content = held[0] if len(held) == 1 else _of_columns(content) or [content]
     if not _holds_records(content):
         raise ValueError("no records: expected [{...}, ...], or one {...} a line")
-    return [one for one in content if isinstance(one, dict)]
+    return [one if isinstance(one, dict) else {} for one in content]  # rows keep their numbers
 
 
 def _of_line(line: str, number: int) -> Any:
     try:
-        return json.loads(line)
+        return json.loads(line, object_pairs_hook=_of_pairs)
     except json.JSONDecodeError as fault:
         raise ValueError(f"line {number}, column {fault.colno}: {fault.msg}; is it cut off?") from None
+
+
+def _of_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"{twice!r} is twice in one record")
+    return record
 
 
 def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:

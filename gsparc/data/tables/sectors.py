@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pandas as pd
 
@@ -18,11 +20,18 @@ TILTS = ("total", "mechanical", "electrical")
 # Lowest and highest that there is, and what the largest reaches unless all are 0; the kind of their unit.
 RANGES = {
     "station_azimuth": (-360, 360, 1, "angle"), "station_width": (0, 360, 1, "angle"),
-    "station_thickness": (0, 360, 1, "angle"), "total": (-90, 90, 0.1, "angle"),
-    "mechanical": (-90, 90, 0.1, "angle"), "electrical": (-90, 90, 0.1, "angle"),
+    "station_thickness": (0, 360, 1, "angle"), **dict.fromkeys(TILTS, (-90, 90, 0.1, "angle")),
     "station_power_db": (-50, 100, 1, "power"), "height": (-500, 9000, 0.3, "length"),
     "carrier_hz": (2e8, 1.1e11, 0, "frequency"),
 }  # fmt: skip
+# Lowest and highest that are usual, and how far single ones are from the middle of all, at most.
+USUAL = {
+    "station_width": (6.3, 360, 360), "station_thickness": (2, 180, 180), "height": (0, 9000, 500),
+    **dict.fromkeys(TILTS, (0, 30, 12)), "station_power_db": (-20, 80, 15),
+}  # fmt: skip
+UNSAID_DBM = 30  # a lower power, where nobody says its unit, may be in watts
+FEW, LEAST = 0.2, 3  # share of a column up to which values are single ones; radians beside degrees
+CELL = re.compile(r"(?i)^\s*[bn]?([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)(?:\s.*)?$")
 FIRST_NR = (
     100_000  # channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1)
 )
@@ -67,32 +76,27 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     notes: list[str] = []
     unread, heads = [], []
     for head in [head for head in sheet.heads if head not in used]:
-        name, unit = sector_quantity(head), unit_of(head)[1]
-        words = sheet.words(head) if name else np.zeros(0, str)
-        values = pd.to_numeric(pd.Series([_number(word) for word in words]), errors="coerce").to_numpy(float)
+        name = sector_quantity(head)
+        values, written, unit = _read_cells(sheet, head, name)
         if name is None or name in found or not np.isfinite(values).any():
             unread.append(repr(head))
             continue
-        said = name
-        if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
-            own = next(
-                (one for one in ("Hz", "kHz", "MHz", "GHz") if _fits(UNITS[one.lower()], values, name)), "Hz"
-            )
-            values, said = UNITS[own.lower()].convert(values), f"{name} in {own}"
-        elif unit is not None and unit.kind == "power" and name == "station_power_db":
-            with np.errstate(divide="ignore", invalid="ignore"):
-                values = 10 * np.log10(unit.convert(values)) + 30
-        elif unit is not None:
-            values = unit.convert(values)
+        said = name if unit is None or name != "carrier_hz" else f"{name} in {unit.name}"
+        lost = np.flatnonzero(np.isnan(values) & (sheet.words(head) != "") & np.isnan(written))
+        if len(lost):
+            cells = list_first([f"'{sheet.words(head)[i]}' in {sheet.rows[i]}" for i in lost])
+            notes.append(Caution(f"{sheet.source}: column {head!r}: {cells}: no {name}; unknown"))
         if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
             values, said = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
-        if name in ("station_width", "station_thickness") and (values == 0).any():
+        zero = name == "station_power_db" and (
+            np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
+        )
+        if (zero or name in ("station_width", "station_thickness")) and (values == 0).any():
             values, said = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
             values = -values
-        if name in RANGES and not _fits(UNITS["m"], values, name):
-            _refuse_range(sheet, head, name, values)
+        notes += _doubt(sheet, head, name, values, written, unit is None)
         found[name] = values
         heads.append(f"{head!r} as {said}")
     parts = [found.pop(name) for name in TILTS if name in found]
@@ -115,25 +119,76 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     return found, notes
 
 
+def _read_cells(sheet: Sheet, head: str, name: str | None) -> tuple[np.ndarray, np.ndarray, Unit | None]:
+    """Read values (T,) in the schema's unit, by each cell's or the head's; those without; the head's unit."""
+    cells = pd.Series(sheet.words(head) if name else np.zeros(0, str)).str.replace(",", ".").str.extract(CELL)
+    numbers, own = pd.to_numeric(cells[0]).to_numpy(float), cells[1].fillna("").str.lower().to_numpy()
+    unit = unit_of(head)[1] or UNITS.get(words_of(head)[-1])
+    written, values = np.where(own == "", numbers, np.nan), np.full(len(own), np.nan)
+    if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
+        hertz = [UNITS[one] for one in ("hz", "khz", "mhz", "ghz")]
+        unit = next((one for one in hertz if _fits(one, written, name)), hertz[0])
+    for text in np.unique(own):
+        one = UNITS.get(text) if text else unit or UNITS["m"]
+        kinds = (RANGES[name][3], *["level"] * (name == "station_power_db")) if name in RANGES else ()
+        if one is not None and (one.kind in kinds or not (text or unit)):
+            values[own == text] = _convert(one, numbers[own == text])
+    return values, written, unit
+
+
+def _convert(unit: Unit, values: np.ndarray) -> np.ndarray:
+    """Values (n,) in a unit, in the schema's; powers in dBm."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = unit.convert(values)
+        return 10 * np.log10(own) + 30 if unit.kind == "power" else own
+
+
 def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
     """Whether values (n,) that are in a unit can be those of a quantity of `RANGES`."""
     low, high, least, _ = RANGES[name]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        own = unit.convert(values[np.isfinite(values)])
-        own = 10 * np.log10(own) + 30 if unit.kind == "power" else own
+    own = _convert(unit, values[np.isfinite(values)])
     return not own.any() or bool(((own >= low) & (own <= high)).all() and np.abs(own).max() >= least)
 
 
-def _refuse_range(sheet: Sheet, head: str, name: str, values: np.ndarray) -> None:
-    """Refuse a column in a unit that it cannot be in, and name those that it can (DataError)."""
-    low, high, least, kind = RANGES[name]
-    fitting = [unit.name for unit in UNITS.values() if unit.kind == kind and _fits(unit, values, name)]
-    fits = f", where {' or '.join(fitting[:3])} would fit" if len(fitting) > 1 else ""
-    remedy = f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'{fits}" if fitting else ""
-    raise DataError(
-        f"{sheet.source}: column {head!r} holds {np.nanmin(values):g} to {np.nanmax(values):g}; expected "
-        f"{name} of {low:g} to {high:g}, {least:g} at least once{remedy}"
-    )
+def _doubt(
+    sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool
+) -> list[str]:
+    """Refuse values (T,) that cannot be (DataError), doubt rare ones, and name the unit that fits."""
+    if name not in RANGES or np.isnan(values).all():
+        return []
+    (least, most, _, kind), (low, high, apart) = RANGES[name], USUAL.get(name, (*RANGES[name][:2], np.inf))
+    low, middle = UNSAID_DBM if unsaid and kind == "power" else low, np.nanmedian(values)
+    refused, off = not _fits(UNITS["m"], values, name), (values < least) | (values > most)
+    if not off.any():
+        off = refused & np.isfinite(values) | (values < low) | (values > high)
+        turned = (values % 1 != 0) & (np.abs(values) < 2 * np.pi)  # degrees of azimuths are seldom as small
+        off |= turned & (name == "station_azimuth") & (turned.sum() >= max(LEAST, FEW * len(values)))
+        single = np.abs(values - middle) > apart
+        off |= single & (single.sum() <= FEW * len(values))
+    if not off.any():
+        return []
+    rest = values[~off & np.isfinite(values)]
+    middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
+    others = [one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")]
+    least_usual, written = USUAL.get(name, (least,))[0], written[off]
+    own = {one.name: _convert(one, written) for one in others}
+    fitting = [
+        unit
+        for unit, v in own.items()
+        if ((v >= least_usual) & (v <= high) & ~(abs(v - middle) > apart)).all()
+    ]
+    shown = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
+    said = f"{sheet.source}: column {head!r} holds {list_first(shown, 3)}; expected {name} of "
+    said += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
+    if fitting and np.isfinite(middle):
+        said += f"; in {fitting[0]}? then write so, as '{written[0]:g} {fitting[0]}'"
+    elif fitting:
+        fitting[2:] = ["dBm"] if kind == "power" and not refused else fitting[2:3]
+        said += f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'"
+        said += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
+    if refused:
+        raise DataError(said)
+    return [Caution(said)]
 
 
 def _in_mhz(carrier: np.ndarray) -> list[str]:
@@ -148,9 +203,3 @@ def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:
         if 1 < len(names) < len(words) and (words != "").all():
             return head, number.astype(np.float64)
     return None
-
-
-def _number(word: str) -> str:
-    """The number that a cell begins with: `30°`, `B20`, `1800 MHz`."""
-    text = word.replace(",", ".").strip().lstrip("Bbn")
-    return text.split()[0].rstrip("°") if text.split() else ""

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -328,7 +329,8 @@ def test_a_distilled_form_was_wrong_by_the_law_of_distance_outside_its_box():
     """19 dB far away, where the training box was told to .011 dB."""
     predictor = of_powers(80, "kriging")
     found = make.compile_model(predictor, 256)
-    assert found.form.predictor is not None and "outside their box" in found.summary
+    said = re.search(r"outside their box ([\d.]+), ([\d.]+) at the worst", found.summary)
+    assert found.form.predictor is not None and said is not None
     for away in (3.0, 30.0, 200.0):
         middle = predictor.site.moving_box.mean(0) + predictor.site.origin
         around = np.linspace(0, 2 * np.pi, 24)
@@ -336,4 +338,4 @@ def test_a_distilled_form_was_wrong_by_the_law_of_distance_outside_its_box():
         places = middle + reach * np.c_[np.cos(around), np.sin(around), 0 * around]
         error = found.form.predictor.rssi(**{predictor.site.moving_end: places})
         error = error - predictor.rssi(**{predictor.site.moving_end: places})
-        assert np.abs(error).max() < 1.5, (away, np.abs(error).max())
+        assert np.abs(error).max() < min(1.5, 1.5 * float(said[2])), (away, np.abs(error).max(), said[0])

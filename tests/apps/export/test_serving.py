@@ -436,3 +436,24 @@ def test_a_repeated_key_answered_the_second(served):
 
 def test_no_page_loads_scripts_from_elsewhere(served):
     assert [ask_http(served.port, "GET", path, None, {})[0] for path in ("/docs", "/redoc")] == [404, 404]
+
+
+@pytest.mark.parametrize("path", ["/predict?unit=dBm", "/std?a", "/healthz?verbose=1", "/?="])
+def test_what_stands_after_a_question_mark_was_read_nowhere(served, path):
+    body = as_json([[1, 2, 1]])
+    status, answer = ask_http(served.port, "POST", path, body, {"Content-Type": "application/json"})[:2]
+    assert status == 422 and b"nothing is read after ?" in answer
+
+
+def test_raw_places_are_of_one_media_type_alone(served):
+    """`application/octet-streamx` was taken for raw, and of two types the first counted."""
+    assert served.post(np.zeros((1, 3), "<f4").tobytes(), RAW + "x")[0] == 422
+    body = np.zeros((1, 3), "<f4").tobytes()
+    head = f"POST /predict HTTP/1.1\r\nHost: a\r\nConnection: close\r\nContent-Length: {len(body)}\r\n"
+    with socket.create_connection(("127.0.0.1", served.port), timeout=10) as client:
+        types = f"Content-Type: {RAW}\r\nContent-Type: application/json\r\n\r\n"
+        client.sendall((head + types).encode() + body)
+        answer = b""
+        while part := client.recv(65536):
+            answer += part
+    assert answer.startswith(b"HTTP/1.1 422") and b"Content-Type twice" in answer

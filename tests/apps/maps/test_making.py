@@ -206,6 +206,10 @@ def test_a_threshold_below_all_that_was_measured_was_said_to_be_met_everywhere(p
     for threshold, said in ((-100, 1), (-90, 0)):
         found = predict_map(predictor, step_m=20.0, threshold_db=threshold, promise=promise)
         assert sum("or below what was measured (lowest -100.6)" in note for note in found.notes) == said
+        assert not any("above all" in note for note in found.notes)
+    found = predict_map(predictor, step_m=20.0, threshold_db=60, promise=promise)
+    assert np.nanmin(found.outage) == 1  # .1 % of the squares had it
+    assert any("threshold_db=60 is above all that was measured (highest -50)" in note for note in found.notes)
 
 
 def test_spectra_have_no_power(predictor, monkeypatch):

@@ -61,3 +61,14 @@ def test_utm_rows_and_stations():
 def test_heights_above_the_sea_and_above_the_ground_were_good():
     (said,) = [note for note in reading(rx_height=np.array(520.0)).notes if "static end" in note]
     assert "490 m below all rows: heights above the sea beside heights above the ground?" in said
+
+
+def test_stations_below_the_ground_are_named():
+    """A height of -25 m was good."""
+    (said,) = [note for note in reading(station_height=np.array(-25.0)).notes if "below 0" in note]
+    assert said.startswith("a static end at a height of -25 m")
+
+
+def test_heights_of_stations_in_kilometres_are_named():
+    (said,) = [note for note in reading(station_height=np.array(0.025)).notes if "static ends" in note]
+    assert said == "static ends at heights of 0.025 m at most: in kilometres?"

@@ -240,3 +240,88 @@ def test_warnings_and_rows_had_other_names_of_a_cell_than_the_rest():
     warnings = warnings_of(link_levels(data))
     assert any(w.startswith("station W03-2 (150) rises") and "level_steps={150:[" in w for w in warnings)
     assert data.row_names[:2] == ["row 0, station W03-2 (150)", "row 0, station W03-3 (212)"]
+
+
+def test_not_heard_or_lost_does_not_depend_on_the_order_of_rows():
+    """Rows shuffled were `few or beside strong ones`, in the order of the drive `not heard?`."""
+    rng, place, level, _ = np.random.default_rng(0), *walk(2)
+    lost = level.copy()
+    level[level < np.percentile(level, 30)] = np.nan
+    lost[rng.choice(len(lost), 60, replace=False)] = np.nan
+    for order in (np.arange(len(level)), np.arange(len(level))[::-1], rng.permutation(len(level))):
+        for values, said in ((level, "not heard?"), (lost, "60 single levels missing")):
+            found = plausibility.gap_warnings(as_links(place[order], values[order, None], ["a"]))
+            assert len(found) == 1 and found[0].startswith(said), found
+
+
+def test_levels_that_agree_but_for_one_are_named():
+    level = np.full(30, -70.0)
+    level[7] = -71
+    (said,) = plausibility.level_warnings(level)
+    assert said == "all levels but 1, -71 dB, are -70 dB: is it the column of levels?"
+    assert not plausibility.level_warnings(np.array([-70.0, -71, -70, -72, -73]))
+
+
+def test_a_station_copied_under_another_name_is_named():
+    place, level, _ = walk(0)
+    other = walk(1)[1]
+    for names, says in (
+        (["a", "b", "c"], "stations a, c hold the same levels at the same places"),
+        (["AP1", "b", "ap1"], "stations AP1, ap1 differ by capitals alone"),
+    ):
+        twins = as_links(place, np.stack([level, other, level], 1), names)
+        assert any(said.startswith(says) for said in plausibility.twin_warnings(twins))
+    assert not plausibility.twin_warnings(as_links(place, np.stack([level, other], 1), ["a", "b"]))
+
+
+def test_all_rows_of_a_station_at_one_place_are_named():
+    place, level, _ = walk(0)
+    levels = np.stack([level, np.full(len(level), np.nan)], 1)
+    still = np.flatnonzero((place == place[40]).all(1)).tolist() + list(range(41, 60))
+    place[still], levels[still, 1] = place[40], np.linspace(-90, -60, 20)
+    (said,) = plausibility.still_warnings(as_links(place, levels, ["a", "b"]))
+    assert said.startswith("all rows of station b are at one place, while levels change by up to 30 dB")
+
+
+@pytest.mark.parametrize("other", ["kilometres", "degrees"])
+def test_some_places_in_another_unit_are_named(other):
+    rng, half = np.random.default_rng(0), np.arange(80) % 2 == 0
+    place = rng.uniform(0, 2500, (80, 2))
+    mixed = place / 1e3 if other == "kilometres" else [11.5, 48.1] + place / 111e3
+    rows = np.c_[np.where(half[:, None], mixed, place), np.ones(80)]
+    found = unit_warnings(from_arrays({"rx_position": rows, "rssi_db": rng.normal(-80, 5, 80)}))
+    assert any("40 of 80 places lie within" in line and f"in {other}?" in line for line in found), found
+    whole = from_arrays({"rx_position": np.c_[place, np.ones(80)], "rssi_db": rng.normal(-80, 5, 80)})
+    assert not unit_warnings(whole)
+
+
+@pytest.mark.parametrize("axes", [[1e3, 1, 1], [1, 1e3, 1], [1e3, 1e3, 1]])
+@pytest.mark.parametrize("who", ["stations", "rows"])
+def test_places_of_stations_beside_rows_in_kilometres_are_named(axes, who):
+    rng = np.random.default_rng(0)
+    rows, posts = (np.c_[rng.uniform(0, 2500, (n, 2)), np.ones(n)] for n in (80, 6))
+    files = {"rx_position": rows, "station_position": posts, "station": np.arange(80) % 6}
+    files["rssi_db"] = rng.normal(-80, 5, 80)
+    assert not unit_warnings(from_arrays(files))
+    key = {"stations": "station_position", "rows": "rx_position"}[who]
+    found = unit_warnings(from_arrays({**files, key: files[key] / axes}))
+    assert any(f"of {who} reach over" in line and "in kilometres?" in line for line in found), found
+
+
+@pytest.mark.parametrize("other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10)])
+@pytest.mark.parametrize("each", [2, 10])
+def test_some_levels_in_another_unit_are_named(other, each):
+    _, level, _ = walk(0)
+    assert not plausibility.level_warnings(level)
+    level[::each] = other(level[::each])
+    (said,) = plausibility.level_warnings(level)
+    assert said.startswith("levels of ") and said.endswith("in two units?"), said
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_carriers_that_no_link_has_are_named(factor):
+    place, level = room()
+    arrays = {"rx_position": place, "tx_position": np.zeros(3), "rssi_db": level}
+    assert not unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9)}))
+    (said,) = unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9 * factor)}))
+    assert said.startswith("carriers of ") and said.endswith("MHz: another unit?")

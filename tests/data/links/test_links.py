@@ -312,3 +312,23 @@ def test_arrays_and_attributes_of_another_form_were_tracebacks(case):
     with pytest.raises(DataError) as caught:
         interpret(Raw(arrays, attributes), "town.npz")
     assert any(re.search(says, line) for line in caught.value.problems), caught.value.problems
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("stations", [1, 12])
+def test_a_level_of_0_far_above_all_others_was_the_strongest(count, stations):
+    """One 0 among -42 to -100 was a station next door; three were below the weakest."""
+    rng = np.random.default_rng(0)
+    level = np.round(rng.uniform(-100, -42, 240))
+    level[rng.choice(240, count, replace=False)] = 0
+    arrays = {"rx_position": rng.uniform(0, 50, (240, 3)), "rssi_db": level}
+    if stations > 1:
+        posts = rng.uniform(0, 50, (stations, 3))
+        arrays |= {"station": np.arange(240) % stations, "station_position": posts}
+    reading = interpret(Raw(arrays), "file")
+    assert (
+        len(reading.data) == 240 - count
+        and 10 * np.log10(reading.data.target.max() * reading.data.site.target_scale) < -41
+    )
+    (said,) = [note for note in reading.notes if "exactly 0" in note]
+    assert "no value, left out; dataset.not_heard=[0]" in said and reading.data.censored is None

@@ -269,3 +269,18 @@ def test_a_station_of_one_place_made_lists_of_the_strongest_of_all_others():
     arrays["rx_position"][arrays["station"] == 2] = [100.0, 100.0, 1.5]
     reading = interpret(Raw(arrays), "drive")
     assert not [note for note in reading.notes if "strongest" in note]
+
+
+def test_what_lists_leave_out_depended_on_the_order_of_rows():
+    """The file's order drew other unlisted links, below other levels."""
+    arrays = network(0).arrays(4)
+    rows = len(arrays["rssi_db"])
+
+    def unlisted(order):
+        data = from_arrays({k: v[order] if len(v) == rows else v for k, v in arrays.items()})
+        links = np.c_[data.station, data.moving + data.site.origin, data.target][data.censored == 1]
+        return links[np.lexsort(links.round(3).T)]
+
+    first = unlisted(np.arange(rows))
+    for order in (np.arange(rows)[::-1], np.random.default_rng(0).permutation(rows)):
+        np.testing.assert_allclose(unlisted(order), first, rtol=1e-5, atol=1e-3)

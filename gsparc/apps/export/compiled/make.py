@@ -89,7 +89,8 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
     if site.kind == "rssi":
         away, _ = _squares(form.predictor, predictor, far_places(site, 256, seed + 4))
-        figure += f", {np.sqrt(away.mean()):.2g} outside their box"
+        rms, most = np.sqrt([away.mean(), away.max()])
+        figure += f", outside their box {rms:.2g}, {most:.2g} at the worst"
     return CompiledForm(form, error, worst, f"{_NAMES[form.kind]}, distilled from {method.name}: {figure}")
 
 
