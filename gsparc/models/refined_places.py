@@ -20,7 +20,7 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.mixture.weights import in_error_unit, to_real_entries
+from gsparc.models.stack import in_error_unit, to_real_entries
 from gsparc.models.target_rows import TINY_POWER
 from gsparc.ops import Pose
 from gsparc.physics.decibels import RELATIVE_DB
