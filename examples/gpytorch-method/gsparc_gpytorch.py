@@ -44,7 +44,7 @@ class GPyTorch(Interpolator):
         self.components, self.steps, self.rate = components, steps, rate
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        parts: Components = principal_components(targets, self.kind, self.components)
+        parts: Components = principal_components(targets, self.target, self.components)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         # One unit for all components, since they share a kernel and its scale.
         self.unit = float(parts.scores.std())

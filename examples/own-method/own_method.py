@@ -9,7 +9,6 @@ from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
-from gsparc.models.target_rows import to_real
 
 
 class NearestK(Interpolator):
@@ -25,7 +24,7 @@ class NearestK(Interpolator):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """From places (n, 3) [m] and targets (n, ...); returns remarks, a line each."""
         self.places = torch.from_numpy(positions)
-        self.rows = torch.from_numpy(to_real(targets, self.kind))  # (n, D) float32; powers in decibels
+        self.rows = torch.from_numpy(self.target.to_real(targets))  # (n, D) float32; powers in decibels
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:

@@ -185,11 +185,6 @@ class Blended(View):
         return Prediction(mean, result.variance, result.unknown)
 
 
-def without_variance(process: Method, settings: Settings | None = None) -> Method:
-    """Return the process without its variance, most of its cost, which the field has of its own."""
-    return with_reduction(process, {"confidence": False, **(settings or {})}, {})
-
-
 def average_with_process(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
     """Return a reduced field averaged with as many pixels of the process.
 
@@ -200,7 +195,8 @@ def average_with_process(own: Method, process: Method, blend: Callable[[Tensor, 
         process: fitted.
         blend: makes one of the field's mean and the process's.
     """
-    lean = without_variance(process, {"stride": own.stride} if isinstance(own, Interpolated) else None)
+    stride = own.stride if isinstance(own, Interpolated) else 1
+    lean = process.reduce({"confidence": False, "stride": stride}, {})
     if isinstance(own, Interpolated) and isinstance(lean, Interpolated):
         return Interpolated(Blended(own.inner, lean.inner.predict, blend), own.grid, own.stride)
     return Blended(own, lean.predict, blend)

@@ -20,7 +20,7 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.mixture.weights import to_real_entries
+from gsparc.models.stack import to_real_entries
 from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)

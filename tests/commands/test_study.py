@@ -45,8 +45,9 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
 
 def test_variants_join_the_models_settings_where_they_are_interpolations():
     """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
+    config = compose("kind=effects", config="study")
     with HYDRA():
-        configs = configs_of(compose("kind=effects", config="study"))
+        configs = configs_of(config)
     variants = {name: build(config.model) for name, config in configs.items()}
     switches = {name: method.switches for name, method in variants.items() if name != "gp"}
     assert len(switches) == 9 and all(isinstance(one, EffectSettings) for one in switches.values())

@@ -19,10 +19,10 @@ from scenes import fold_of
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, fitting, loading
+from gsparc.models import stack as stacking
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
 from gsparc.models.mixture import fit_candidates
-from gsparc.models.mixture import weights as solution_weights
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.registry import build, method_class
@@ -200,8 +200,8 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
 
 @pytest.mark.slow
 def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
-    equal = lambda found, *unused: (1 / len(found),) * len(found)  # noqa: E731
-    monkeypatch.setattr(solution_weights, "stacking_weights", equal)
+    equal = lambda gram, *unused: np.full(gram.shape[1], 1 / gram.shape[1])  # noqa: E731
+    monkeypatch.setattr(stacking, "choose_weights", equal)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")

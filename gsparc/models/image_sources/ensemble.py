@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 
 IN_VAIN = 0.9  # of the power left out: two such searches, and no others begin
 QUADRATURE = 0.4  # initial `SourceScene.quadrature`
-SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
 Look = Callable[[Rows, SourceScene], None]  # of a search, with phases

@@ -36,9 +36,11 @@ from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
+from gsparc.models.stack import weights_of_fits
 from gsparc.physics.mirror_planes import hesse_form, image_rotations
 from gsparc.physics.row_factors import Freedom, align_factors
 from gsparc.physics.waves import point_wave, wave_over_band
+from gsparc.processes.averages import mixture_moments
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.race import Race
@@ -145,8 +147,7 @@ class ImageSourceGP(SourcesInFrame):
     def _set_members(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights (M,) float32 of sum 1."""
         self._set_posteriors(rows, [member.scene for member in members])
-        error = torch.tensor([member.left_out for member in members])
-        self.weights = torch.softmax(-ensemble.SHARPNESS * error.log(), 0)
+        self.weights = weights_of_fits(torch.tensor([member.left_out for member in members]))
         return self
 
     def _describe_search(self, members: list[Member]) -> list[str]:
@@ -267,10 +268,8 @@ class ImageSourceGP(SourcesInFrame):
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""
         stack, variance, prior = (self.query.in_float64 if float64 else self.query).predict(places, tones)
-        weight = self.weights[:, None, None, None]
-        mean = (weight * stack).sum(0)  # of (members, B E, R, K)
-        spread = (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        return Moments(mean, variance + spread, prior)
+        parts = [(share, one, variance) for share, one in zip(self.weights.tolist(), stack, strict=True)]
+        return Moments(*mixture_moments(parts), prior)
 
     def _normalised_paths(self, places: Tensor) -> SourcePaths:
         """See `SourcesInFrame`."""

@@ -30,9 +30,9 @@ from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, Query
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
-from gsparc.models.mixture.weights import explained_variance, in_error_unit
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
+from gsparc.models.stack import explained_variance, stack
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
@@ -157,10 +157,12 @@ class Mixture(LearnsTogether, ClosedForm):
         found, reports, read = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, watch, cut
         )
-        chosen = fit_candidates.weigh_candidates(found, data, fold, cut)
+        # A search that went on has errors of its own: here a mixture need not be surely better, too.
+        sure = 0.0 if set(found).intersection(fit_candidates.SEARCHES) else 1.0
+        chosen = stack(found, data, fold.val, cut, sure)
         heeded.count_reads(*(path for name in chosen for path in read[name]))
-        members, weights = zip(*chosen.values(), strict=True)
-        self.members, self.weights, self.started = list(members), tuple(weights), "+".join(chosen)
+        self.members, self.weights = [found[name] for name in chosen], tuple(chosen.values())
+        self.started = "+".join(chosen)
         self.site, self.init_s = data.site, watch.seconds
         self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
@@ -184,7 +186,7 @@ class Mixture(LearnsTogether, ClosedForm):
         batch = data.batch(fold.val)
         result = self.predict(batch).explained
         assert result is not None
-        own, target = (in_error_unit(one, data.site) for one in (result, batch.target))
+        own, target = (data.site.target.in_error_unit(one) for one in (result, batch.target))
         return explained_variance(own, target, data.site.kind != "csi")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -262,8 +264,7 @@ class Mixture(LearnsTogether, ClosedForm):
 
     def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""
-        for weight, one in zip(self.weights, self.members, strict=True):
-            yield from ((weight * more, part) for more, part in one.weighted_members())
+        yield from zip(self.weights, self.members, strict=True)
 
     @property
     def label(self) -> str:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gsparc.models.powers.groups import SPREAD, number_squares, split_groups
 from gsparc.models.powers.waves import FLOOR, PlaneWaveBasis, field_db, fit_wave_weights, make_basis
+from gsparc.models.stack import best_weights
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
 from gsparc.processes.nearest import condition_on_nearest
@@ -31,7 +32,6 @@ from gsparc.processes.trend import TINY_M
 
 FOLDS = 5  # of squares; each solution is blind to one
 SIDES = 8  # squares along the longer side
-BEFORE = 0.5  # mean of a prior on the share of the solutions
 TRIED = 10  # solutions after which it must pay
 PROBES = 10  # one row of so many is kept from all solutions
 MOST_ROWS = FACTORED // 2  # of one least-squares problem per solution
@@ -236,33 +236,21 @@ def _fit_blend(
 ) -> tuple[Blend, float]:  # fmt: skip
     """How to share predictions with a process of errors (n,), and what that gains at places left out."""
     probes = fold < 0
-    # From the process's prediction, measured plus error, to that of the solutions.
-    towards = _held_out_mean(powers, fold, blind) - rows.decibels - error
-    excess = _excess_variance(powers, fold, blind)
-    shares, left = [], []
+    errors = np.stack([error, _held_out_mean(powers, fold, blind) - rows.decibels], 1)
+    gram = errors[:, :, None] * errors[:, None]
+    # Less what would go if all solutions answered, as they do at new places.
+    gram[:, 1, 1] -= _excess_variance(powers, fold, blind)
+    shares, left, gains = [], [], []
     # Rows of a square left out err together and count as one; probes among rows err alone.
     for chosen, alike in ((probes, 1.0), (~probes, len(group) / len(np.unique(group)))):
-        share = _best_share(error[chosen], towards[chosen], excess[chosen], alike)
-        # Less what would go if all solutions answered, as they do at new places.
-        both = float((((error + share * towards) ** 2 - share**2 * excess)[chosen]).mean())
-        shares.append(share)
-        left.append(both / max(float((error[chosen] ** 2).mean()), TINY))
-    apart = ~probes
-    squares = (error + shares[1] * towards) ** 2 - shares[1] ** 2 * excess
-    gain = float((error**2 - squares)[apart].mean())
-    middle = (float(np.median(distance[probes])), float(np.median(distance[apart])))
-    return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gain
-
-
-def _best_share(error: np.ndarray, difference: np.ndarray, excess: np.ndarray, rows_per_unit: float) -> float:
-    """Share of the way from a process with errors (n,) to solutions: least squares with a prior, in [0, 1].
-
-    Count `rows_per_unit` rows as one.
-    """
-    noise = rows_per_unit * max(float((error**2).mean()), TINY)
-    square = max(float(difference @ difference - excess.sum()), 0.0)
-    # Least of |e + s t|^2 / noise + (s - BEFORE)^2 / SPREAD^2 over the share s.
-    certain = 1 / SPREAD**2
-    return float(
-        np.clip((-(difference @ error) / noise + BEFORE * certain) / (square / noise + certain), 0.0, 1.0)
-    )
+        mean = gram[chosen].mean(0)
+        plain = max(float(mean[0, 0]), TINY)
+        # A prior of equal shares, of a deviation of `SPREAD`, is an error that each has of its own.
+        own = plain * alike / chosen.sum() / (2 * SPREAD**2) * np.eye(2)
+        weights = best_weights(mean + own)
+        both = float(weights @ mean @ weights)
+        shares.append(float(weights[1]))
+        left.append(both / plain)
+        gains.append(plain - both)
+    middle = (float(np.median(distance[probes])), float(np.median(distance[~probes])))
+    return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gains[1]

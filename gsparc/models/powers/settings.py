@@ -18,9 +18,9 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
-from gsparc.models.mixture.weights import UNUSED, best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
+from gsparc.models.stack import best_weights
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
 from gsparc.processes.kernel import EndShadowing, ExponentialShadowing, Kernel, Shadowing, distances
@@ -146,7 +146,6 @@ def mix_candidates(
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
-    share = np.where(share < UNUSED, 0.0, share) / share[share >= UNUSED].sum()
     kept = [(float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
     notes = dict.fromkeys(note for _, one in kept for note in one.notes)

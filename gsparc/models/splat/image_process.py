@@ -18,15 +18,26 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.method import Method, Prediction
-from gsparc.models.mixture import fit_candidates
-from gsparc.models.reduced import Settings, average_with_process, without_variance
+from gsparc.models.reduced import Settings, average_with_process
 from gsparc.models.splat.auto_settings import resolve_auto
 from gsparc.models.splat.method import LearnedField
+from gsparc.models.stack import (
+    LEAST_HELD,
+    choose_weights,
+    error_products,
+    explained_variance,
+    relative_to_row,
+)
 from gsparc.models.terms import array_obstacle
+from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 
 log = logging.getLogger(__name__)
+# A mean with the process takes several times as long: it must gain 2 standard errors, and .1 dB.
+SURE, LEAST_GAIN = 2.0, 0.1 / RELATIVE_DB
+FEW_ROWS = 40  # fewer do not tell a weight from a half, where the two differ by less than twice the error
+MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 BEYOND = 1e-3  # of the variance of targets, that an averaged process leaves out
 
 
@@ -45,7 +56,6 @@ class ImageProcess(LearnedField):
         self.plain = plain
         self.explained: float | None = None
         self._average: tuple[GaussianProcess, float] | None = None  # a process and its weight in the mean
-        self._average_mean: Method | None = None  # that process without its variance, made when first asked
 
     @property
     def effects(self) -> str:  # type: ignore[override]
@@ -59,7 +69,7 @@ class ImageProcess(LearnedField):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
-        self._average, self._average_mean = None, None
+        self._average = None
         with heeded.set_apart():
             array = self.settings.response.array
             why = array_obstacle(data.site, "rx", "the receiver moves") if array else None
@@ -100,10 +110,33 @@ class ImageProcess(LearnedField):
         return self._average is not None and self._average[1] >= 1
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
-        if self.plain:
-            left = self._left_out, self._apart
-            self._average, explained = fit_candidates.weigh_process(self, data, fold, *left)
-            self.explained = self.explained if explained is None else explained
+        """Weigh a process of the same rows by validation rows and, of spectra, training rows left out."""
+        if not self.plain:
+            return
+        process, left = GaussianProcess(), self._left_out  # a dozen validation rows decide by chance
+        process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
+        if not self.count_components() or (left is None and len(fold.val) < LEAST_HELD):
+            few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
+            log.info("%s: a Gaussian process alone", few if self.count_components() else "no Gaussians")
+            self._average = process, 1.0
+            return
+        held, val = [], fold.val[:: -(-len(fold.val) // MOST_HELD) or 1]
+        if len(val):
+            batch = data.batch(val)
+            answers = (self.predict(batch).mean, process.predict(batch).mean, batch.target)
+            held.append([data.site.target.in_error_unit(one).detach() for one in answers])
+        if left is not None:
+            held.append([torch.from_numpy(one) for one in left.beside_process(self._apart)])
+        own, _, target = held[0]
+        self.explained = explained_variance(own, target, data.site.kind != "csi")
+        gram = np.concatenate([error_products(both, target) for *both, target in held])
+        gram = relative_to_row(gram) if data.site.kind == "spectrum" else gram
+        weight = float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
+        log.info(
+            "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
+            len(val), 0 if left is None else len(left.centres), weight,
+        )  # fmt: skip
+        self._average = (process, weight) if weight else None
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -114,13 +147,8 @@ class ImageProcess(LearnedField):
         own = super().predict(query)
         if self._average is None:
             return own
-        if self._average_mean is None:
-            self._average_mean = without_variance(self._average[0])
-        method, weight = self._average
-        # The process without its variance is float32 and has no slopes, which float64 is asked for.
-        exact = query.tx.dtype == torch.float64
-        other = method.mean_at(query) if exact else self._average_mean.predict(query).mean
-        return replace(own, mean=self.fitted_site.target.blend(own.mean, other, weight))
+        process, weight = self._average  # its variance is most of its cost, and the field has one of its own
+        return replace(own, mean=self.fitted_site.target.blend(own.mean, process.mean_at(query), weight))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -178,7 +206,7 @@ class ImageProcess(LearnedField):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self._average, self._average_mean = None, None
+        self._average = None
         response = replace(self.settings.response, array=bool(state["array"]))
         self.settings = replace(self.settings, response=response)
         super().restore(site, state["inner"])

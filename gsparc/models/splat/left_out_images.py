@@ -49,10 +49,15 @@ class LeftOut(Stored):
         distance = cdist(self.positions, self.positions)
         return mean + means_and_variances(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
 
-    def predictions_and_targets(self, gap: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return predictions and targets (n, P) at one gap, of the samples that anything is left for."""
-        seen = ~np.isnan(predicted[gap]).any(1)
-        return predicted[gap][seen], self.images[self.centres][seen]
+    def beside_process(self, distance: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return predictions, those of a process, and targets (n, P) of samples that anything is left for.
+
+        At the gap of `nearest_gap`.
+        """
+        gap = self.nearest_gap(distance)
+        both = self.predicted[gap], self.predict_by_process()[gap]
+        seen = ~np.isnan(both).any((0, 2))
+        return both[0][seen], both[1][seen], self.images[self.centres][seen]
 
     def nearest_gap(self, distance: float | None) -> int:
         """Return the gap whose held-out samples are most nearly `distance` [m] from the rest, by medians.

@@ -100,7 +100,7 @@ def test_a_reflection_that_two_solutions_found_was_two_paths(small):
     """Before, paths were those of the heaviest solution."""
     _, data, fold, method, _ = small
     other = copy.deepcopy(method)
-    other.weights = 0.5 * other.weights
+    other.frame = replace(other.frame, scale=0.5 * other.frame.scale)
     model = ImageSources()
     model.site, model.members, model.weights = data.site, [method, other], (0.6, 0.4)
     predictor, world = Predictor(model, data.site), data.moving[fold.test[:5]] + data.site.origin

@@ -1,4 +1,4 @@
-"""The plain process as one of the solutions that are weigh_candidates."""
+"""The plain process as one of the solutions that are weighed."""
 
 import numpy as np
 import torch
@@ -9,12 +9,12 @@ from gsparc.data.inner_folds import cut_folds
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.mixture.fit_candidates import weigh_candidates
 from gsparc.models.mixture.methods import Channels
+from gsparc.models.stack import stack
 
 
 def test_sources_of_few_rows_lost_a_decibel_to_the_process():
-    """Bearings of a moving array were weigh_candidates against nothing."""
+    """Bearings of a moving array were weighed against nothing."""
     data = room_of_spectra()
     few = np.arange(0, 24)
     good, _ = fitted_to(GaussianProcess(), data, few)
@@ -22,7 +22,7 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     spoilt.mean = spoilt.mean + 0.3
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
     cut = cut_folds(data, fold, None, 3, 0)
-    assert [*weigh_candidates({"bearings": spoilt, "process": good}, data, fold, cut)] == ["process"]
+    assert stack({"bearings": spoilt, "process": good}, data, fold.val, cut) == {"process": 1.0}
 
 
 class Said(ClosedForm):

@@ -180,7 +180,7 @@ def own_copy(case):
 @pytest.mark.parametrize("stride", [1, 2])
 def test_a_process_beside_spares_pixels_with_the_field(field, process, stride):
     both = own_copy(field)
-    both.method._average, both.method._average_mean = (process.method, 0.5), None
+    both.method._average = process.method, 0.5
     spared = process.answer(process.less(confidence=False, stride=stride)).mean
     wanted = 0.5 * field.answer(field.less(stride=stride)).mean + 0.5 * spared
     found = both.answer(both.less(stride=stride, confidence=True)).mean

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,13 +149,10 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
         ValueError: channels that are not made of sources, or spectra that are not rendered.
     """
     method, site = predictor.method, predictor.site
-    if isinstance(method, ImageProcess) and method._average is not None:
-        own_form = _rendered(method, site)  # without the process that it is averaged with
-        if own_form is not None:
-            alone = copy.copy(method)
-            # A copy: the model of the caller keeps the process that it is averaged with.
-            alone._average = None
-            return replace(own_form, predictor=Predictor(alone, site))
+    alone = method.without_process()
+    own_form = _rendered(alone, site) if isinstance(alone, LearnedField) else None
+    if alone is not None and own_form is not None:
+        return replace(own_form, predictor=Predictor(alone, site))
     if site.kind == "spectrum":
         raise ValueError(f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)")
     sources = _sources_of(method) if site.kind == "csi" else None

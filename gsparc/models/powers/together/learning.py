@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.mixture.weights import mean_and_error
 from gsparc.models.powers.settings import EVIDENCE_LOOKS, fit_kernel_by_evidence
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
+from gsparc.models.stack import mean_and_error
 from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.places import extra_columns, moving_end

@@ -1,18 +1,20 @@
+"""Weights of several predictors, by rows that none of them learned from."""
+
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from gsparc.models.mixture.weights import (
-    HeldOutPair,
+from gsparc.models.splat.image_process import FEW_ROWS, LEAST_GAIN, SURE
+from gsparc.models.stack import (
     best_weights,
     choose_weights,
+    error_products,
     explained_variance,
     mean_and_error,
     mixture_errors,
-    share_of_second,
-    stacking_weights,
+    relative_to_row,
 )
 
 EACH = np.arange(50)  # every row is a unit
@@ -23,33 +25,40 @@ def noisy(share: float, seed: int) -> torch.Tensor:
     return TARGET + share * torch.from_numpy(np.random.default_rng(seed).standard_normal(TARGET.shape))
 
 
+def weigh(predicted: list[torch.Tensor], target: torch.Tensor, unit: np.ndarray, deviations: float = 1.0):
+    """Weights, one a prediction."""
+    return tuple(choose_weights(error_products(predicted, target), unit, deviations))
+
+
+def share(*pairs: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Weight of the second of two predictions of spectra, where its mean with the first costs more."""
+    grams = [error_products([*map(torch.from_numpy, both)], torch.from_numpy(last)) for *both, last in pairs]
+    gram = relative_to_row(np.concatenate(grams))
+    return float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
+
+
 def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
-    few = stacking_weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
-    assert (
-        few == (1.0, 0.0)
-        and 0 < stacking_weights([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
-    )
+    few = weigh([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
+    assert few == (1.0, 0.0) and 0 < weigh([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
 
 
 def test_rows_of_one_unit_do_not_make_a_mixture():
     """One square of floor: whichever mixture fits it says nothing about the next."""
-    assert sorted(stacking_weights([noisy(0.3, 1), noisy(0.31, 2)], TARGET, 0 * EACH)) == [0, 1]
+    assert sorted(weigh([noisy(0.3, 1), noisy(0.31, 2)], TARGET, 0 * EACH)) == [0, 1]
 
 
 def test_complex_predictions_are_weighed_as_they_are_summed():
     turned = torch.complex(noisy(0.3, 1), noisy(0.3, 2))
     other = torch.complex(noisy(0.3, 3), noisy(0.3, 4))
     target = torch.complex(TARGET, TARGET)
-    found = stacking_weights([turned, other], target, EACH)
+    found = weigh([turned, other], target, EACH)
     both = found[0] * turned + found[1] * other
     told = [explained_variance(one, target, False) for one in (both, turned, other)]
     assert told[0] > max(told[1:])
 
 
 def test_silent_targets_still_give_weights():
-    assert sum(
-        stacking_weights([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)
-    ) == pytest.approx(1)
+    assert sum(weigh([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)) == pytest.approx(1)
 
 
 def test_what_is_explained_is_about_the_mean_of_powers_and_about_zero_of_channels():
@@ -58,34 +67,34 @@ def test_what_is_explained_is_about_the_mean_of_powers_and_about_zero_of_channel
     assert explained_variance(torch.zeros_like(TARGET), TARGET, False) == 0
 
 
-def rows(own: float, plain: float, count: int, seed: int = 0) -> HeldOutPair:
+def rows(own: float, plain: float, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     draws = np.random.default_rng(seed)
     target = draws.uniform(0, 1, (count, 40))
     noise = draws.standard_normal((2, count, 40))
-    return HeldOutPair(target + own * noise[0], target + plain * noise[1], target)
+    return (target + own * noise[0], target + plain * noise[1], target)
 
 
 def test_the_second_has_the_weight_of_largest_psnr():
-    assert share_of_second([rows(0.1, 0.1, 200)]) == pytest.approx(0.5, abs=0.05)
-    assert share_of_second([rows(0.01, 0.3, 200)]) == 0.0
-    assert share_of_second([rows(0.3, 0.01, 200)]) == 1.0
+    assert share(rows(0.1, 0.1, 200)) == pytest.approx(0.5, abs=0.05)
+    assert share(rows(0.01, 0.3, 200)) == 0.0
+    assert share(rows(0.3, 0.01, 200)) == 1.0
     # A query that takes longer is worth little, a loss to the process beside it is not.
-    assert share_of_second([rows(0.102, 0.1, 20_000)]) > 0
+    assert share(rows(0.102, 0.1, 20_000)) > 0
 
 
 def test_an_average_of_a_gain_that_rows_do_not_tell_from_none_is_not_made():
     """On the RFID spectra .04 dB were bought with three times the time of a query."""
     rng = np.random.default_rng(1)
     target, noise = rng.uniform(0, 1, (60, 40)), 0.1 * rng.standard_normal((60, 40))
-    opposite = np.where(np.arange(60) < 3, -1.0, 1.1)[:, None]  # few rows make all of the gain
-    pair = HeldOutPair(target + noise, target + opposite * noise, target)
-    assert share_of_second([pair]) == 0.0
-    assert 0 < share_of_second([pair] * 30) < 1  # as if rows were so many
+    opposite = np.where(np.arange(60) < 6, -1.0, 1.05)[:, None]  # few rows make all of the gain
+    pair = (target + noise, target + opposite * noise, target)
+    assert share(pair) == 0.0
+    assert 0 < share(*[pair] * 30) < 1  # as if rows were so many
 
 
 def test_every_row_counts_once_whichever_part_it_is_of():
     few, many = rows(0.3, 0.05, 3, 1), rows(0.05, 0.3, 300, 2)
-    assert share_of_second([few, many]) < 0.1 < share_of_second([few])
+    assert share(few, many) < 0.1 < share(few)
 
 
 def test_few_rows_that_do_not_tell_two_apart_weigh_them_alike():
@@ -93,9 +102,9 @@ def test_few_rows_that_do_not_tell_two_apart_weigh_them_alike():
     rng = np.random.default_rng(0)
     target = rng.normal(size=(16, 50))
     alike = [target + rng.normal(size=(16, 50)) for _ in range(2)]
-    assert share_of_second([HeldOutPair(*alike, target)]) == 0.5
-    assert share_of_second([HeldOutPair(target + 0.01, alike[1], target)]) == 0.0
-    assert share_of_second([HeldOutPair(alike[0], target + 0.01, target)]) == 1.0
+    assert share((*alike, target)) == 0.5
+    assert share((target + 0.01, alike[1], target)) == 0.0
+    assert share((alike[0], target + 0.01, target)) == 1.0
 
 
 def gram_of(errors: np.ndarray) -> np.ndarray:
