@@ -12,7 +12,8 @@ import numpy as np
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.schema import Measurements, Site
-from gsparc.models.carriers.method import CarrierField, carriers_obstacle
+from gsparc.models.carriers.array import carriers_obstacle
+from gsparc.models.carriers.method import CarrierField
 from gsparc.models.method import Method, import_path
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
