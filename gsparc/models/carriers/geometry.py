@@ -26,6 +26,7 @@ from gsparc.processes.stored import Stored
 PLANES = 8  # at most
 REACH, STEP = 3.0, 0.05  # beyond the box of both ends, and between planes that are tried [m]
 LEAST_GAIN = 0.003  # of the energy: a plane that explains less is none
+LEAST_ALONE = 0.02  # of an image's energy
 RIDGE = 0.02  # of the powers' solve
 NEIGHBOURS, LEAST_M, COMMON = 8, 0.3, 0.15  # shares at a place: of the nearest, by distance, and of all
 DRAWS = 24  # of the phases between paths
@@ -83,13 +84,15 @@ def find_paths(
 
     target, tried = seen.double() @ metric, _planes_to_try(torch.cat([places, receiver[None]]))
     images = looks(ways(places, tried, receiver, rotation)[0])[:, 1:]
-    scale = images.square().sum(2)
     planes, energy = NO_PLANES, float(target.square().sum())
     known = looks(ways(places, planes, receiver, rotation)[0])
     powers, left = _solve(known, target)
     while len(planes) < PLANES:
-        gain = ((images * left[:, None]).sum(2).clamp_min(0).square() / scale).sum(0)
-        best = int(gain.argmax())
+        # Of an image only what known paths cannot imitate tells: orthogonal least squares.
+        basis = torch.linalg.qr(known.mT)[0]
+        alone = images - images @ basis @ basis.mT
+        scale = alone.square().sum(2).clamp_min(LEAST_ALONE * images.square().sum(2))
+        best = int(((alone * left[:, None]).sum(2).clamp_min(0).square() / scale).sum(0).argmax())
         more = torch.cat([known, images[:, best : best + 1]], 1)
         solved, rest = _solve(more, target)
         if float((left.square().sum() - rest.square().sum()) / energy) < LEAST_GAIN:
