@@ -35,6 +35,7 @@ def check(
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
+    from gsparc.data.checks.array_layout import carrier_warnings, layout_warnings
     from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
     from gsparc.data.checks.outliers import outlier_warnings
@@ -55,6 +56,7 @@ def check(
     warnings = [f"units? {hint}" for hint in unit_warnings(reading.data)] + outlier_warnings(reading.data)
     warnings += [note for note in reading.notes if isinstance(note, Caution)]
     warnings += convention_warnings(reading.data)
+    warnings += layout_warnings(reading.data) + carrier_warnings(reading.data)
     warnings += [] if levels is None else sanity_warnings(levels, steps)
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]

@@ -112,6 +112,7 @@ def centre_positions(data: Measurements) -> Measurements:
         "target_scale": np.array(site.target_scale),
         "carrier_hz": None if site.carrier_hz is None else np.array(site.carrier_hz),
         "carriers_hz": None if stations is None else stations.carrier_hz,
+        "arrays": None if stations is None else stations.array,
     }  # fmt: skip
     still = None
     if static is not None and (stations is None or len(stations) == 1):

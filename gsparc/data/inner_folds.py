@@ -17,7 +17,7 @@ from gsparc.data import spacing
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements, TrainTest
 from gsparc.data.spacing import neighbour_distance
-from gsparc.data.splits import CORNERS, AnySplit, FileSettings, Fold, SplitSettings, make_split
+from gsparc.data.splits import CORNERS, WHOLE, AnySplit, FileSettings, Fold, SplitSettings, make_split
 
 Draws = np.random.Generator
 FARTHER = 2.0  # times the usual distance to the nearest training row, from which validation rows are apart
@@ -83,7 +83,7 @@ def inner_folds(
     settings = _inside(positions, fold, split)
     rng = np.random.default_rng([seed, 4])
     cut = None
-    if settings.name in ("stations", "runs"):
+    if settings.name in WHOLE:
         if station is not None:
             unit = np.unique(station[known], return_inverse=True)[1].reshape(-1)
             cut = _stations(unit, settings, count, rng)

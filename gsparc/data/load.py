@@ -104,7 +104,8 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
         return answerable(remove_rows(split, absent) if len(absent) else split, data)
-    unit = data.run if settings.name == "runs" else data.station
+    carriers = None if data.carrier_hz is None else np.unique(data.carrier_hz, return_inverse=True)[1]
+    unit = {"runs": data.run, "carriers": carriers}.get(settings.name, data.station)
     place = spacing.group_visits(data.moving, data.place)
     if place is not None and place is not data.place:
         text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"

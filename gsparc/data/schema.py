@@ -50,6 +50,7 @@ class Stations:
             [deg], and power [dB], NaN where unknown; None where nothing of it is known.
         label: (T,) what a list of cells calls them, to be shown; None where that is `name`. It is no fact of
             the measurements.
+        array: (T, M, 3) [m] receive elements where each carrier has an array of its own; None: the site's.
     """
 
     position: np.ndarray
@@ -58,6 +59,7 @@ class Stations:
     carrier_hz: np.ndarray | None = None
     sector: np.ndarray | None = None
     label: Sequence[str] | None = field(default=None, compare=False)
+    array: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -74,11 +76,11 @@ class Stations:
 
     def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
-        optional = (self.rotation, self.carrier_hz, self.sector)
-        rotation, carrier, sector = (None if one is None else one[numbers] for one in optional)
+        optional = (self.rotation, self.carrier_hz, self.sector, self.array)
+        rotation, carrier, sector, array = (None if one is None else one[numbers] for one in optional)
         called = tuple(names or (self.name[i] for i in numbers))
         label = None if self.label is None else tuple(self.label[i] for i in numbers)
-        return Stations(self.position[numbers], called, rotation, carrier, sector, label)
+        return Stations(self.position[numbers], called, rotation, carrier, sector, label, array)
 
 
 @dataclass(frozen=True)
@@ -325,6 +327,12 @@ class Measurements:
         if self.site.static_end is None:
             return np.hstack([self.tx, self.rx_position])
         return self.tx if self.site.moving_end == "tx" else self.rx_position
+
+    @property
+    def carrier_hz(self) -> np.ndarray | None:
+        """Carrier (S,) [Hz] of each row where stations are told apart by theirs, else None."""
+        carriers = None if self.site.stations is None else self.site.stations.carrier_hz
+        return None if carriers is None or self.station is None else carriers[self.station]
 
     def censored_side(self, rows: np.ndarray) -> np.ndarray:
         """Return `censored` of rows (n,), (n,) int8."""

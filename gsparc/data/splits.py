@@ -15,7 +15,8 @@ from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, 
 from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent, thin_rows
 
-NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations", "runs", "none")
+WHOLE = ("stations", "carriers", "runs")  # of which whole ones are held out
+NAMES = ("random", "grouped", "corner", "blocks", "sparse", *WHOLE, "none")
 CORNERS = ("--", "-+", "+-", "++")
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
 
@@ -95,7 +96,8 @@ class SplitSettings(Checked):
     gsparc.data.limits.SettingError: test_fraction=1.5: a number above 0 and below 1 is needed
 
     Attributes:
-        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations` or `runs`; `none` tests no row.
+        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations`, `carriers` or `runs`; `none`
+            tests no row.
         seed: of every random choice below.
         val_fraction: share of each fold's training rows kept for validation.
         test_fraction: share of the rows that `random` (without files) and `corner` hold out, and of the runs
@@ -111,8 +113,8 @@ class SplitSettings(Checked):
         train_count: thin each fold's training rows to this many (validation included); None keeps all.
         thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
         spacing_m: keep only training rows at least this far apart, before the other two [m]; None keeps all.
-        leave_out: rows that are neither learned from nor tested on, or `outliers`; of `stations`, how many
-            are held out together, drawn by seed (0: each one in its turn).
+        leave_out: rows that are neither learned from nor tested on, or `outliers`; of `stations` and
+            `carriers`, how many are held out together, drawn by seed (0: each one in its turn).
     """
 
     name: str = setting("random", KNOWN)
@@ -134,8 +136,8 @@ class SplitSettings(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # `stations` takes a number of stations there; everything else a list of rows.
-        if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
+        # These take a number of stations, or carriers, there; everything else a list of rows.
+        if self.name not in ("stations", "carriers") or type(self.leave_out) is not int or self.leave_out < 0:
             ROWS.check("leave_out", self.leave_out)
 
     def held_out_count(self, count: int) -> int:
@@ -191,7 +193,7 @@ def make_split(
         release_split: (train, test) rows that the release names; used by `random` only.
         outliers: (n,) rows that `leave_out=outliers` means.
         place: (S,) int64; rows of one place stay together. None where every row is one.
-        station: (S,) int64, of which station, for `runs` of which run, a row is; needed by these two.
+        station: (S,) int64, of which station, carrier or run a row is; needed by the splits of these names.
         order: (S,) rows as `none` draws those that validate; None: by their numbers.
 
     Raises:
@@ -204,7 +206,7 @@ def make_split(
     named = None if settings.name != "random" or release_split is None or settings.redraw else release_split
     # Of the rows that stand for their places, and the place of each row.
     first = which = np.arange(len(rows_left))
-    if settings.name in ("stations", "runs"):
+    if settings.name in WHOLE:
         local_folds = _whole(None if station is None else station[rows_left], settings)
     else:
         if named is not None:
@@ -321,7 +323,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     """Folds that each hold out a station, or one that holds out `leave_out` of them, or a share of the runs.
 
     Args:
-        unit: (S,) int64 number of each row's station, or run.
+        unit: (S,) int64 number of each row's station, carrier or run.
     """
     name = settings.name
     if unit is None:
@@ -329,7 +331,7 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     unit = np.unique(unit, return_inverse=True)[1].reshape(-1)
     count = int(unit.max()) + 1
     together = settings.held_out_count(count)
-    least = 2 if name == "stations" else 1
+    least = 1 if name == "runs" else 2
     if count - max(together, 1) < least:
         remain = "two at least must remain" if least == 2 else "one must remain"
         raise DataError(f"split={name}: {count} {name}; {remain} to learn from and to choose on")

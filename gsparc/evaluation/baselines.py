@@ -14,6 +14,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score_methods
+from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import stations_of_fold
 from gsparc.models.registry import all_methods, method_class
@@ -23,7 +24,8 @@ log = logging.getLogger(__name__)
 
 # What a reader could have without gsparc, in the order of tables. `zero` has NMSE 1 by definition: what is
 # worse is worse than saying nothing.
-PLAIN = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp", "ridge")
+PLAIN = ("zero", "mean", "nearest", "idw", "other_carriers", "direct_beam", "distance_law", "kriging", "gp",
+         "complex_gp", "ridge")  # fmt: skip
 
 
 def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
@@ -31,6 +33,7 @@ def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     powers, channels = data.site.kind == "rssi", data.site.kind == "csi"
     # Both fit decibels over distance, which only powers have; a linear map is of a band from the other.
     serves = {"distance_law": powers, "kriging": powers, "ridge": data.uplink is not None}
+    serves["other_carriers"] = serves["direct_beam"] = carriers_obstacle(data.site) is None
     serves["complex_gp"] = channels and _have_carriers(data) and _know_all_stations(data, split)
     return tuple(name for name in PLAIN if serves.get(name, True))
 

@@ -11,7 +11,9 @@ import numpy as np
 
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Site
+from gsparc.models.carriers.array import carriers_obstacle
+from gsparc.models.carriers.method import CarrierField
 from gsparc.models.method import Method, import_path
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
@@ -53,6 +55,7 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
         table: tuple[tuple[bool, type[Method]], ...] = (
             (data.uplink is not None, UplinkField),
             (site.phase_reference == "neighbours", Channels),
+            (carriers_obstacle(site) is None, CarrierField),
             (terms.power, Powers),
             (terms.moving_array and placed, Bearings),
             (terms.phase and placed, ImageSources),
@@ -69,7 +72,7 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
             why = "spectra of a moving array hide nothing" if hides else why
             raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
         reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
-        if kind is UplinkField or site.phase_reference == "neighbours":
+        if kind in (UplinkField, CarrierField) or site.phase_reference == "neighbours":
             options = []  # whatever is said, it is one method
         elif kind is Channels:
             why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
@@ -116,6 +119,10 @@ class Gsparc(LearnsTogether):
         self.switches, self.position_std, self._field = effects, position_std, field
         self.own_terms = to_terms(terms)
 
+    def learns_jointly(self, site: Site) -> bool:
+        """See `LearnsTogether`; carriers of spectra share paths, too."""
+        return super().learns_jointly(site) or carriers_obstacle(site) is None
+
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """See `MethodFactory`."""
         method = choose(data, self, quiet=True)
@@ -134,8 +141,9 @@ class Gsparc(LearnsTogether):
 
     def create_as(self, target: str) -> Method:
         """See `MethodFactory`; under its own name."""
-        if target == import_path(UplinkField):
-            return UplinkField()
+        alike = {import_path(kind): kind for kind in (UplinkField, CarrierField)}
+        if target in alike:
+            return alike[target]()
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count

@@ -87,9 +87,10 @@ def station_site(site: Site, number: int) -> Site:
     carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
     rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
     place = stations.position[number]
+    array = site.array if stations.array is None else stations.array[number]
     return replace(
         site, name=f"{site.name}, station {stations.name[number]}", stations=None, carrier_hz=carrier,
-        static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
+        array=array, static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
     )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ class SpectrumLags:
     Attributes:
         count: real numbers per spectrum.
         pixels: basis of all spectra.
+        gram: (count, count) float64, inner products of the lags' images.
     """
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
@@ -48,9 +49,9 @@ class SpectrumLags:
         self.pixels = fit_separable(basis.split(BLOCK), LOST)  # in float64
         self._basis = self.pixels.project(basis.float())
         exact = self._basis.double()  # in float32, rounding would be most of the weakest lags
-        gram = exact @ exact.T
-        gram.diagonal().add_(RIDGE * gram.diagonal().mean())
-        self._inverse = torch.linalg.solve(gram, exact).T
+        self.gram = exact @ exact.T
+        self.gram.diagonal().add_(RIDGE * self.gram.diagonal().mean())
+        self._inverse = torch.linalg.solve(self.gram, exact).T
 
     @property
     def image_shape(self) -> tuple[int, int]:
@@ -69,3 +70,14 @@ class SpectrumLags:
     def spectrum(self, lags: Tensor, pixels: Separable | None = None) -> Tensor:
         """Return power (n, H, W), at least 0, of lags (n, count); on `pixels`, thinned ones, if given."""
         return (pixels or self.pixels).images(lags @ self._basis).clamp_min(0)
+
+
+def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
+    """Return 2 if images (n, H, W) are amplitudes, 1 if powers, and the energy share outside the lags."""
+    residual = {}
+    for exponent in (2, 1):
+        power = images**exponent
+        again = space.spectrum(space.to_lags(power))
+        residual[exponent] = float((again - power).square().sum() / power.square().sum())
+    exponent = min(residual, key=lambda e: residual[e])
+    return exponent, residual[exponent]

@@ -71,6 +71,10 @@ def _carrier(site: Site) -> str:
         return ""
     if site.carrier_hz is None:
         return "unknown; give frequency_hz, and effects that need the phase become available"
+    carriers = None if site.stations is None else site.stations.carrier_hz
+    several = [] if carriers is None else [f"{hertz / 1e9:.6g}" for hertz in np.unique(carriers)]
+    if len(several) > 1:
+        return f"{list_first(several)} GHz, one for each station"
     return f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
 
 

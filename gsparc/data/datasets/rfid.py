@@ -4,6 +4,12 @@ gateway_info.yml     dataset_name, then per gateway: position [m], orientation (
 tx_pos.csv           header x,y,z; row i (from 1) belongs to spectrum/%05d.png of i [m]
 spectrum/00001.png   8-bit grey, 360 wide (azimuth, degrees) x 90 high (elevation, row 0 = 0 degrees)
 train_index.txt, test_index.txt   optional, both or none: one number per line
+freq.txt             optional: line i is the carrier of spectrum i [GHz]
+
+With freq.txt it is the layout of Wideband3DGS and XFreq-GS: each carrier is a station of its own at the
+gateway, with an array half a wavelength apart in the receiver's yz plane; row i of an image is the zenith
+angle of i degrees, and azimuths run clockwise. Their spectra say so: all but .0003 of their energy is in the
+lags of that array (elevations, or the plane xy, leave .05 at least), and direct paths appear mirrored.
 
 GSpaRC's room has the same with `rx_pos.csv`: the gateway is the transmitter that stands, the receiver moves
 and its axes are the world's. Its spectra are `00001.npy`: (90, 360) real numbers from 0 to 1, or of 8 bits.
@@ -22,12 +28,14 @@ from PIL import Image
 
 from gsparc.data.assemble import centre_positions, check_positions
 from gsparc.data.blocks import allocate
+from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_yaml
+from gsparc.data.files import read_text, read_yaml
 from gsparc.data.limits import finite_array
-from gsparc.data.own_checks import is_unit, quaternion_to_matrix
-from gsparc.data.schema import LIGHT, End, Measurements, Site, TrainTest
+from gsparc.data.links.stations import number_places
+from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
+from gsparc.data.schema import LIGHT, End, Measurements, Site, Stations, TrainTest
 from gsparc.ops import SphereGrid
 
 if TYPE_CHECKING:
@@ -80,6 +88,11 @@ def load_rfid(
     positions = _read_positions(root / f"{moving}_pos.csv", problems)
     count = None if positions is None else len(positions)
     spectra = _read_spectra(root / "spectrum", f"{moving}_pos.csv", count, problems)
+    if moving == "rx" and (root / "freq.txt").exists():
+        problems.add(
+            root / "freq.txt", "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
+        )
+    carriers = _read_carriers(root / "freq.txt", f"{moving}_pos.csv", count, problems)
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
     if listed is not None and count is not None:
@@ -103,11 +116,30 @@ def load_rfid(
     turned = info.rotation if moving == "tx" else np.eye(3)
     still, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, turned))
     tx, rx = (positions[rows], still) if moving == "tx" else (still, positions[rows])
-    return centre_positions(Measurements(
+    data = Measurements(
         site, tx, rx, rotation, spectra if listed is None else spectra[rows],
         row_names=[f"spectrum/{i + 1:05d}{suffix}" for i in rows], release_split=release_split,
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
-    ))  # fmt: skip
+    )  # fmt: skip
+    if carriers is not None:
+        half = planar_array(**{**layout, "spacing_m": 0.5} if isinstance(layout, Mapping) else {})
+        data = _at_carriers(replace(data, site=replace(site, name=info.dataset)), carriers[rows], half)
+    return centre_positions(data)
+
+
+def _at_carriers(data: Measurements, carrier_hz: np.ndarray, array: np.ndarray) -> Measurements:
+    """A station for each carrier (S,) [Hz], of an array (M, 3) in wavelengths; in our conventions."""
+    carriers, station = np.unique(carrier_hz, return_inverse=True)
+    arrays = LIGHT / carriers[:, None, None] * array[:, [2, 0, 1]]
+    places, names = (
+        np.repeat(data.rx_position[:1], len(carriers), axis=0),
+        [f"{c / 1e9:g} GHz" for c in carriers],
+    )
+    turned = np.repeat(data.rx_rotation[:1], len(carriers), axis=0)
+    stations = Stations(places, tuple(names), turned, carriers, array=arrays)
+    site = replace(data.site, stations=stations, array=arrays[0], carrier_hz=float(carriers[0]))
+    data = replace(data, site=site, station=station.reshape(-1), place=number_places(data.tx))
+    return convert_conventions(data, ("zenith", "clockwise"))
 
 
 def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, TrainTest | None]:
@@ -179,6 +211,21 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     positions = np.stack(known, axis=1)
     check_positions(problems, str(path), positions, [*sheet.rows])
     return positions
+
+
+def _read_carriers(path: Path, positions: str, count: int | None, problems: Problems) -> np.ndarray | None:
+    """Carriers (S,) [Hz] of the rows; None where there is no such file."""
+    if not path.exists() or count is None:
+        return None
+    words = (problems.attempt(lambda: read_text(path, "missing")) or "").split()
+    try:
+        carriers = 1e9 * np.array(words, np.float64)
+    except ValueError:
+        carriers = np.zeros(0)
+    if carriers.shape != (count,) or not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
+        expected = f"expected the carrier of each of the {count} rows of {positions} [GHz], one number a line"
+        return problems.add(path, f"{len(words)} words; {expected}")
+    return carriers
 
 
 def _read_spectra(folder: Path, positions: str, count: int | None, problems: Problems) -> np.ndarray | None:

@@ -88,6 +88,16 @@ def _without_table(check: Checker, measured: str, part: Selection) -> Links | No
             return Links("tx")  # what is missing is said where positions are read
         rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
         links, moving = find_static_end(check, rx, tx), np.hstack([rx, tx])
+        carrier = check.read_real("carrier_hz", (), (rows,))
+        if (
+            carrier is not None and carrier.ndim and links.static_end is not None
+        ):  # a station for each carrier
+            still, other = (rx, tx) if links.static_end == "rx" else (tx, rx)
+            arrays.setdefault("station", np.zeros(rows, np.int64))
+            arrays["place"] = number_places(other)
+            one = links.stations or Stations(still[:1].astype(np.float64), (links.static_end,))
+            links = replace(links, stations=split_by_carrier(check, one, measured in POWERS))
+            links = links if len(links.stations or ()) > 1 else replace(links, stations=None)
     if links.stations is None and moving.ndim == 2 and len(moving) == rows:
         place = number_places(moving)
         if len(np.unique(place)) < rows:  # a place visited twice is not learned from and tested on

@@ -42,6 +42,8 @@ class LearnsTogether(MethodFactory):
             return "each", "model.terms are of one station"
         if not self.learns_jointly(data.site) or self.init.name == "scene":
             return "each", ""
+        if data.site.kind == "spectrum":
+            return "together", "carriers at one place have the same paths"
         if data.site.kind == "csi":
             return "together", "channels at all stations share waves and the frame of places"
         if find_sectors(data) is not None:

@@ -28,11 +28,10 @@ from gsparc.models.moving_array.triangulate import (
     SearchSettings,
     find_sources,
     nonnegative_powers,
-    pixel_exponent,
     site_problem,
 )
 from gsparc.models.target_rows import heard_rows, training_targets
-from gsparc.physics.lags import BLOCK, SpectrumLags
+from gsparc.physics.lags import BLOCK, SpectrumLags, pixel_exponent
 from gsparc.physics.separable import Separable, fit_separable
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext, FitReport

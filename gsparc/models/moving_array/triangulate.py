@@ -181,17 +181,6 @@ def _pixels_and_inside(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Te
 MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
 
 
-def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
-    """Return 2 if images (n, H, W) are amplitudes, 1 if powers, and the energy share outside the lags."""
-    residual = {}
-    for exponent in (2, 1):
-        power = images**exponent
-        again = space.spectrum(space.to_lags(power))
-        residual[exponent] = float((again - power).square().sum() / power.square().sum())
-    exponent = min(residual, key=lambda e: residual[e])
-    return exponent, residual[exponent]
-
-
 def site_problem(data: Measurements) -> str | None:
     """Return why sources cannot be triangulated from these measurements; None when they can."""
     otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"

@@ -9,7 +9,8 @@ from releases import release
 
 from gsparc.data.datasets.rfid import WAVELENGTH, load_rfid, planar_array
 from gsparc.data.errors import DataError
-from gsparc.data.load import load
+from gsparc.data.load import load, split_for
+from gsparc.models.per_station import station_site
 
 
 def test_tiny_folder(rfid_folder):
@@ -125,3 +126,28 @@ def load_rfid_images(folder):
         np.save(path.with_suffix(".npy"), images[-1])
         path.unlink()
     return np.stack(images)
+
+
+def test_carriers_of_rows_were_mixed_as_repeats(rfid_folder):
+    """The layout of many carriers: a station for each, places together, zenith angles, clockwise azimuths."""
+    plain = load_rfid(rfid_folder).target
+    (rfid_folder / "freq.txt").write_text("1\n5\n60\n1\n5\n60\n")
+    tags = [[0.5 * (i // 3), 0.2, 1.0] for i in range(6)]
+    (rfid_folder / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in tags))
+    data = load_rfid(rfid_folder)
+    assert data.site.stations.name == ("1 GHz", "5 GHz", "60 GHz")
+    assert data.carrier_hz.tolist() == [1e9, 5e9, 60e9] * 2 and data.place.tolist() == [0, 0, 0, 1, 1, 1]
+    np.testing.assert_array_equal(data.target, plain[:, ::-1, ::-1])
+    assert data.site.grid.elevations().rad2deg()[[0, -1]].tolist() == pytest.approx([1, 90])
+    own = station_site(data.site, 2)
+    assert own.carrier_hz == 60e9 and np.ptp(own.array[:, 0]) == 0
+    assert np.ptp(own.array[:, 1]) / own.wavelength == pytest.approx(1.5)
+    folds = split_for({"name": "carriers"}, data).folds
+    assert [data.carrier_hz[fold.test].tolist() for fold in folds] == [[1e9] * 2, [5e9] * 2, [60e9] * 2]
+
+
+@pytest.mark.parametrize("text", ["1\n60\n", "1 1 1 1 1 x", "1 1 1 1 1 6e10"])
+def test_carriers_that_are_none_are_refused(rfid_folder, text):
+    (rfid_folder / "freq.txt").write_text(text)
+    with pytest.raises(DataError, match=r"freq.txt: . words; expected the carrier of each of the 6 rows"):
+        load_rfid(rfid_folder)

@@ -9,7 +9,7 @@ from gsparc.data.checks.describe import describe
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.errors import DataError
 from gsparc.data.limits import SettingError
-from gsparc.data.own import interpret
+from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 from gsparc.data.selection import Selection
 
@@ -332,3 +332,16 @@ def test_a_level_of_0_far_above_all_others_was_the_strongest(count, stations):
     )
     (said,) = [note for note in reading.notes if "exactly 0" in note]
     assert "no value, left out; dataset.not_heard=[0]" in said and reading.data.censored is None
+
+
+def test_a_carrier_per_row_was_refused_without_a_list_of_stations():
+    """One receiver whose rows are at two carriers is a station at each; rows of a place stay together."""
+    places = np.repeat(np.random.default_rng(0).uniform(0, 5, (12, 3)), 2, axis=0)
+    spectra = np.random.default_rng(1).uniform(0, 1, (24, 12, 24))
+    arrays = {"tx_position": places, "rx_position": np.zeros(3), "spectrum": spectra}
+    data = from_arrays(arrays | {"carrier_hz": np.tile([1e9, 60e9], 12)})
+    assert data.carrier_hz.tolist() == [1e9, 60e9] * 12 and data.site.static_end == "rx"
+    assert data.place.tolist() == np.repeat(np.arange(12), 2).tolist()
+    assert data.site.stations.name == ("rx at 1000 MHz", "rx at 60000 MHz")
+    alike = from_arrays(arrays | {"carrier_hz": np.full(24, 2e9)})
+    assert alike.site.stations is None and alike.site.carrier_hz == 2e9

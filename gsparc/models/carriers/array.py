@@ -1,0 +1,131 @@
+"""What spectra of one array at several carriers have in common, whatever is learned of them."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.query import Query
+from gsparc.data.schema import LIGHT, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.models.carriers.geometry import ExpectedSpectra, SharedPaths
+from gsparc.models.method import Method
+from gsparc.models.target_rows import training_targets
+from gsparc.physics.bartlett import SpectrumRenderer
+from gsparc.physics.lags import SpectrumLags, pixel_exponent
+from gsparc.processes.left_out import rows_of_groups
+from gsparc.processes.stored import from_plain, to_plain
+from gsparc.training.context import FitContext
+
+SAME_PLACE = 1e-3  # [m]
+
+
+def carriers_obstacle(site: Site) -> str | None:
+    """Return why spectra of this site are not those of one array at several carriers; None where they are."""
+    stations = site.stations
+    if site.kind != "spectrum" or stations is None or stations.carrier_hz is None:
+        return "targets are no spectra at several carriers"
+    if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE:
+        return "receivers at several places"
+    turned = stations.rotation
+    if turned is not None and not np.allclose(turned, turned[0], atol=1e-6):
+        return "receivers turned differently"
+    if site.array is None or site.grid is None or len(site.array) < 2:
+        return "the array is unknown"
+    relative = _arrays(site) / (LIGHT / stations.carrier_hz)[:, None, None]
+    return None if np.allclose(relative, relative[0], atol=1e-3) else "carriers see through different arrays"
+
+
+def _arrays(site: Site) -> np.ndarray:
+    """Elements (T, M, 3) [m] of the array at each carrier."""
+    assert site.stations is not None and site.array is not None
+    own = site.stations.array
+    return np.repeat(site.array[None], len(site.stations), axis=0) if own is None else own
+
+
+class OneArray(Method):
+    """A method of spectra at several carriers, of which one array, alike in wavelengths, saw all."""
+
+    stored: ClassVar[tuple[str, ...]] = ("exponent", "places", "mean")
+    both_ends = True
+    no_gradient = "what is nearest changes in jumps"
+    exponent: int  # of a pixel that is its power
+    places: Tensor  # (n, 3) float64 [m], local, of training rows, each once
+    mean: Tensor  # (H * W,) of all training rows
+    _spectra: ExpectedSpectra | None = None
+
+    def learns_jointly(self, site: Site) -> bool:
+        """See `MethodFactory`."""
+        return carriers_obstacle(site) is None
+
+    def choose_stations(
+        self, data: Measurements, fold: Fold, context: FitContext
+    ) -> tuple[Literal["each", "together"], str]:
+        """See `MethodFactory`."""
+        return "together", "carriers at one place have the same paths"
+
+    def read_rows(self, data: Measurements, rows: np.ndarray) -> tuple[Tensor, list[Tensor]]:
+        """Return images (n, H * W) of rows (n,), and which of them are of each place.
+
+        Raises:
+            ValueError: not spectra of one array at several carriers.
+        """
+        problem = carriers_obstacle(data.site)
+        if problem is not None:
+            raise ValueError(f"{self.name}: {problem}")
+        self.site, self._spectra = data.site, None
+        images = torch.from_numpy(data.site.target.to_real(training_targets(data, rows)))
+        self.places, which = torch.unique(torch.from_numpy(data.tx[rows]), dim=0, return_inverse=True)
+        few = images[:: max(1, len(images) // 16)].unflatten(1, data.target.shape[1:])
+        self.exponent, self.mean = pixel_exponent(self.lags(), few)[0], images.mean(0)
+        return images, rows_of_groups(which.numpy())
+
+    def answer_images(self, images: Tensor, query: Query) -> Tensor:
+        """Return images (B, H * W) as targets (B, H, W), in the query's precision."""
+        grid = self.fitted_site.grid
+        assert grid is not None
+        return images.clamp(0, 1).unflatten(1, (grid.height, grid.width)).to(query.tx.dtype)
+
+    def state(self) -> dict[str, Any]:
+        """Return what was learned."""
+        return {name: to_plain(getattr(self, name)) for name in self.stored}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self._spectra = site, None
+        for name in self.stored:
+            setattr(self, name, from_plain(state[name]))
+
+    def pose(self) -> tuple[Tensor, Tensor]:
+        """Return place (3,) float64 [m] and rotation (3, 3) of the receiver."""
+        stations, turned = self.fitted_site.stations, self.fitted_site.rx_rotation
+        assert stations is not None
+        rotation = stations.rotation[0] if stations.rotation is not None else turned
+        turned = np.eye(3) if rotation is None else rotation
+        return torch.from_numpy(stations.position[0]), torch.from_numpy(np.asarray(turned, np.float64))
+
+    def array(self) -> tuple[np.ndarray, float]:
+        """Return elements (M, 3) [m] at the first carrier, and its wavelength [m]."""
+        stations = self.fitted_site.stations
+        assert stations is not None and stations.carrier_hz is not None
+        return _arrays(self.fitted_site)[0], LIGHT / float(stations.carrier_hz[0])
+
+    def lags(self) -> SpectrumLags:
+        """Return the array's lags."""
+        array, wavelength = self.array()
+        assert self.fitted_site.grid is not None
+        return SpectrumLags(array, self.fitted_site.grid, wavelength)
+
+    def expected(self, paths: SharedPaths, places: Tensor) -> Tensor:
+        """Return mean images (n, H * W) of the paths to places (n, 3)."""
+        if self._spectra is None:
+            (array, wavelength), grid = self.array(), self.fitted_site.grid
+            assert grid is not None
+            renderer = SpectrumRenderer(array, grid, wavelength, torch.zeros(grid.height, grid.width))
+            turns = torch.from_numpy(2 * np.pi / wavelength * array).float()
+            how = self.fitted_site.normalisation
+            self._spectra = ExpectedSpectra(renderer, turns, how, self.exponent)
+        return self._spectra(paths.ways(places)[0], paths.powers(places))

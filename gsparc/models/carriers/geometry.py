@@ -1,0 +1,154 @@
+"""Directions of arrival at places that nobody measured: the direct path, and images in mirror planes.
+
+Carriers of one place have the same paths under other phases: the mean of their spectra in power is nearly the
+incoherent sum of the paths. Planes are those whose images explain the means at all training places together,
+found one after the other; what each path carries there is solved in nonnegative numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gsparc.physics.array_response import normalise_spectrum
+from gsparc.physics.bartlett import SpectrumRenderer
+from gsparc.physics.lags import SpectrumLags
+from gsparc.physics.mirror_planes import NO_PLANES, reflect
+from gsparc.processes.factor import Factor
+from gsparc.processes.stored import Stored
+
+PLANES = 8  # at most
+REACH, STEP = 3.0, 0.05  # beyond the box of both ends, and between planes that are tried [m]
+LEAST_GAIN = 0.003  # of the energy: a plane that explains less is none
+LEAST_ALONE = 0.02  # of an image's energy
+RIDGE = 0.02  # of the powers' solve
+NEIGHBOURS, LEAST_M, COMMON = 8, 0.3, 0.15  # shares at a place: of the nearest, by distance, and of all
+DRAWS = 24  # of the phases between paths
+SAME_M = 1e-3  # [m], a place itself, which does not tell its own shares
+
+
+@dataclass(frozen=True)
+class SharedPaths(Stored):
+    """Paths from a place to the receiver.
+
+    Attributes:
+        planes: (K, 4) float64, mirrors.
+        receiver: (3,) float64 [m].
+        rotation: (3, 3) float64, of the receiver.
+        places: (n, 3) float64 [m], where shares are known.
+        shares: (n, K + 1) float64, powers times distance squared of the direct path and of images, of sum 1.
+    """
+
+    planes: Tensor
+    receiver: Tensor
+    rotation: Tensor
+    places: Tensor
+    shares: Tensor
+
+    def ways(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Return directions (n, K + 1, 3) of arrival, receiver frame, and distances (n, K + 1) [m]."""
+        return ways(places, self.planes, self.receiver, self.rotation)
+
+    def powers(self, places: Tensor) -> Tensor:
+        """Return what paths carry to places (n, 3), (n, K + 1), of sum 1; one that was measured by others."""
+        apart = torch.cdist(places, self.places)
+        weight = torch.where(apart < SAME_M, 0.0, 1 / apart.clamp_min(LEAST_M).square())
+        near = weight.topk(min(NEIGHBOURS, len(self.places)), dim=1)
+        own = (near.values[..., None] * self.shares[near.indices]).sum(1) / near.values.sum(1, keepdim=True)
+        shares = (1 - COMMON) * own + COMMON * self.shares.mean(0)
+        return normalize(shares / self.ways(places)[1].square(), p=1, dim=1)
+
+
+def ways(places: Tensor, planes: Tensor, receiver: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """Return directions (n, K + 1, 3) of places (n, 3) and their images, receiver frame; distances [m]."""
+    mirrored = reflect(places[:, None], planes)
+    away = torch.cat([places[:, None], mirrored], 1) - receiver
+    distance = away.norm(dim=2).clamp_min(LEAST_M)
+    return away @ rotation / distance[..., None], distance
+
+
+def find_paths(
+    lags: SpectrumLags, seen: Tensor, places: Tensor, receiver: Tensor, rotation: Tensor
+) -> SharedPaths:
+    """Return planes and shares that explain lags `seen` (n, count) at places (n, 3) [m]."""
+    metric = Factor.from_gram(lags.gram).lower  # of lags to pixels: energies are of images
+
+    def looks(directions: Tensor) -> Tensor:
+        return lags.plane_wave_lags(directions.float()).double() @ metric
+
+    target, tried = seen.double() @ metric, _planes_to_try(torch.cat([places, receiver[None]]))
+    images = looks(ways(places, tried, receiver, rotation)[0])[:, 1:]
+    planes, energy = NO_PLANES, float(target.square().sum())
+    known = looks(ways(places, planes, receiver, rotation)[0])
+    powers, left = _solve(known, target)
+    while len(planes) < PLANES:
+        # Of an image only what known paths cannot imitate tells: orthogonal least squares.
+        basis = torch.linalg.qr(known.mT)[0]
+        alone = images - images @ basis @ basis.mT
+        scale = alone.square().sum(2).clamp_min(LEAST_ALONE * images.square().sum(2))
+        best = int(((alone * left[:, None]).sum(2).clamp_min(0).square() / scale).sum(0).argmax())
+        more = torch.cat([known, images[:, best : best + 1]], 1)
+        solved, rest = _solve(more, target)
+        if float((left.square().sum() - rest.square().sum()) / energy) < LEAST_GAIN:
+            break
+        planes, known, powers, left = torch.cat([planes, tried[best : best + 1]]), more, solved, rest
+    distance = ways(places, planes, receiver, rotation)[1]
+    return SharedPaths(planes, receiver, rotation, places, normalize(powers * distance.square(), p=1, dim=1))
+
+
+def _planes_to_try(ends: Tensor) -> Tensor:
+    """Planes (Q, 4) across the axes, on both sides of the box of ends (n, 3) [m]."""
+    planes = []
+    for axis in range(3):
+        low, high = float(ends[:, axis].min()), float(ends[:, axis].max())
+        beyond = STEP * torch.arange(1, round(REACH / STEP), dtype=torch.float64)
+        offset = torch.cat([low - beyond, high + beyond])
+        planes.append(torch.cat([torch.eye(3).double()[axis].expand(len(offset), 3), offset[:, None]], 1))
+    return torch.cat(planes)
+
+
+def _solve(looks: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Nonnegative powers (n, K) whose sums of looks (n, K, D) are nearest to the target (n, D); the rest."""
+    ridge = RIDGE * float(looks.norm(dim=2).mean()) * np.eye(looks.shape[1])
+    none = np.zeros(looks.shape[1])
+    pairs = zip(looks.numpy(), target.numpy(), strict=True)
+    powers = torch.from_numpy(
+        np.stack([nnls(np.vstack([own.T, ridge]), np.concatenate([one, none]))[0] for own, one in pairs])
+    )
+    return powers, target - (powers[:, None] @ looks)[:, 0]
+
+
+class ExpectedSpectra:
+    """Mean spectra, normalised as published, of paths whose phases nobody knows.
+
+    Args:
+        renderer: of the array.
+        turns: (M, 3), radians per unit of direction.
+        normalisation: as of `Site`.
+        exponent: of a pixel that is its power.
+    """
+
+    def __init__(self, renderer: SpectrumRenderer, turns: Tensor, normalisation: str, exponent: int) -> None:
+        self.renderer, self.turns = renderer, turns
+        self.normalisation, self.exponent = normalisation, exponent
+
+    @torch.no_grad()
+    def __call__(self, directions: Tensor, powers: Tensor) -> Tensor:
+        """Return images (n, H * W) float32 of directions (n, K, 3) and powers (n, K)."""
+        drawn = torch.rand(DRAWS, powers.shape[1], generator=torch.Generator().manual_seed(0))
+        phases = torch.polar(torch.ones_like(drawn), 2 * math.pi * drawn)
+        angle = directions.float() @ self.turns.T
+        response = torch.polar(powers.float().sqrt()[..., None].expand_as(angle), angle)
+        result = []
+        for one in response:
+            vectors = phases @ one
+            image = self.renderer(torch.cat([vectors, torch.zeros(DRAWS, 1)], 1)).flatten(1)
+            image = image if self.exponent == 2 else image.square()
+            result.append(normalise_spectrum(image, self.normalisation).mean(0))
+        return torch.stack(result)

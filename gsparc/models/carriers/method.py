@@ -1,0 +1,174 @@
+"""`model=carriers`: spectra at several carriers in one field, which tell of each other at a place.
+
+The mean is what paths found from all spectra together are expected to look like, mixed with the mean image; a
+process over places and carriers learns what is left: rows of a place observed at some carriers tell the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.carriers.array import SAME_PLACE, OneArray
+from gsparc.models.carriers.geometry import SharedPaths, find_paths
+from gsparc.models.method import Prediction
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.left_out import left_out_residuals
+from gsparc.processes.stored import Stored
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.stopwatch import Stopwatch
+
+PIXELS = 500  # of an image, that settings are chosen on
+LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
+SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
+NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
+MOST_ROWS = 4000
+
+
+@dataclass(frozen=True)
+class Covariance(Stored):
+    """Covariance of residual images over places and carriers, in units of the part that a place shares.
+
+    Attributes:
+        length: over places [m].
+        shared: of what neighbouring places share, at all carriers.
+        near: of what near carriers of a place share.
+        noise: of each row.
+        amplitude: of the whole, per pixel.
+    """
+
+    length: float
+    shared: float
+    near: float
+    noise: float
+    amplitude: float = 1.0
+
+    def between(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
+        apart = distances(a[:, :3], b[:, :3])
+        octaves = (a[:, None, 3] - b[None, :, 3]).abs()
+        here = (apart < SAME_PLACE).double()
+        return self.shared * matern32(apart, self.length) + here * (
+            1 + self.near * matern32(octaves, OCTAVES)
+        )
+
+    @property
+    def prior(self) -> float:
+        """Variance of a row without noise."""
+        return self.shared + 1 + self.near
+
+
+class CarrierField(OneArray):
+    """Shared paths, and a process over places and carriers.
+
+    Args:
+        name: as it appears in tables.
+    """
+
+    effects = "line_of_sight, specular"
+    stored = (*OneArray.stored, "paths", "weight", "covariance", "rows", "left")
+    paths: SharedPaths
+    covariance: Covariance
+    _kept: Tensor | None = None
+
+    def __init__(self, name: str = "carriers") -> None:
+        self.name = name
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Find planes, then condition a process on what they do not explain.
+
+        Raises:
+            ValueError: not spectra of one array at several carriers, or too many.
+        """
+        watch, known = Stopwatch(), np.concatenate([fold.train, fold.val])
+        if len(known) > MOST_ROWS:
+            raise ValueError(
+                f"{self.name}: {len(known)} rows, {MOST_ROWS} at most; thin with split.train_count"
+            )
+        images, groups = self.read_rows(data, known)
+        carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()
+        assert carrier is not None and grid is not None
+        self.rows = torch.from_numpy(np.c_[data.tx[known], np.log2(carrier[known])])
+        power = [images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups]
+        seen = torch.stack([lags.to_lags(one).mean(0) for one in power])
+        self.paths = find_paths(lags, seen, self.places, *self.pose())
+        expected, which = self.expected(self.paths, self.places) - self.mean, torch.empty(len(known)).long()
+        for place, rows in enumerate(groups):
+            which[rows] = place
+        self._choose(images - self.mean, expected[which], groups)
+        left = images - self.mean - self.weight * expected[which]
+        self._kept, factor = None, Factor.from_gram(self._gram(self.covariance))
+        self.left = factor.solve(left.double()).float()
+        planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
+        one = self.covariance
+        kernel = (
+            f"length {one.length:.3g} m, shared {one.shared:.3g}, near {one.near:.3g}, noise {one.noise:.3g}"
+        )
+        return FitReport(watch.seconds, (f"{self.name}: {planes}; {kernel}, chosen on left-out places",))
+
+    def _choose(self, images: Tensor, expected: Tensor, groups: list[Tensor]) -> None:
+        """Set the weight of paths and the covariance of least error at places and rows left out."""
+        step = max(1, images.shape[1] // PIXELS)
+        both = torch.cat([images[:, ::step], expected[:, ::step]], 1).double()
+        diagonal = float((self.rows[:, :3].amax(0) - self.rows[:, :3].amin(0)).norm()) or 1.0
+        best = math.inf
+        for length, shared, near, noise in product(LENGTHS, SHARES, NEAR_CARRIERS, NOISES):
+            one = Covariance(length * diagonal, shared, near, noise)
+            inverse = Factor.from_gram(self._gram(one)).inverse
+            solved = inverse @ both
+            away, variance = left_out_residuals(inverse, solved, groups)
+            # Residuals are linear in what is taken off: the best weight is a quotient.
+            image, path = away.chunk(2, dim=1)
+            weight = float((image * path).sum() / path.square().sum().clamp_min(1e-9))
+            weight = min(max(weight, 0.0), 1.0)
+            missed = (image - weight * path).square().mean(1)
+            image, path = left_out_residuals(inverse, solved)[0].chunk(2, dim=1)
+            error = float(missed.mean()) * float((image - weight * path).square().mean())
+            if error < best:
+                best, self.weight = error, weight
+                self.covariance = replace(one, amplitude=float((missed / variance).mean()))
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`; `query.station` says which carrier.
+
+        Raises:
+            ValueError: it does not.
+        """
+        site = self.fitted_site
+        assert site.stations is not None and site.stations.carrier_hz is not None
+        if query.station is None:
+            raise ValueError(
+                f"{self.name}: which carrier? say station=, one of {', '.join(site.stations.shown)}"
+            )
+        places, which = torch.unique(query.tx.cpu().double(), dim=0, return_inverse=True)
+        octaves = torch.from_numpy(np.log2(site.stations.carrier_hz))[query.station.cpu()]
+        cross = self.covariance.between(torch.cat([places[which], octaves[:, None]], 1), self.rows)
+        paths = self.expected(self.paths, places) - self.mean
+        image = self.mean + self.weight * paths[which] + cross.float() @ self.left
+        prior = self.covariance.prior
+        certain = (cross @ self._inverse() * cross).sum(1)
+        variance = (prior - certain).clamp(0, prior)
+        error = self.covariance.amplitude * (variance + self.covariance.noise)
+        mean = self.answer_images(image, query)
+        return Prediction(mean, error.to(mean.dtype), (variance / prior).to(mean.dtype))
+
+    def count_components(self) -> int:
+        """Return the number of mirror planes."""
+        return len(self.paths.planes)
+
+    def _inverse(self) -> Tensor:
+        if self._kept is None:
+            self._kept = Factor.from_gram(self._gram(self.covariance)).inverse
+        return self._kept
+
+    def _gram(self, one: Covariance) -> Tensor:
+        return one.between(self.rows, self.rows) + one.noise * torch.eye(len(self.rows), dtype=torch.float64)
