@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from pyproj import Geod
+from pyproj import Proj
 
 from gsparc.data.errors import DataError
 
 DIGITS = 4  # of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
 # Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.
 ON_EARTH = ((-90, 90), (-180, 360))
-_WGS84 = Geod(ellps="WGS84")
 
 
 @dataclass(frozen=True)
@@ -64,10 +63,7 @@ class Georeference:
         if fault is not None:
             raise DataError(fault[1])
         there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
-        places = [np.array(v) for v in np.broadcast_arrays(self.longitude, self.latitude, *there)]
-        azimuth, _, distance = _WGS84.inv(places[0], places[1], places[2], places[3])
-        angle = np.radians(azimuth)
-        return np.stack([distance * np.sin(angle), distance * np.cos(angle)], axis=-1)
+        return np.stack(self._projection(*map(np.array, there)), axis=-1)
 
     def to_degrees(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return latitude, longitude (n,) [deg] of local (n, 2) [m]; the inverse of `from_degrees`.
@@ -78,13 +74,14 @@ class Georeference:
         xy = np.asarray(xy, np.float64)
         if xy.ndim != 2 or xy.shape[1] != 2:
             raise DataError(f"local coordinates: expected shape (n, 2), found {xy.shape}")
-        distance = np.hypot(xy[:, 0], xy[:, 1])
-        if not (distance < 2.0e7).all():
+        if not (np.hypot(xy[:, 0], xy[:, 1]) < 2.0e7).all():
             raise DataError("local coordinates: not finite, or not on Earth; expected metres from the origin")
-        azimuth = np.degrees(np.arctan2(xy[:, 0], xy[:, 1]))
-        east, north = (np.full(len(xy), v) for v in (self.longitude, self.latitude))
-        longitude, latitude, _ = _WGS84.fwd(east, north, azimuth, distance)
+        longitude, latitude = self._projection(xy[:, 0], xy[:, 1], inverse=True)
         return np.asarray(latitude), np.asarray(longitude)
+
+    @property
+    def _projection(self) -> Proj:
+        return Proj(proj="aeqd", ellps="WGS84", lat_0=self.latitude, lon_0=self.longitude)
 
 
 def find_invalid_coordinate(
