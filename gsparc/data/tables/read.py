@@ -65,10 +65,9 @@ def parse_table(
         DataError: all problems, with row and column.
     """
     sheet, notes = read_sheet(path)
-    sheet, of_cells = unfold_cells(sheet)
-    sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
-    sheet, of_tones = unfold_tones(sheet)
-    notes = [*notes, *of_cells, *of_slots, *of_tones]
+    for unfold in (unfold_cells, partial(unfold_slots, said={*map(str, columns.values())}), unfold_tones):
+        sheet, more = unfold(sheet)
+        notes += more
     listed = None
     if stations_file is not None:
         second, _ = read_sheet(stations_file, sheet.problems)
@@ -299,8 +298,10 @@ class Builder:
             if self.listed is not None:
                 fault = "no column says which station a row is of"
                 return self.refuse(f"{fault}; say dataset.columns.station=COLUMN")
-            if where is None:
-                where = self._second_in_degrees(end_places)
+            if where is None and len(end_places) > 1 and all(end.degrees for end in end_places.values()):
+                # Stations are fewer than the places that were measured at, whichever end they are.
+                few = min(end_places, key=lambda end: len(np.unique(end_places[end].all(), axis=0)))
+                where = end_places.pop(few)
             return None if where is None else self._unnamed(where)
         words, head = self.sheet.joined(c.head for c in columns), columns[0].head or ""
         if self.listed is not None:
@@ -382,16 +383,14 @@ class Builder:
             self.notes += said
         known = {"", *self.listed.names, *lacking}
         unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in known]
+        place = f"{self.sheet.source}, " + ("the heads" if head is None else f"column {head!r}")
         if len(unlisted) > MOST_NAMED:
-            place = "the heads" if head is None else f"column {head!r}"
             fault = f"{list_first([*map(repr, unlisted)])} are no listed stations; the list has "
-            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault + list_first(self.listed.names))
-            return
+            return self.sheet.problems.add(place, fault + list_first(self.listed.names))
         for word in unlisted:
-            row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
-            place = "the heads" if head is None else f"column {head!r}, {row}"
+            row = "" if head is None else f", {self.sheet.rows[int(np.argmax(words == word))]}"
             fault = f"{word!r} is no listed station{suggest_name(word, self.listed.names)}"
-            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
+            self.sheet.problems.add(place + row, fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:
         assert self.listed is not None
@@ -403,14 +402,6 @@ class Builder:
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
             self.notes.append(f"listed, but {where}: {list_first(names, 8)}")
-
-    def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
-        """Of two ends in degrees, the one with fewer places, which are then stations."""
-        if len(ends) < 2 or not all(where.degrees for where in ends.values()):
-            return None
-        # Stations are fewer than the places that were measured at, whichever end they are.
-        few = min(ends, key=lambda end: len(np.unique(ends[end].all(), axis=0)))
-        return ends.pop(few)
 
     def _unnamed(self, where: Places) -> StationList | None:
         """Stations told apart by their places alone."""
