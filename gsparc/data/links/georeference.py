@@ -33,9 +33,7 @@ class Georeference:
     longitude: float
 
     def __post_init__(self) -> None:
-        fault = find_invalid_coordinate(self.latitude, self.longitude)
-        if fault is not None:
-            raise DataError(f"origin: {fault[1]}")
+        _refuse_invalid(self.latitude, self.longitude, "origin: ")
 
     @classmethod
     def from_coordinates(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
@@ -45,9 +43,9 @@ class Georeference:
             DataError: no places, or a value is not in range.
         """
         latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
-        fault = find_invalid_coordinate(latitude, longitude) if latitude.size else (0, "no places")
-        if fault is not None:
-            raise DataError(f"origin: {fault[1]}")
+        if not latitude.size:
+            raise DataError("origin: no places")
+        _refuse_invalid(latitude, longitude, "origin: ")
         # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
         turned = np.median((longitude - longitude[0] + 180) % 360 - 180) + longitude[0]
         east = (round(float(turned), DIGITS) + 180) % 360 - 180
@@ -59,9 +57,7 @@ class Georeference:
         Raises:
             DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
         """
-        fault = find_invalid_coordinate(latitude, longitude)
-        if fault is not None:
-            raise DataError(fault[1])
+        _refuse_invalid(latitude, longitude)
         there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
         return np.stack(self._projection(*map(np.array, there)), axis=-1)
 
@@ -82,6 +78,11 @@ class Georeference:
     @property
     def _projection(self) -> Proj:
         return Proj(proj="aeqd", ellps="WGS84", lat_0=self.latitude, lon_0=self.longitude)
+
+
+def _refuse_invalid(latitude: np.ndarray | float, longitude: np.ndarray | float, what: str = "") -> None:
+    if (fault := find_invalid_coordinate(latitude, longitude)) is not None:
+        raise DataError(f"{what}{fault[1]}")
 
 
 def find_invalid_coordinate(
