@@ -65,9 +65,10 @@ def parse_table(
         DataError: all problems, with row and column.
     """
     sheet, notes = read_sheet(path)
-    for unfold in (unfold_cells, partial(unfold_slots, said={*map(str, columns.values())}), unfold_tones):
-        sheet, more = unfold(sheet)
-        notes += more
+    sheet, of_cells = unfold_cells(sheet)
+    sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
+    sheet, of_tones = unfold_tones(sheet)
+    notes = [*notes, *of_cells, *of_slots, *of_tones]
     listed = None
     if stations_file is not None:
         second, _ = read_sheet(stations_file, sheet.problems)
@@ -213,14 +214,13 @@ class Builder:
             said = MEASURED.fullmatch(label)
             if said and said[2].lower() in UNITS and UNITS[said[2].lower()].kind == "frequency":
                 label = f"{UNITS[said[2].lower()].factor * float(said[1]):.0f}"
-            where = self.sheet.describe_column(column.head or "")
             # A sign belongs to the number: tones -1 and 1 lie on both sides of the carrier.
             if not re.fullmatch(r"[-+]?\d+|", label):
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
-                self.sheet.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
+                self.refuse(f"{fault}, or say dataset.columns.{part}='NAME*'", column.head or "")
             elif tones.setdefault(int(label or 0), column) is not column:
                 other = tones[int(label or 0)].head
-                self.sheet.problems.add(where, f"the same tone as {other!r}; rename one")
+                self.refuse(f"the same tone as {other!r}; rename one", column.head or "")
         return tones
 
     def _ends(self, measured: str | None) -> None:
