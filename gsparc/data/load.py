@@ -138,7 +138,7 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
     if left := sum(len(old.test) - len(new.test) for old, new in zip(split.folds, folds, strict=True)):
         said = "split: %d test rows are left out, of stations with under %d training rows"
         log.warning(said, left, splits.LEAST_ROWS)
-    return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
+    return replace(split, folds=tuple(folds))
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
