@@ -38,8 +38,9 @@ def check(
     from gsparc.data.checks.array_layout import carrier_warnings, layout_warnings
     from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
+    from gsparc.data.checks.link_levels import link_levels
     from gsparc.data.checks.outliers import outlier_warnings
-    from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
+    from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
     from gsparc.data.checks.unit_warnings import unit_warnings
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for

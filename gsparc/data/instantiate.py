@@ -108,12 +108,15 @@ def config_node(kind: type) -> dict[str, Any]:
 _OTHER = object()
 
 
-def accepted_arguments(kind: type) -> dict[str, Any]:
-    """Return what a class takes, with defaults; `**names` is what its base class, or `hands_on`, takes."""
+def accepted_arguments(kind: Any) -> dict[str, Any]:
+    """Return what a class or function takes, with defaults; of a class `**names` is what its base class, or
+    `hands_on`, takes.
+    """
     if kind is object:
         return {}
-    own, base = list(inspect.signature(kind.__init__).parameters.values())[1:], {}  # type: ignore[misc]
-    if any(p.kind is p.VAR_KEYWORD for p in own):
+    of_class = isinstance(kind, type)
+    own, base = [*inspect.signature(kind.__init__ if of_class else kind).parameters.values()][of_class:], {}
+    if of_class and any(p.kind is p.VAR_KEYWORD for p in own):
         base = accepted_arguments(vars(kind).get("hands_on", kind.__mro__[1]))
     named = {p.name: p.default for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     return {**named, **{name: default for name, default in base.items() if name not in named}}

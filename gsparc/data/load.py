@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.resources import files
 from typing import Any
@@ -139,7 +139,7 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
     if left := sum(len(old.test) - len(new.test) for old, new in zip(split.folds, folds, strict=True)):
         said = "split: %d test rows are left out, of stations with under %d training rows"
         log.warning(said, left, splits.LEAST_ROWS)
-    return replace(split, folds=tuple(folds), sha256=splits.hash_indices(tuple(folds)))
+    return replace(split, folds=tuple(folds))
 
 
 def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
@@ -177,17 +177,8 @@ def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
 
 def _parameters(kind: Any) -> dict[str, Any]:
     """What `kind` takes, with defaults; what a dataset hands on by keyword is what its reader takes."""
-    own = (
-        accepted_arguments(kind)
-        if isinstance(kind, type)
-        else _defaults(inspect.signature(kind).parameters.values())
-    )
-    _, *read = inspect.signature(getattr(kind, "reader", lambda path: path)).parameters.values()
-    return {**dict.fromkeys(getattr(kind, "switches", ())), **_defaults(read), **own}
-
-
-def _defaults(parameters: Iterable[inspect.Parameter]) -> dict[str, Any]:
-    return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD}
+    _, *read = accepted_arguments(getattr(kind, "reader", lambda path: path)).items()
+    return {**dict.fromkeys(getattr(kind, "switches", ())), **dict(read), **accepted_arguments(kind)}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:

@@ -270,9 +270,6 @@ def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
     return values
 
 
-Test = Callable[[np.ndarray], np.ndarray]
-
-
 def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
     """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
     # Magnitudes of complex64 overflow and comparisons with NaN warn; both are tested for here.
@@ -291,7 +288,9 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     check.refuse_rows(name, out, f"out of range; expected {wanted}")
 
 
-def _rows(values: np.ndarray, test: Test, mask: np.ndarray | None = None) -> np.ndarray:
+def _rows(
+    values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
+) -> np.ndarray:
     """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
     flags = []
     for part in row_blocks(values):

@@ -106,7 +106,10 @@ def _of_sheet(
         named = f"{end}_" if f"{end}_" in rest else ""
         # Coordinates without a name are taken once: a second end without its own is missing.
         if named not in rest or (len(moving) > 1 and not named and "" in ends):
-            raise DataError(_missing(sheet, end, len(moving) > 1))
+            axes = "columns.latitude=COLUMN and .longitude, or .x and .y"
+            axes = f"columns.{end}_x=COLUMN and .{end}_y" if len(moving) > 1 else axes
+            none = f"no coordinates of the {ENDS[end]} among {sheet.first_heads()}"
+            raise DataError(f"{sheet.source}: {none}; say {axes}")
         ends[end] = rest.pop(named)
     # Static ends stand where they were measured: a query cannot move them.
     other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
@@ -128,9 +131,3 @@ def _of_sheet(
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
     told = (*notes, *guessed)
     return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, device, name, told, table)
-
-
-def _missing(sheet: Sheet, end: End, both: bool) -> str:
-    axes = "columns.latitude=COLUMN and .longitude, or .x and .y"
-    axes = f"columns.{end}_x=COLUMN and .{end}_y" if both else axes
-    return f"{sheet.source}: no coordinates of the {ENDS[end]} among {sheet.first_heads()}; say {axes}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsparc.data.errors import DataError, readable
 from gsparc.data.files import write_whole
-from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.data.splits import Fold, Split
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +50,9 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
             raise DataError(f"{path}: fold {i} names a row twice (train, val and test must be disjoint)")
         if len(every) and (every.min() < 0 or every.max() >= rows):
             raise DataError(f"{path}: fold {i} names a row outside 0 to {rows - 1}")
-    if not folds or hash_indices(folds) != stored_hash:
+    split = Split(name, folds)
+    if not folds or split.sha256 != stored_hash:
         raise DataError(f"{path}: the indices do not match their sha256; the file was edited or damaged")
     if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
         log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
-    return Split(name, folds, stored_hash)
+    return split

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,14 +50,17 @@ class Split:
     Attributes:
         name: one of `NAMES`, or a file's.
         folds: one or more folds.
-        sha256: hash of all indices.
         of_release: whether the release named the test rows.
     """
 
     name: str
     folds: tuple[Fold, ...]
-    sha256: str
     of_release: bool = False
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of all indices."""
+        return hash_indices(self.folds)
 
     @property
     def title(self) -> str:
@@ -223,7 +227,7 @@ def make_split(
             pairs = enumerate([(drawn, drawn[:0])])
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
     folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
-    return Split(settings.name, folds, hash_indices(folds), named is not None)
+    return Split(settings.name, folds, named is not None)
 
 
 def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:
@@ -265,8 +269,7 @@ def rows_to_leave_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: in
 
 def remove_rows(split: Split, absent: np.ndarray) -> Split:
     """Return the same folds without the rows `absent` (n,)."""
-    folds = tuple(fold.map(lambda part: np.setdiff1d(part, absent)) for fold in split.folds)
-    return Split(split.name, folds, hash_indices(folds))
+    return Split(split.name, tuple(fold.map(lambda part: np.setdiff1d(part, absent)) for fold in split.folds))
 
 
 def hash_indices(folds: tuple[Fold, ...], parts: Sequence[str] = ("train", "val", "test")) -> str:

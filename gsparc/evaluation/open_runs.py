@@ -142,7 +142,7 @@ def open_files(
     if other and others_whole and all(value is None for value in (split or {}).values()):
         none, every = np.zeros(0, np.int64), np.arange(len(data))
         folds = (Fold(none, none, every),) * len(stored)
-        chosen = Split("whole", folds, hash_indices(folds))
+        chosen = Split("whole", folds)
     else:
         chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
     foreign, learned, trained = _foreign(stored, data, chosen)

@@ -14,8 +14,9 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
 from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.checks.outliers import find_outliers, too_far
-from gsparc.data.checks.plausibility import LinkLevels, find_outlier_rows
+from gsparc.data.checks.plausibility import find_outlier_rows
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import OUTLINE, annotate, draw_stations, frame_of, legend_below, set_bounds

@@ -40,7 +40,7 @@ def listed(place, station, level):
 def split_of(data, tested=5):
     test = data.place % tested == 1
     rows = np.arange(len(data))
-    return Split("every fifth", (Fold(rows[~test], rows[:0], rows[test]),), "")
+    return Split("every fifth", (Fold(rows[~test], rows[:0], rows[test]),))
 
 
 def evaluated(data, baselines):
@@ -184,9 +184,9 @@ def test_the_strongest_at_the_nearest_moment_was_in_no_table():
     """Levels of each station's own nearest moments tell a best server worse: 52 for 63 % of a drive."""
     near = listed([0, 10, 20, 30], [0, 1, 1, 0], [-70.0, -75, -75, -70])
     rows = np.arange(4)
-    split = Split("own", (Fold(rows, rows[:0], rows),), "")
+    split = Split("own", (Fold(rows, rows[:0], rows),))
     asked = listed([9, 9, 1, 1], [0, 1, 0, 1], [-90.0, -76, -71, -95])
-    own = Split("asked", (Fold(rows[:0], rows[:0], rows),), "")
+    own = Split("asked", (Fold(rows[:0], rows[:0], rows),))
     scores = fit_baseline("nearest", asked, own, learned=(near, split)).scores
     assert best_server(scores, asked) == {"best_server": 1.0}
     del scores.samples["served"]

@@ -8,7 +8,7 @@ import torch
 from networks import network
 
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.given_heard import levels_given_heard
 from gsparc.evaluation.summary import remarks
@@ -29,7 +29,7 @@ def test_listed_rows_were_judged_by_levels_listed_or_not():
     folds = (Fold(np.flatnonzero(~test), NONE, np.flatnonzero(test)),)
     method = wrap_per_station(Gsparc(), data)
     method.fit(data, folds[0], FitContext(Path()))
-    split = Split("moments", folds, hash_indices(folds))
+    split = Split("moments", folds)
     found = evaluate(method, 1.0, data, split, baselines=["kriging", "nearest"], timed=False)
     facts, columns = found.facts, found.columns
     assert facts["test/rmse_db"] < 0.97 * facts["baseline/kriging/rmse_db"]
@@ -60,9 +60,7 @@ def test_heard_rows_beside_silent_ones_were_judged_by_levels_heard_or_not():
     folds = (Fold(np.arange(1000), NONE, np.arange(1000, 1500)),)
     method = Powers()
     method.fit(data, folds[0], FitContext(Path()))
-    found = evaluate(
-        method, 1.0, data, Split("drive", folds, hash_indices(folds)), baselines=["kriging"], timed=False
-    )
+    found = evaluate(method, 1.0, data, Split("drive", folds), baselines=["kriging"], timed=False)
     facts = found.facts
     assert 0.2 < facts["test/outage/rate"] < 0.8 and facts["test/heard_above_db"] > 2
     assert facts["test/rmse_db"] < facts["baseline/kriging/rmse_db"]

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 import gsparc
 from gsparc.commands.shared.inputs import read_inputs
 from gsparc.data.split_files import write_split
-from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import ledger
 from gsparc.evaluation.ledger import (
     FAILURE,
@@ -118,7 +118,7 @@ def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
     states = []
     for test in ([8, 9], [7, 9]):
         folds = (Fold(np.arange(5), np.array([5, 6]), np.array(test)),)
-        write_split(split, Split("own", folds, hash_indices(folds)), 40)
+        write_split(split, Split("own", folds), 40)
         states.append(of(file, *words))
     assert states[0].split != states[1].split and states[0].settings == states[1].settings
 

@@ -148,7 +148,7 @@ def opened_beside_all(folder, monkeypatch, **changes):
     gsparc.fit(rx=WALK, rssi=drive["rssi_db"], model="mean", save=folder / "model.ckpt")
     np.savez(folder / "drive.npz", **(drive | changes))
     learned, rows = from_arrays(drive), np.arange(80)
-    split = Split("all", (Fold(rows, rows[:0], rows[:0]),), "")
+    split = Split("all", (Fold(rows, rows[:0], rows[:0]),))
     monkeypatch.setattr(
         open_runs, "_trained", lambda stored, data: (align_to_site(learned, data.site), split)
     )
@@ -257,8 +257,8 @@ def test_a_second_survey_had_no_table_where_a_station_was_rarely_heard_before(pl
     before[2:, 2] = np.nan
     posts = POSTS if placed else np.full_like(POSTS, np.nan)
     first, second = town(rssi_db=before, station_position=posts), town(station_position=posts)
-    learned = Split("none", (Fold(np.arange(len(first)), none, none),), "")
-    chosen = answerable(Split("whole", (Fold(none, none, every),), ""), second, (first, learned))
+    learned = Split("none", (Fold(np.arange(len(first)), none, none),))
+    chosen = answerable(Split("whole", (Fold(none, none, every),)), second, (first, learned))
     assert set(second.station[chosen.folds[0].test]) == {0, 1}
     assert "test rows are left out, of stations with under 4 training rows" in caplog.text
     for name in ("zero", "kriging"):

@@ -5,7 +5,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.plausibility import find_level_steps, link_levels
+from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.plausibility import find_level_steps
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan
 from gsparc.evaluation.site_plan import draw_site, find_spots

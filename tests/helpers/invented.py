@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.data.splits import Fold, Split
 from gsparc.ops import SphereGrid
 
 
@@ -42,4 +42,4 @@ def divide(rows: int, folds: int = 1) -> Split:
         test = np.arange(fold, rows, folds if folds > 1 else 4)
         rest = np.setdiff1d(np.arange(rows), test)
         parts.append(Fold(train=rest[3:], val=rest[:3], test=test))
-    return Split("toy", tuple(parts), hash_indices(tuple(parts)))
+    return Split("toy", tuple(parts))

@@ -169,19 +169,19 @@ def test_a_baseline_that_cannot_ended_the_run_of_a_station_with_few_rows():
         Fold(np.setdiff1d(np.arange(len(data)), rows), np.zeros(0, int), np.array(rows))
         for rows in ([0, 4, 6], [1, 4, 6])
     ]
-    kept = [baselines_for(data, Split("random", (fold,), "")) for fold in folds]
+    kept = [baselines_for(data, Split("random", (fold,))) for fold in folds]
     assert ["complex_gp" in names for names in kept] == [True, False]
 
 
 def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeypatch):
     """A file of 50,000 rows at 12 stations read 12 large matrices for every 64 rows: half an hour."""
     method = fitted("gp", town, fold, tmp_path)
-    whole = score_methods([method], town, Split("random", (fold,), ""))
+    whole = score_methods([method], town, Split("random", (fold,)))
     asked = []
     monkeypatch.setattr("gsparc.evaluation.scores.CHUNK", 6)
     answer = method.predict
     monkeypatch.setattr(method, "predict", lambda b: asked.append(len(b.station.unique())) or answer(b))
-    parts = score_methods([method], town, Split("random", (fold,), ""))
+    parts = score_methods([method], town, Split("random", (fold,)))
     assert sum(asked) < len(asked) + len(POSTS)
     np.testing.assert_array_equal(parts.row, whole.row)
     for name in whole.samples:

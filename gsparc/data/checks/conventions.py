@@ -123,20 +123,16 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
     kind, place = data.site.kind, np.hstack([data.tx, data.rx_position])
     groups, declared = _groups(place), _score(data, labels)
-    rivals = {}
+    rivals: dict[str, Score] = {}
     for name in _tried(few):
         with suppress(ValueError):  # a grid turned beyond a pole
             placed = convert_conventions(data, [name])
             # Within a wavelength all places are one: whatever does not move fits.
             if kind == "spectrum" or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean():
-                rivals[name] = _score(placed, labels)
-
-    def may_be(name: str, rival: Score) -> bool:
-        gain = float((rival.rows - declared.rows).mean())
-        clear = name != "delays_removed" or (rival.fit > ONE_DELAY and gain > CLEAR)
-        return clear and rival.fit > FIT[kind]
-
-    rivals = {name: one for name, one in rivals.items() if may_be(name, one)}
+                one = _score(placed, labels)
+                delayed = one.fit > ONE_DELAY and (one.rows - declared.rows).mean() > CLEAR
+                if one.fit > FIT[kind] and (delayed or name != "delays_removed"):
+                    rivals[name] = one
     best = max(rivals.values(), key=lambda one: one.log_likelihood, default=declared)
     gain = best.rows - declared.rows
     of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])

@@ -86,11 +86,11 @@ def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
 
 def outlier_warnings(data: Measurements) -> list[str]:
     """Say each kind of outlier in one sentence, with the names of the first rows."""
-    sentences = []
-    for what, rows in find_outliers(data).items():
-        names = list_first([data.row_names[i] for i in rows])
-        sentences.append(f"{names}: {what}; if they are wrong, leave them out with split.leave_out=outliers")
-    return sentences
+    names = {
+        what: list_first([data.row_names[i] for i in rows]) for what, rows in find_outliers(data).items()
+    }
+    advice = "if they are wrong, leave them out with split.leave_out=outliers"
+    return [f"{who}: {what}; {advice}" for what, who in names.items()]
 
 
 WIDTHS = 30.0  # of the rows' box

@@ -12,7 +12,8 @@ import numpy as np
 
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.conventions import convention_warnings
-from gsparc.data.checks.plausibility import find_level_steps, link_levels, sanity_warnings
+from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import Caution, DataError, Problems, Severe

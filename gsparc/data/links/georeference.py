@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from pyproj import Geod
+from pyproj import Proj
 
 from gsparc.data.errors import DataError
 
 DIGITS = 4  # of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
 # Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.
 ON_EARTH = ((-90, 90), (-180, 360))
-_WGS84 = Geod(ellps="WGS84")
 
 
 @dataclass(frozen=True)
@@ -34,9 +33,7 @@ class Georeference:
     longitude: float
 
     def __post_init__(self) -> None:
-        fault = find_invalid_coordinate(self.latitude, self.longitude)
-        if fault is not None:
-            raise DataError(f"origin: {fault[1]}")
+        _refuse_invalid(self.latitude, self.longitude, "origin: ")
 
     @classmethod
     def from_coordinates(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
@@ -46,9 +43,9 @@ class Georeference:
             DataError: no places, or a value is not in range.
         """
         latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
-        fault = find_invalid_coordinate(latitude, longitude) if latitude.size else (0, "no places")
-        if fault is not None:
-            raise DataError(f"origin: {fault[1]}")
+        if not latitude.size:
+            raise DataError("origin: no places")
+        _refuse_invalid(latitude, longitude, "origin: ")
         # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
         turned = np.median((longitude - longitude[0] + 180) % 360 - 180) + longitude[0]
         east = (round(float(turned), DIGITS) + 180) % 360 - 180
@@ -60,14 +57,9 @@ class Georeference:
         Raises:
             DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
         """
-        fault = find_invalid_coordinate(latitude, longitude)
-        if fault is not None:
-            raise DataError(fault[1])
+        _refuse_invalid(latitude, longitude)
         there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
-        places = [np.array(v) for v in np.broadcast_arrays(self.longitude, self.latitude, *there)]
-        azimuth, _, distance = _WGS84.inv(places[0], places[1], places[2], places[3])
-        angle = np.radians(azimuth)
-        return np.stack([distance * np.sin(angle), distance * np.cos(angle)], axis=-1)
+        return np.stack(self._projection(*map(np.array, there)), axis=-1)
 
     def to_degrees(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return latitude, longitude (n,) [deg] of local (n, 2) [m]; the inverse of `from_degrees`.
@@ -78,13 +70,19 @@ class Georeference:
         xy = np.asarray(xy, np.float64)
         if xy.ndim != 2 or xy.shape[1] != 2:
             raise DataError(f"local coordinates: expected shape (n, 2), found {xy.shape}")
-        distance = np.hypot(xy[:, 0], xy[:, 1])
-        if not (distance < 2.0e7).all():
+        if not (np.hypot(xy[:, 0], xy[:, 1]) < 2.0e7).all():
             raise DataError("local coordinates: not finite, or not on Earth; expected metres from the origin")
-        azimuth = np.degrees(np.arctan2(xy[:, 0], xy[:, 1]))
-        east, north = (np.full(len(xy), v) for v in (self.longitude, self.latitude))
-        longitude, latitude, _ = _WGS84.fwd(east, north, azimuth, distance)
+        longitude, latitude = self._projection(xy[:, 0], xy[:, 1], inverse=True)
         return np.asarray(latitude), np.asarray(longitude)
+
+    @property
+    def _projection(self) -> Proj:
+        return Proj(proj="aeqd", ellps="WGS84", lat_0=self.latitude, lon_0=self.longitude)
+
+
+def _refuse_invalid(latitude: np.ndarray | float, longitude: np.ndarray | float, what: str = "") -> None:
+    if (fault := find_invalid_coordinate(latitude, longitude)) is not None:
+        raise DataError(f"{what}{fault[1]}")
 
 
 def find_invalid_coordinate(

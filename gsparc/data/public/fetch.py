@@ -16,7 +16,7 @@ from urllib.parse import quote
 import yaml
 from filelock import FileLock, Timeout
 
-from gsparc.data.errors import DataError, explain_error, suggest_name
+from gsparc.data.errors import DataError, Problems, explain_error, suggest_name
 from gsparc.data.files import platform_cache, read_shipped_table
 from gsparc.data.public.hub import fetch_from_hub
 
@@ -131,10 +131,7 @@ def fetched_path(choice: str, setting: str = "file") -> Path:
 
 def fetched_path_or_none(choice: str) -> Path | None:
     """Return the same as `fetched_path`; None where it is not there."""
-    try:
-        return fetched_path(choice)
-    except DataError:
-        return None
+    return Problems(choice).attempt(partial(fetched_path, choice))
 
 
 def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries: int = 2) -> Path:

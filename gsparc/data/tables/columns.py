@@ -127,8 +127,7 @@ def choose_columns(
         # Columns whose head says less than others of the quantity count only where there is nothing better.
         candidates = [column for column in found if not column.less] or found
         if role == "station":
-            candidates = _identity(sheet, candidates, always=only is not None)
-            candidates = _finest(sheet, candidates)
+            candidates = _finest(sheet, _identity(sheet, candidates, always=only is not None))
         tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
         # With a column of stations a row is of one: several columns of levels would contradict it.
         one_each = tones or "station" not in {**chosen, **guesses}

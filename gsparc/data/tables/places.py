@@ -316,7 +316,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
         return None, notes
     names = sheet.joined(c.head for c in chosen["station"])
-    every = {"+".join(heads): _named(sheet, heads) for heads in aliases}
+    every = {"+".join(heads): tuple(sheet.joined(heads).tolist()) for heads in aliases}
     unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
     repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
     by = ["+".join(c.head or "" for c in chosen["station"]), *unique]
@@ -348,7 +348,3 @@ def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
         beside = TOGETHER.get(min(words), set())
         result += [(head, other) for other in sheet.heads if other != head and set(words_of(other)) & beside]
     return result
-
-
-def _named(sheet: Sheet, heads: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(" ".join(row) for row in zip(*(sheet.words(head).tolist() for head in heads), strict=True))

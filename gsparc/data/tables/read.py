@@ -214,14 +214,13 @@ class Builder:
             said = MEASURED.fullmatch(label)
             if said and said[2].lower() in UNITS and UNITS[said[2].lower()].kind == "frequency":
                 label = f"{UNITS[said[2].lower()].factor * float(said[1]):.0f}"
-            where = self.sheet.describe_column(column.head or "")
             # A sign belongs to the number: tones -1 and 1 lie on both sides of the carrier.
             if not re.fullmatch(r"[-+]?\d+|", label):
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
-                self.sheet.problems.add(where, f"{fault}, or say dataset.columns.{part}='NAME*'")
+                self.refuse(f"{fault}, or say dataset.columns.{part}='NAME*'", column.head or "")
             elif tones.setdefault(int(label or 0), column) is not column:
                 other = tones[int(label or 0)].head
-                self.sheet.problems.add(where, f"the same tone as {other!r}; rename one")
+                self.refuse(f"the same tone as {other!r}; rename one", column.head or "")
         return tones
 
     def _ends(self, measured: str | None) -> None:
@@ -299,8 +298,10 @@ class Builder:
             if self.listed is not None:
                 fault = "no column says which station a row is of"
                 return self.refuse(f"{fault}; say dataset.columns.station=COLUMN")
-            if where is None:
-                where = self._second_in_degrees(end_places)
+            if where is None and len(end_places) > 1 and all(end.degrees for end in end_places.values()):
+                # Stations are fewer than the places that were measured at, whichever end they are.
+                few = min(end_places, key=lambda end: len(np.unique(end_places[end].all(), axis=0)))
+                where = end_places.pop(few)
             return None if where is None else self._unnamed(where)
         words, head = self.sheet.joined(c.head for c in columns), columns[0].head or ""
         if self.listed is not None:
@@ -382,16 +383,14 @@ class Builder:
             self.notes += said
         known = {"", *self.listed.names, *lacking}
         unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in known]
+        place = f"{self.sheet.source}, " + ("the heads" if head is None else f"column {head!r}")
         if len(unlisted) > MOST_NAMED:
-            place = "the heads" if head is None else f"column {head!r}"
             fault = f"{list_first([*map(repr, unlisted)])} are no listed stations; the list has "
-            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault + list_first(self.listed.names))
-            return
+            return self.sheet.problems.add(place, fault + list_first(self.listed.names))
         for word in unlisted:
-            row = self.sheet.rows[int(np.argmax(words == word))] if head is not None else ""
-            place = "the heads" if head is None else f"column {head!r}, {row}"
+            row = "" if head is None else f", {self.sheet.rows[int(np.argmax(words == word))]}"
             fault = f"{word!r} is no listed station{suggest_name(word, self.listed.names)}"
-            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
+            self.sheet.problems.add(place + row, fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:
         assert self.listed is not None
@@ -403,14 +402,6 @@ class Builder:
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
             self.notes.append(f"listed, but {where}: {list_first(names, 8)}")
-
-    def _second_in_degrees(self, ends: dict[str, Places]) -> Places | None:
-        """Of two ends in degrees, the one with fewer places, which are then stations."""
-        if len(ends) < 2 or not all(where.degrees for where in ends.values()):
-            return None
-        # Stations are fewer than the places that were measured at, whichever end they are.
-        few = min(ends, key=lambda end: len(np.unique(ends[end].all(), axis=0)))
-        return ends.pop(few)
 
     def _unnamed(self, where: Places) -> StationList | None:
         """Stations told apart by their places alone."""

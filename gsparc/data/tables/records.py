@@ -37,7 +37,8 @@ def read_records(path: Path) -> pd.DataFrame:
         padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
         places = pd.DataFrame([one[:3] for one in padded], dtype=float)
         frame = frame.join(places.rename(columns=dict(enumerate(PLACE))).loc[:, lambda p: p.notna().any()])
-    for name in [name for name in frame if frame[name].map(_is_long).any()]:
+    lengths = frame.map(lambda value: len(value) if isinstance(value, list) else 0).max()
+    for name in lengths.index[lengths > MOST_VALUES]:
         raise ValueError(f"more than {MOST_VALUES:,} values in {name!r} of one record; expected one in each")
     short = Counter(name.rpartition(".")[2] for name in frame)
     return frame.rename(columns=lambda name: last if short[last := name.rpartition(".")[2]] == 1 else name)
@@ -45,10 +46,6 @@ def read_records(path: Path) -> pd.DataFrame:
 
 def _holds_records(value: Any) -> bool:
     return isinstance(value, list) and any(isinstance(one, dict) for one in value)
-
-
-def _is_long(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > MOST_VALUES
 
 
 def _of_json(text: str) -> list[dict[str, Any]]:

@@ -108,7 +108,8 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
             carrier = turned(found.pop(name))
             if np.isfinite(carrier).all():
                 found.setdefault("carrier_hz", carrier)
-                notes.append(f"{sheet.source}: carriers by {name}: {list_first(_in_mhz(carrier), 4)}")
+                in_mhz = [f"{one / MHZ:g} MHz" for one in np.unique(carrier)]
+                notes.append(f"{sheet.source}: carriers by {name}: {list_first(in_mhz, 4)}")
             elif "carrier_hz" not in found:
                 notes.append(Caution(f"{sheet.source}: {name}: some of it names no frequency; not read"))
     if heads:
@@ -189,10 +190,6 @@ def _doubt(
     if refused:
         raise DataError(said)
     return [Caution(said)]
-
-
-def _in_mhz(carrier: np.ndarray) -> list[str]:
-    return [f"{one / MHZ:g} MHz" for one in np.unique(carrier)]
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:

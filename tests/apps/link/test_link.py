@@ -245,8 +245,8 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
 
 
 def _split():
-    from gsparc.data.splits import Split, hash_indices
+    from gsparc.data.splits import Split
 
     one = fold()
     whole = type(one)(one.train[:40], one.val, np.concatenate([np.arange(40, 80), one.test]))
-    return Split("toy", (whole,), hash_indices((whole,)))
+    return Split("toy", (whole,))

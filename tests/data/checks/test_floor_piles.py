@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from releases import real
 
-from gsparc.data.checks.plausibility import find_floor_pile, floor_warnings, link_levels
+from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.plausibility import find_floor_pile, floor_warnings
 from gsparc.data.own import from_arrays
 
 

@@ -7,7 +7,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.checks import plausibility
 from gsparc.data.checks.level_steps import detect_level_steps
-from gsparc.data.checks.plausibility import LinkLevels, link_levels
+from gsparc.data.checks.link_levels import LinkLevels, link_levels
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datasets.own import read_any
 from gsparc.data.own import from_arrays

@@ -7,7 +7,8 @@ import pytest
 from networks import network
 from releases import release
 
-from gsparc.data.checks.plausibility import floor_warnings, link_levels, sanity_warnings
+from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.plausibility import floor_warnings, sanity_warnings
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.errors import DataError, Severe
 from gsparc.data.links.strongest import number_lists

@@ -87,8 +87,8 @@ def test_gsparc_took_a_map_of_places_where_an_uplink_was_heard() -> None:
     method = Gsparc().create_for(data)
     assert isinstance(method, UplinkField) and method.name == "gsparc"
     assert not isinstance(Gsparc().create_for(deaf(data)), UplinkField)
-    assert "ridge" in baselines_for(data, Split("random", (fold(),), ""))
-    assert "ridge" not in baselines_for(deaf(data), Split("random", (fold(),), ""))
+    assert "ridge" in baselines_for(data, Split("random", (fold(),)))
+    assert "ridge" not in baselines_for(deaf(data), Split("random", (fold(),)))
 
 
 def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:

@@ -1,0 +1,94 @@
+"""Levels of powers as links, one station's at one place each, that questions of plausibility are asked of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.data.schema import Measurements
+from gsparc.data.selection import FROM_ROW
+
+UNNAMED = "the station"  # a single one, of a file without stations
+
+
+@dataclass(frozen=True)
+class LinkLevels:
+    """One row for every measurement, and for every place and station without one.
+
+    Attributes:
+        position: (n, 3) of the moving end, in the world [m].
+        station: (n,) int64.
+        level_db: (n,) [dB], NaN where there is no value.
+        rows: (n,) what messages call the row of the file.
+        file_row: (n,) its number from 0.
+        names: (T,) of the stations, for people.
+        keys: (T,) as settings take them.
+        station_position: (T, 3), in the world [m]; None where it is not known.
+        limited: stations with rows below a level of hearing that the file states, or that lists leave out.
+    """
+
+    position: np.ndarray
+    station: np.ndarray
+    level_db: np.ndarray
+    rows: list[str]
+    file_row: np.ndarray
+    names: list[str]
+    keys: list[str]
+    station_position: np.ndarray | None
+    limited: frozenset[int] = frozenset()
+
+    def heard(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield each station, and its rows (k,) with a value."""
+        for t in np.unique(self.station):
+            yield int(t), np.flatnonzero((self.station == t) & np.isfinite(self.level_db))
+
+
+def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkLevels | None:
+    """Return levels of powers with one end that stands still; None of anything else.
+
+    Args:
+        data: the measurements.
+        file_row: (S,) number of each row in its file; None: the row's own.
+    """
+    site = data.site
+    if site.kind != "rssi" or site.static_end is None:
+        return None
+    stations = site.stations
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    place = np.arange(len(data)) if data.place is None else data.place
+    _, first, which = np.unique(place, return_index=True, return_inverse=True)
+    count = 1 if stations is None else len(stations)
+    with np.errstate(divide="ignore"):
+        level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
+    link, called = which.reshape(-1) * count + station, data.row_names
+    side = data.censored_side(np.arange(len(data)))
+    rows = np.flatnonzero(side <= 0)
+    # Lists end at their weakest, of several levels: what piles up there is no receiver's noise.
+    floors = np.unique(np.stack([station, level], 1)[side > 0], axis=0)
+    floor_known = "sensitivity_db" in data.provenance or len(floors) > len(np.unique(floors[:, 0]))
+    limited = frozenset(floors[:, 0].astype(int).tolist() if floor_known else ())
+    absent = np.zeros(0, np.int64)
+    # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
+    # with a station for each place has no empty cells.
+    told = data.censored is not None or data.provenance.get("absent") == "unknown"
+    if not told and len(first) < len(data):
+        absent = np.setdiff1d(np.arange(len(first) * count), link)
+    parts = [] if stations is None else [name.split(FROM_ROW) for name in stations.name]
+    for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
+        # A part of a station is not absent before its first row or after its last.
+        at, own = absent // count, which[station == t]
+        within = (at > own.min(initial=len(first))) & (at < own.max(initial=0))
+        absent = absent[(absent % count != t) | within]
+    order = np.argsort(np.concatenate([rows, first[absent // count]]), kind="stable")
+    of_row = np.concatenate([rows, first[absent // count]])[order]
+    of_link = np.concatenate([station[rows], absent % count])[order]
+    levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
+    of_file = [called[i].partition(", station")[0] for i in of_row]
+    known = site.static_position if stations is None else stations.position
+    known = None if known is None else np.atleast_2d(known) + site.origin
+    names, keys = ([UNNAMED],) * 2 if stations is None else map(list, (stations.shown, stations.name))
+    number = of_row if file_row is None else file_row[of_row]
+    place = data.moving[of_row] + site.origin
+    return LinkLevels(place, of_link, levels, of_file, number, names, keys, known, limited)
