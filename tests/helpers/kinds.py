@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from boxes import room_of_spectra
 from campaigns import channels, powers, spectra
 from known_arrays import array_site, measure, room_vectors, walk
@@ -14,7 +15,11 @@ from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import bartlett_spectrum, steering_matrix
 
+CARRIERS, PLACES, WALL, CEILING = 5, 30, 4.0, 3.0
+HERTZ = np.array([1.0, 2.0, 5.0, 20.0, 60.0]) * 1e9
+ELEMENTS = planar_array(spacing_m=0.5)[:, [2, 0, 1]]  # in wavelengths, in the plane yz
 POSTS = np.array([[0.0, 0.0, 5.0], [20.0, 0.0, 5.0]])
 
 
@@ -28,6 +33,30 @@ def static_array(folder: Path) -> Measurements:
     site = array_site(SphereGrid.hemisphere(16, 32), planar_array())
     tx = walk(60)
     return measure(site, tx, room_vectors(tx, 1, planar_array())[0], "kinds")
+
+
+def carriers(folder: Path | None = None) -> Measurements:
+    """Places in sight of an array, a mirror at y = 4 and one at z = 3; phases of paths free."""
+    rng, grid, elements = np.random.default_rng(0), SphereGrid.hemisphere(24, 48), ELEMENTS
+    place = np.c_[rng.uniform(2, 6, PLACES), rng.uniform(-3, 3, PLACES), rng.uniform(0.8, 1.6, PLACES)]
+    images = [place, place * [1, -1, 1] + [0, 2 * WALL, 0], place * [1, 1, -1] + [0, 0, 2 * CEILING]]
+    away = np.stack(images, 1) - [0.0, 0.0, 1.0]
+    distance = np.linalg.norm(away, axis=2)
+    response = np.exp(2j * np.pi * away / distance[..., None] @ elements.T)
+    gains = np.array([1, 0.8, 0.7]) / distance * np.exp(2j * np.pi * rng.random((CARRIERS, PLACES, 3)))
+    vectors = np.einsum("cpk,pkm->pcm", gains, response).reshape(-1, 16)
+    spectra = bartlett_spectrum(torch.from_numpy(vectors), steering_matrix(elements, grid, 1.0)).numpy()
+    spectra = (spectra / spectra.max(1, keepdims=True)).reshape(-1, 24, 48)
+    station = np.tile(np.arange(CARRIERS), PLACES)
+    arrays = {
+        "tx_position": np.repeat(place, CARRIERS, axis=0), "rx_position": np.array([0.0, 0.0, 1.0]),
+        "spectrum": spectra, "carrier_hz": HERTZ[station], "array_position": elements * 0.3,
+    }  # fmt: skip
+    data = from_arrays(arrays, {"normalisation": "max"})
+    # An array half a wavelength apart at each carrier.
+    alike = elements * (299_792_458.0 / HERTZ)[:, None, None]
+    object.__setattr__(data.site.stations, "array", alike)
+    return data
 
 
 def moving_array(folder: Path) -> Measurements:

@@ -58,8 +58,8 @@ class Georeference:
             DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
         """
         _refuse_invalid(latitude, longitude)
-        there = np.atleast_1d(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
-        return np.stack(self._projection(*map(np.array, there)), axis=-1)
+        east, north = (np.array(one, np.float64, ndmin=1) for one in (longitude, latitude))
+        return np.stack(self._projection(east, north), axis=-1)
 
     def to_degrees(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return latitude, longitude (n,) [deg] of local (n, 2) [m]; the inverse of `from_degrees`.

@@ -22,7 +22,8 @@ from gsparc.models.carriers.geometry import SharedPaths, find_paths
 from gsparc.models.method import Prediction
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances, matern32
-from gsparc.processes.left_out import left_out_residuals
+from gsparc.processes.left_out import left_out_residuals, rows_of_groups
+from gsparc.processes.neighbourhood import covering_rows
 from gsparc.processes.stored import Stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
@@ -31,7 +32,7 @@ PIXELS = 500  # of an image, that settings are chosen on
 LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
 SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
 NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
-MOST_ROWS = 4000
+MOST_ROWS, CHOSEN_ON = 4000, 600  # rows that are learned from, and that settings are chosen on
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,10 @@ class Covariance(Stored):
         return self.shared * matern32(apart, self.length) + here * (
             1 + self.near * matern32(octaves, OCTAVES)
         )
+
+    def gram(self, rows: Tensor) -> Tensor:
+        """Return covariances (n, n) of rows (n, 4) with their noise."""
+        return self.between(rows, rows) + self.noise * torch.eye(len(rows), dtype=torch.float64)
 
     @property
     def prior(self) -> float:
@@ -90,10 +95,7 @@ class CarrierField(OneArray):
             ValueError: not spectra of one array at several carriers, or too many.
         """
         watch, known = Stopwatch(), np.concatenate([fold.train, fold.val])
-        if len(known) > MOST_ROWS:
-            raise ValueError(
-                f"{self.name}: {len(known)} rows, {MOST_ROWS} at most; thin with split.train_count"
-            )
+        whole, known = len(known), known[_at_covering_places(data.tx[known], MOST_ROWS)]
         images, groups = self.read_rows(data, known)
         carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()
         assert carrier is not None and grid is not None
@@ -104,26 +106,32 @@ class CarrierField(OneArray):
         expected, which = self.expected(self.paths, self.places) - self.mean, torch.empty(len(known)).long()
         for place, rows in enumerate(groups):
             which[rows] = place
-        self._choose(images - self.mean, expected[which], groups)
+        few = _at_covering_places(data.tx[known], CHOSEN_ON)
+        of_few = rows_of_groups(which[few].numpy())
+        self._choose(self.rows[few], (images - self.mean)[few], expected[which[few]], of_few)
         left = images - self.mean - self.weight * expected[which]
-        self._kept, factor = None, Factor.from_gram(self._gram(self.covariance))
+        self._kept, factor = None, Factor.from_gram(self.covariance.gram(self.rows))
         self.left = factor.solve(left.double()).float()
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
         one = self.covariance
         kernel = (
             f"length {one.length:.3g} m, shared {one.shared:.3g}, near {one.near:.3g}, noise {one.noise:.3g}"
         )
-        return FitReport(watch.seconds, (f"{self.name}: {planes}; {kernel}, chosen on left-out places",))
+        notes = [f"{self.name}: {planes}; {kernel}, chosen on left-out places"]
+        if len(known) < whole:
+            some = f"{len(known)} of {whole} rows are learned from, at places all over the site"
+            notes.append(f"{self.name}: {some}")
+        return FitReport(watch.seconds, tuple(notes))
 
-    def _choose(self, images: Tensor, expected: Tensor, groups: list[Tensor]) -> None:
+    def _choose(self, rows: Tensor, images: Tensor, expected: Tensor, groups: list[Tensor]) -> None:
         """Set the weight of paths and the covariance of least error at places and rows left out."""
         step = max(1, images.shape[1] // PIXELS)
         both = torch.cat([images[:, ::step], expected[:, ::step]], 1).double()
-        diagonal = float((self.rows[:, :3].amax(0) - self.rows[:, :3].amin(0)).norm()) or 1.0
+        diagonal = float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0
         best = math.inf
         for length, shared, near, noise in product(LENGTHS, SHARES, NEAR_CARRIERS, NOISES):
             one = Covariance(length * diagonal, shared, near, noise)
-            inverse = Factor.from_gram(self._gram(one)).inverse
+            inverse = Factor.from_gram(one.gram(rows)).inverse
             solved = inverse @ both
             away, variance = left_out_residuals(inverse, solved, groups)
             # Residuals are linear in what is taken off: the best weight is a quotient.
@@ -167,8 +175,12 @@ class CarrierField(OneArray):
 
     def _inverse(self) -> Tensor:
         if self._kept is None:
-            self._kept = Factor.from_gram(self._gram(self.covariance)).inverse
+            self._kept = Factor.from_gram(self.covariance.gram(self.rows)).inverse
         return self._kept
 
-    def _gram(self, one: Covariance) -> Tensor:
-        return one.between(self.rows, self.rows) + one.noise * torch.eye(len(self.rows), dtype=torch.float64)
+
+def _at_covering_places(places: np.ndarray, most: int) -> np.ndarray:
+    """Rows (m,) at places (n, 3) spread over all, every row of a place: about so many at most."""
+    where, which = np.unique(places, axis=0, return_inverse=True)
+    kept = covering_rows(where, max(2, most * len(where) // len(places)), 0)
+    return np.flatnonzero(np.isin(which.reshape(-1), kept))

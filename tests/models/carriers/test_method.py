@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import kinds
 import numpy as np
 import pytest
 import torch
+from kinds import CARRIERS, CEILING, ELEMENTS, WALL
 
-from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
+from gsparc.models.carriers import method
 from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.carriers.geometry import STEP, find_paths, ways
 from gsparc.models.carriers.method import CarrierField
@@ -17,46 +19,20 @@ from gsparc.models.carriers.plain import DirectBeam, OtherCarriers
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import wrap_per_station
 from gsparc.ops import Pose, SphereGrid
-from gsparc.physics.array_response import bartlett_spectrum, steering_matrix
 from gsparc.physics.lags import SpectrumLags
 from gsparc.training.context import FitContext
-
-CARRIERS, PLACES, WALL, CEILING = 5, 30, 4.0, 3.0
-HERTZ = np.array([1.0, 2.0, 5.0, 20.0, 60.0]) * 1e9
-ELEMENTS = planar_array(spacing_m=0.5)[:, [2, 0, 1]]  # in wavelengths, in the plane yz
 
 
 @pytest.fixture(scope="module")
 def room():
-    """Places in sight of an array, a mirror at y = 4 and one at z = 3; phases of paths free."""
-    rng, grid = np.random.default_rng(0), SphereGrid.hemisphere(24, 48)
-    elements = ELEMENTS
-    place = np.c_[rng.uniform(2, 6, PLACES), rng.uniform(-3, 3, PLACES), rng.uniform(0.8, 1.6, PLACES)]
-    images = [place, place * [1, -1, 1] + [0, 2 * WALL, 0], place * [1, 1, -1] + [0, 0, 2 * CEILING]]
-    away = np.stack(images, 1) - [0.0, 0.0, 1.0]
-    distance = np.linalg.norm(away, axis=2)
-    response = np.exp(2j * np.pi * away / distance[..., None] @ elements.T)
-    gains = np.array([1, 0.8, 0.7]) / distance * np.exp(2j * np.pi * rng.random((CARRIERS, PLACES, 3)))
-    vectors = np.einsum("cpk,pkm->pcm", gains, response).reshape(-1, 16)
-    spectra = bartlett_spectrum(torch.from_numpy(vectors), steering_matrix(elements, grid, 1.0)).numpy()
-    spectra = (spectra / spectra.max(1, keepdims=True)).reshape(-1, 24, 48)
-    station = np.tile(np.arange(CARRIERS), PLACES)
-    arrays = {
-        "tx_position": np.repeat(place, CARRIERS, axis=0), "rx_position": np.array([0.0, 0.0, 1.0]),
-        "spectrum": spectra, "carrier_hz": HERTZ[station], "array_position": elements * 0.3,
-    }  # fmt: skip
-    data = from_arrays(arrays, {"normalisation": "max"})
-    # An array half a wavelength apart at each carrier.
-    alike = elements * (299_792_458.0 / HERTZ)[:, None, None]
-    object.__setattr__(data.site.stations, "array", alike)
-    return data
+    return kinds.carriers()
 
 
-def fit(method, data, test):
+def fit(one, data, test):
     train = np.setdiff1d(np.arange(len(data)), test)
     none = train[:0]
-    method.fit(data, Fold(train, none, test), FitContext(Path()))
-    return method
+    one.fit(data, Fold(train, none, test), FitContext(Path()))
+    return one
 
 
 def error(method, data, rows):
@@ -134,3 +110,15 @@ def test_an_array_that_carriers_see_differently_is_not_one(room):
     assert carriers_obstacle(plain.site) == "carriers see through different arrays"
     with pytest.raises(ValueError, match="carriers: carriers see through different arrays"):
         fit(CarrierField(), plain, LAST)
+
+
+def test_more_rows_than_a_process_takes_were_refused(room, monkeypatch):
+    """Over 4,000 rows `model=gsparc` ended in an error; whole places all over the site are learned from."""
+    monkeypatch.setattr(method, "MOST_ROWS", 60)
+    monkeypatch.setattr(method, "CHOSEN_ON", 30)
+    field, none = CarrierField(), np.zeros(0, np.int64)
+    report = field.fit(room, Fold(np.arange(100), none, np.arange(100, 150)), FitContext(Path()))
+    learned = len(field.rows)
+    assert 30 <= learned <= 60 and learned % CARRIERS == 0
+    assert f"{learned} of 100 rows are learned from" in report.notes[-1]
+    assert torch.isfinite(field.predict(room.batch(np.arange(100, 150))).mean).all()
