@@ -32,7 +32,12 @@ PIXELS = 500  # of an image, that settings are chosen on
 LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
 SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
 NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
-MOST_ROWS, CHOSEN_ON = 4000, 600  # rows that are learned from, and that settings are chosen on
+OWN, ALONE = (
+    (0.0, 2.0),
+    0.2,
+)  # of the same, what images have in common within .2 octaves at neighbouring places
+NOISES_ALONE = (0.03, 0.1, 0.3, 1.0)  # of carriers that tell nothing of each other
+MOST_ROWS, CHOSEN_ON = 4000, 500  # rows that are learned from, and that settings are chosen on
 
 
 @dataclass(frozen=True)
@@ -43,24 +48,28 @@ class Covariance(Stored):
         length: over places [m].
         shared: of what neighbouring places share, at all carriers.
         near: of what near carriers of a place share.
+        own: of what neighbouring places share at near carriers alone.
         noise: of each row.
+        place: 1; 0 where carriers tell nothing of each other.
         amplitude: of the whole, per pixel.
     """
 
     length: float
     shared: float
     near: float
+    own: float
     noise: float
+    place: float = 1.0
     amplitude: float = 1.0
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
         apart = distances(a[:, :3], b[:, :3])
         octaves = (a[:, None, 3] - b[None, :, 3]).abs()
-        here = (apart < SAME_PLACE).double()
-        return self.shared * matern32(apart, self.length) + here * (
-            1 + self.near * matern32(octaves, OCTAVES)
-        )
+        here, alike = (apart < SAME_PLACE).double(), matern32(octaves, OCTAVES)
+        around, own = matern32(apart, self.length), self.own * matern32(octaves, ALONE)
+        # Of a carrier alone: its mean image, and what varies over places.
+        return self.shared * around + own * (1 + around) + here * (self.place + self.near * alike)
 
     def gram(self, rows: Tensor) -> Tensor:
         """Return covariances (n, n) of rows (n, 4) with their noise."""
@@ -69,7 +78,7 @@ class Covariance(Stored):
     @property
     def prior(self) -> float:
         """Variance of a row without noise."""
-        return self.shared + 1 + self.near
+        return self.shared + 2 * self.own + self.place + self.near
 
 
 class CarrierField(OneArray):
@@ -114,9 +123,8 @@ class CarrierField(OneArray):
         self.left = factor.solve(left.double()).float()
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
         one = self.covariance
-        kernel = (
-            f"length {one.length:.3g} m, shared {one.shared:.3g}, near {one.near:.3g}, noise {one.noise:.3g}"
-        )
+        parts = f"shared {one.shared:.3g}, near {one.near:.3g}, own {one.own:.3g}, noise {one.noise:.3g}"
+        kernel = f"length {one.length:.3g} m, {parts}" + " (each carrier alone)" * (not one.place)
         notes = [f"{self.name}: {planes}; {kernel}, chosen on left-out places"]
         if len(known) < whole:
             some = f"{len(known)} of {whole} rows are learned from, at places all over the site"
@@ -129,8 +137,10 @@ class CarrierField(OneArray):
         both = torch.cat([images[:, ::step], expected[:, ::step]], 1).double()
         diagonal = float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0
         best = math.inf
-        for length, shared, near, noise in product(LENGTHS, SHARES, NEAR_CARRIERS, NOISES):
-            one = Covariance(length * diagonal, shared, near, noise)
+        together = (Covariance(1.0, *one) for one in product(SHARES, NEAR_CARRIERS, OWN, NOISES))
+        apart = (Covariance(1.0, 0.0, 0.0, 1.0, noise, place=0.0) for noise in NOISES_ALONE)
+        for length, one in product(LENGTHS, (*together, *apart)):
+            one = replace(one, length=length * diagonal)
             inverse = Factor.from_gram(one.gram(rows)).inverse
             solved = inverse @ both
             away, variance = left_out_residuals(inverse, solved, groups)
