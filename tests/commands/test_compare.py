@@ -92,7 +92,7 @@ def filled_here(tmp_path_factory) -> list[dict]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["joblib", "ray"])
+@pytest.mark.parametrize("engine", ["joblib", pytest.param("ray", marks=pytest.mark.rare)])
 def test_cells_filled_elsewhere_are_the_same(filled_here, tmp_path, engine):
     pytest.importorskip(engine, reason=f"{engine} is not installed")
     spectra(tmp_path / "own.npz")

@@ -61,6 +61,7 @@ def test_a_killed_job_is_gone_on_with_and_nothing_is_done_twice(tmp_path, monkey
 
 
 @pytest.mark.slow
+@pytest.mark.rare
 def test_jobs_on_ray_return_what_jobs_here_do_and_are_not_done_again(tmp_path):
     pytest.importorskip("ray", reason="ray is not installed")
     spectra(tmp_path / "own.npz")
