@@ -18,6 +18,7 @@ from gsparc.data.schema import Site
 from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
+from gsparc.models.carriers.method import CarrierField
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, HasGaussians, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
@@ -124,7 +125,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.shown)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
         both = self.method, self._whole
-        method, whole = (m.station_method(number) if isinstance(m, PerStation) else m for m in both)
+        method, whole = (
+            m.station_method(number) if isinstance(m, PerStation | CarrierField) else m for m in both
+        )
         return self._copy_with(method, whole, station_site(self.site, number), self._unit)
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:

@@ -58,6 +58,7 @@ MAKES = {  # what others than of received powers are fitted to
     **dict.fromkeys(("complex_gp", "channels", "image_sources"), kinds.gains),
     **dict.fromkeys(("array", "splat", "array_process"), kinds.static_array),
     **dict.fromkeys(("moving_array", "bearings"), kinds.moving_array),
+    **dict.fromkeys(("carriers", "other_carriers", "direct_beam"), kinds.carriers),
     **dict.fromkeys(SMALL, lambda folder: lobes(folder)[0]),
     **dict.fromkeys(("ngrf", "newrf"), lambda _: room(40, directions=True)[0]),
     **dict.fromkeys(UPLINK, lambda _: city("all")),
@@ -221,10 +222,14 @@ def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.
 def test_what_is_scored_is_what_is_served(name):
     """`answer` of rows and `predict` of places were two ways, each with code of its own."""
     method, data, fold = fitted(name)
-    batch, predictor = data.batch(fold.test), Predictor(method, data.site)
+    rows, predictor = fold.test, Predictor(method, data.site)
+    if data.station is not None:
+        rows = rows[data.station[rows] == data.station[rows[0]]]
+        predictor = predictor.select_station(int(data.station[rows[0]]))
+    batch = data.batch(rows)
     scored = method.predict(batch).mean
     if name not in UPLINK:
-        return torch.testing.assert_close(served(predictor, data, fold.test), scored, rtol=1e-4, atol=1e-5)
+        return torch.testing.assert_close(served(predictor, data, rows), scored, rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="uplink= is needed"):
         method.predict(replace(batch, uplink=None))
     heard = batch.uplink * data.site.target_scale

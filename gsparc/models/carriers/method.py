@@ -6,6 +6,7 @@ process over places and carriers learns what is left: rows of a place observed a
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, replace
 from itertools import product
@@ -93,6 +94,7 @@ class CarrierField(OneArray):
     paths: SharedPaths
     covariance: Covariance
     _kept: Tensor | None = None
+    _carrier: int | None = None
 
     def __init__(self, name: str = "carriers") -> None:
         self.name = name
@@ -163,6 +165,8 @@ class CarrierField(OneArray):
         """
         site = self.fitted_site
         assert site.stations is not None and site.stations.carrier_hz is not None
+        if query.station is None and self._carrier is not None:
+            query = replace(query, station=torch.full((len(query.tx),), self._carrier))
         if query.station is None:
             raise ValueError(
                 f"{self.name}: which carrier? say station=, one of {', '.join(site.stations.shown)}"
@@ -178,6 +182,12 @@ class CarrierField(OneArray):
         error = self.covariance.amplitude * (variance + self.covariance.noise)
         mean = self.answer_images(image, query)
         return Prediction(mean, error.to(mean.dtype), (variance / prior).to(mean.dtype))
+
+    def station_method(self, number: int) -> CarrierField:
+        """Return the same asked about one carrier, which queries then need not name."""
+        twin = copy.copy(self)
+        twin._carrier = number
+        return twin
 
     def count_components(self) -> int:
         """Return the number of mirror planes."""
