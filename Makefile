@@ -64,7 +64,7 @@ $(VENV)/.sionna: $(VENV)/.installed
 demo: setup ## train on a small simulated site, print the table, draw the spectra (half a minute)
 	$(RUN) train.py experiment=demo hydra.run.dir=demo
 
-test: setup ## fast tests (four minutes on two idle cores)
+test: setup ## fast tests (five minutes on two idle cores)
 	$(PYTEST) -m "not slow"
 
 browser: ## Debian's chromium for the test of the report, where packages can be reached

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
@@ -14,28 +15,26 @@ Kind = Literal["spectrum", "csi", "rssi"]
 Values = TypeVar("Values", np.ndarray, Tensor)
 
 
-class Target:
+class Target(ABC):
     """A kind of measurement; rows are first in all arrays.
 
     Attributes:
         kind: its name in files and settings.
-        words: what one is, for people.
         numbers: real numbers of an entry.
         exponent: of an entry's magnitude that is its power.
         axes: of an array of them, rows among them.
-        signed: whether entries have a sign, or a phase.
+        is_complex: whether entries have a phase.
     """
 
     kind: ClassVar[Kind]
-    words: ClassVar[str]
     numbers: ClassVar[int] = 1
     exponent: ClassVar[int] = 2
     axes: ClassVar[int] = 3
-    signed: ClassVar[bool] = False
+    is_complex: ClassVar[bool] = False
 
+    @abstractmethod
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """Return how many of which shape (`shape` of one) there are, for people."""
-        raise NotImplementedError
 
     def to_real(self, target: np.ndarray) -> np.ndarray:
         """Return stored targets (n, ...) as float32 rows (n, D), in units in which interpolation is fair.
@@ -45,9 +44,9 @@ class Target:
         """
         return target.reshape(len(target), -1).astype(np.float32)
 
+    @abstractmethod
     def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """Return rows (B, D) of `to_real` as targets (B, *shape) in stored units."""
-        raise NotImplementedError
 
     def entry_variance(self, variance: Tensor, mean: Tensor) -> Tensor:
         """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry
@@ -78,7 +77,6 @@ class Spectrum(Target):
     """Amplitudes over directions (H, W), in [0, 1]."""
 
     kind = "spectrum"
-    words = "spectra"
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""
@@ -98,9 +96,8 @@ class Channel(Target):
     """Complex gains (antennas, subcarriers)."""
 
     kind = "csi"
-    words = "channels"
     numbers = 2
-    signed = True
+    is_complex = True
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""
@@ -121,7 +118,6 @@ class Power(Target):
     """Received powers (1,), linear; their errors are of decibels."""
 
     kind = "rssi"
-    words = "received powers"
     exponent = 1
     axes = 2
 

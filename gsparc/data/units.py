@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.data.files import read_shipped_table
+from gsparc.physics.decibels import RELATIVE_DB
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,6 @@ def list_units(kind: str) -> str:
 WATTS = {unit.name: unit.factor for unit in _LISTED if unit.kind == "power"}  # that a value of 1 is
 WATTS |= {"dBW": 1.0, "dBm": 1e-3}  # of levels the power of 0
 LINEAR = "linear"  # a power whose level is in the site's unit of levels, whatever that refers to
-DB = 10 / math.log(10)
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class PowerUnit:
         In float64: squares of powers in watts are beyond float32.
         """
         if self.decibels:
-            return variance.double() * (DB / stored.double().reshape(variance.shape)).square()
+            return variance.double() * (RELATIVE_DB / stored.double().reshape(variance.shape)).square()
         return variance.double() * self.scale**2
 
     def stored(self, values: Tensor) -> Tensor:
@@ -127,4 +127,4 @@ class PowerUnit:
 
 def power_in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean and deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
-    return 10 * np.log10(mean), DB * np.sqrt(variance) / mean
+    return 10 * np.log10(mean), RELATIVE_DB * np.sqrt(variance) / mean

@@ -20,7 +20,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.data.units import DB
+from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
@@ -65,7 +65,7 @@ class Prediction:
         many = factor.reshape(-1, *shape[: self.mean.ndim - 1])
         mean, variance, explained = self.mean * many, self.variance, self.explained
         if variance is not None:
-            own = (mean / DB).square() * spread.reshape(many.shape)
+            own = (mean / RELATIVE_DB).square() * spread.reshape(many.shape)
             scale = factor.square().reshape(-1, *shape[: variance.ndim - 1])
             variance = variance * scale + own.reshape(variance.shape)
         return Prediction(mean, variance, self.unknown, None if explained is None else explained * many)

@@ -18,7 +18,6 @@ from gsparc.data.schema import Site
 from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
-from gsparc.models.carriers.method import CarrierField
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, HasGaussians, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
@@ -123,16 +122,16 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         number = find_station(station, stations)
         if number is None:
             raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.shown)}")
-        # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
+        # By number: two stations at one place, with different carriers, cannot be told apart by it.
         both = self.method, self._whole
-        method, whole = (
-            m.station_method(number) if isinstance(m, PerStation | CarrierField) else m for m in both
-        )
-        return self._copy_with(method, whole, station_site(self.site, number), self._unit)
+        method, whole = (m.station_method(number) if isinstance(m, PerStation) else m for m in both)
+        copy = self._copy_with(method, whole, station_site(self.site, number), self._unit)
+        copy.queries = Queries(copy.site, None if isinstance(self.method, PerStation) else number)
+        return copy
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
         copy = Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
-        copy._device = self._device
+        copy._device, copy.queries = self._device, Queries(site, self.queries.station)
         return copy
 
     def select_device(self, device: str) -> Predictor:

@@ -33,9 +33,15 @@ class PlacedQuery(NamedTuple):
 
 
 class Queries:
-    """Queries of one site; see `Predictor`."""
+    """Queries of one site; see `Predictor`.
 
-    def __init__(self, site: Site) -> None:
+    Args:
+        site: of the model, or what one of its stations sees.
+        station: its number, where a model of all is asked: two may stand at one place.
+    """
+
+    def __init__(self, site: Site, station: int | None = None) -> None:
+        self.station = station
         self.site, still = site, site.static_position if site.static_end == "rx" else None
         # The pose of a receiver that never moved, made once.
         self._still = None if still is None else Pose(_float(still), _float(self._rx_rotation(None, 1)))
@@ -54,7 +60,8 @@ class Queries:
         common = self._still is not None and len(places) == 1 and dtype == torch.float32
         if self._still is not None and common:  # with nothing to look up
             sender = _float(np.atleast_2d(places[moving] - self.site.origin))
-            return PlacedQuery(Query(sender, self._still), single, isinstance(tx, Tensor))
+            query = Query(sender, self._still, self._stations(len(sender)))
+            return PlacedQuery(query, single, isinstance(tx, Tensor))
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
         # One place of an end goes with any number of the other's.
         count = max(len(place) for place in local.values())
@@ -70,7 +77,11 @@ class Queries:
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        return PlacedQuery(Query(sender, pose), single, any(isinstance(v, Tensor) for v in (tx, receiver)))
+        query = Query(sender, pose, self._stations(len(sender)))
+        return PlacedQuery(query, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
+
+    def _stations(self, count: int) -> Tensor | None:
+        return None if self.station is None else torch.full((count,), self.station)
 
     def _static_place(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""

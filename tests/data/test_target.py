@@ -28,7 +28,7 @@ def test_real_numbers_of_targets_are_targets_again(kind):
     rows = target.to_real(values)
     assert rows.dtype == np.float32 and rows.shape == (5, np.prod(SHAPES[kind]) * target.numbers)
     again = target.to_targets(torch.from_numpy(rows), SHAPES[kind])
-    assert again.is_complex() == target.signed
+    assert again.is_complex() == target.is_complex
     np.testing.assert_allclose(again.numpy(), values, rtol=1e-5)
 
 

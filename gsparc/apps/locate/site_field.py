@@ -64,7 +64,7 @@ class SiteField:
         if site.kind == "spectrum":
             return HeardMoments(mean.double(), variance)
         mean, variance = site.target.moments_in_error_unit(mean, variance)
-        number = torch.complex128 if site.target.signed else torch.float64
+        number = torch.complex128 if site.target.is_complex else torch.float64
         return self._joined(mean.to(number), variance.expand(mean.shape))
 
     def _joined(self, mean: Tensor, variance: Tensor) -> HeardMoments:

@@ -90,7 +90,7 @@ def snapshots_of_values(
     count, each = site.stations and len(site.stations), site.target.axes
     ndim = each if count is None or site.kind == "rssi" else each + 1
     shaped = heard.ndim == ndim and (not count or heard.shape[1] == count)
-    if heard.is_complex() != site.target.signed or not shaped:
+    if heard.is_complex() != site.target.is_complex or not shaped:
         stations = "" if count is None else f" of {count} stations"
         raise ValueError(f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}")
     if silent is not None and (site.kind != "rssi" or np.shape(silent) != tuple(heard.shape)):

@@ -131,10 +131,8 @@ def _at_carriers(data: Measurements, carrier_hz: np.ndarray, array: np.ndarray) 
     """A station for each carrier (S,) [Hz], of an array (M, 3) in wavelengths; in our conventions."""
     carriers, station = np.unique(carrier_hz, return_inverse=True)
     arrays = LIGHT / carriers[:, None, None] * array[:, [2, 0, 1]]
-    places, names = (
-        np.repeat(data.rx_position[:1], len(carriers), axis=0),
-        [f"{c / 1e9:g} GHz" for c in carriers],
-    )
+    places = np.repeat(data.rx_position[:1], len(carriers), axis=0)
+    names = [f"{one / 1e9:g} GHz" for one in carriers]
     turned = np.repeat(data.rx_rotation[:1], len(carriers), axis=0)
     stations = Stations(places, tuple(names), turned, carriers, array=arrays)
     site = replace(data.site, stations=stations, array=arrays[0], carrier_hz=float(carriers[0]))

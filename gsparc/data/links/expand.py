@@ -89,9 +89,8 @@ def _without_table(check: Checker, measured: str, part: Selection) -> Links | No
         rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
         links, moving = find_static_end(check, rx, tx), np.hstack([rx, tx])
         carrier = check.read_real("carrier_hz", (), (rows,))
-        if (
-            carrier is not None and carrier.ndim and links.static_end is not None
-        ):  # a station for each carrier
+        # Rows at several carriers: a station at each.
+        if carrier is not None and carrier.ndim and links.static_end is not None:
             still, other = (rx, tx) if links.static_end == "rx" else (tx, rx)
             arrays.setdefault("station", np.zeros(rows, np.int64))
             arrays["place"] = number_places(other)

@@ -112,7 +112,7 @@ class Kriging(Interpolator):
         decibels, self.channels = self._to_decibels(targets), None
         first, self.values, _ = mean_at_places(positions, decibels)
         self.positions = positions[first]
-        if self.target.signed:
+        if self.target.is_complex:
             self.channels = mean_at_places(positions, targets.reshape(len(targets), -1))[1]
         self.variogram = fit_variogram(positions, decibels)
         self._factor_system()
@@ -123,7 +123,7 @@ class Kriging(Interpolator):
         return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m{few}",)
 
     def _to_decibels(self, targets: np.ndarray) -> np.ndarray:
-        if self.target.signed:
+        if self.target.is_complex:
             power = np.abs(targets.reshape(len(targets), -1)) ** 2
             floor = max(float(power.mean()) * 1e-8, SILENCE)
             return to_decibels(np.maximum(power, floor)).astype(np.float32)

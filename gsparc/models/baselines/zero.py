@@ -19,5 +19,5 @@ class Zero(Interpolator):
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        dtype = torch.complex64 if self.target.signed else torch.float32
+        dtype = torch.complex64 if self.target.is_complex else torch.float32
         return Prediction(torch.zeros(len(queries), *self.shape, dtype=dtype))

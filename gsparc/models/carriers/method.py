@@ -6,7 +6,6 @@ process over places and carriers learns what is left: rows of a place observed a
 
 from __future__ import annotations
 
-import copy
 import math
 from dataclasses import dataclass, replace
 from itertools import product
@@ -94,7 +93,6 @@ class CarrierField(OneArray):
     paths: SharedPaths
     covariance: Covariance
     _kept: Tensor | None = None
-    _carrier: int | None = None
 
     def __init__(self, name: str = "carriers") -> None:
         self.name = name
@@ -117,10 +115,10 @@ class CarrierField(OneArray):
         expected, which = self.expected(self.paths, self.places) - self.mean, torch.empty(len(known)).long()
         for place, rows in enumerate(groups):
             which[rows] = place
-        few = _at_covering_places(data.tx[known], CHOSEN_ON)
+        few, images = _at_covering_places(data.tx[known], CHOSEN_ON), images.sub_(self.mean)
         of_few = rows_of_groups(which[few].numpy())
-        self._choose(self.rows[few], (images - self.mean)[few], expected[which[few]], of_few)
-        left = images - self.mean - self.weight * expected[which]
+        self._choose(self.rows[few], images[few], expected[which[few]], of_few)
+        left = images.sub_(self.weight * expected[which])
         self._kept, factor = None, Factor.from_gram(self.covariance.gram(self.rows))
         self.left = factor.solve(left.double()).float()
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
@@ -165,8 +163,6 @@ class CarrierField(OneArray):
         """
         site = self.fitted_site
         assert site.stations is not None and site.stations.carrier_hz is not None
-        if query.station is None and self._carrier is not None:
-            query = replace(query, station=torch.full((len(query.tx),), self._carrier))
         if query.station is None:
             raise ValueError(
                 f"{self.name}: which carrier? say station=, one of {', '.join(site.stations.shown)}"
@@ -182,12 +178,6 @@ class CarrierField(OneArray):
         error = self.covariance.amplitude * (variance + self.covariance.noise)
         mean = self.answer_images(image, query)
         return Prediction(mean, error.to(mean.dtype), (variance / prior).to(mean.dtype))
-
-    def station_method(self, number: int) -> CarrierField:
-        """Return the same asked about one carrier, which queries then need not name."""
-        twin = copy.copy(self)
-        twin._carrier = number
-        return twin
 
     def count_components(self) -> int:
         """Return the number of mirror planes."""

@@ -154,9 +154,8 @@ def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weigh
     gram = weights.mT @ weights
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
     batch = data.batch(rows)
-    images = torch.from_numpy(data.site.target.to_real(training_targets(data, rows))).flatten(
-        1
-    )  # holes filled
+    filled = training_targets(data, rows)
+    images = torch.from_numpy(data.site.target.to_real(filled)).flatten(1)
     emission = Factor.from_gram(gram + ridge).solve(weights.mT @ images.mT).mT
     distance = model.relative_distances(batch.tx)
     attenuation = model.attenuation(distance)
