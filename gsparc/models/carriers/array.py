@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.data.schema import LIGHT, Measurements, Site
+from gsparc.data.schema import LIGHT, Measurements, Site, Stations
 from gsparc.data.splits import Fold
 from gsparc.models.carriers.geometry import ExpectedSpectra, SharedPaths
 from gsparc.models.method import Method
+from gsparc.models.reduced import coarsen_grid
 from gsparc.models.target_rows import training_targets
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.lags import SpectrumLags, pixel_exponent
@@ -99,19 +100,24 @@ class OneArray(Method):
         for name in self.stored:
             setattr(self, name, from_plain(state[name]))
 
+    @property
+    def _stations(self) -> Stations:
+        stations = self.fitted_site.stations
+        assert stations is not None
+        return stations
+
     def pose(self) -> tuple[Tensor, Tensor]:
         """Return place (3,) float64 [m] and rotation (3, 3) of the receiver."""
-        stations, turned = self.fitted_site.stations, self.fitted_site.rx_rotation
-        assert stations is not None
+        stations, turned = self._stations, self.fitted_site.rx_rotation
         rotation = stations.rotation[0] if stations.rotation is not None else turned
         turned = np.eye(3) if rotation is None else rotation
         return torch.from_numpy(stations.position[0]), torch.from_numpy(np.asarray(turned, np.float64))
 
     def array(self) -> tuple[np.ndarray, float]:
         """Return elements (M, 3) [m] at the first carrier, and its wavelength [m]."""
-        stations = self.fitted_site.stations
-        assert stations is not None and stations.carrier_hz is not None
-        return _arrays(self.fitted_site)[0], LIGHT / float(stations.carrier_hz[0])
+        carrier = self._stations.carrier_hz
+        assert carrier is not None
+        return _arrays(self.fitted_site)[0], LIGHT / float(carrier[0])
 
     def lags(self) -> SpectrumLags:
         """Return the array's lags."""
@@ -119,11 +125,17 @@ class OneArray(Method):
         assert self.fitted_site.grid is not None
         return SpectrumLags(array, self.fitted_site.grid, wavelength)
 
+    @property
+    def stride(self) -> int:
+        """Rows and columns of pixels per one that `expected` computes."""
+        return 1
+
     def expected(self, paths: SharedPaths, places: Tensor) -> Tensor:
-        """Return mean images (n, H * W) of the paths to places (n, 3)."""
+        """Return mean images (n, pixels) of the paths to places (n, 3), every `stride`-th row and column."""
         if self._spectra is None:
             (array, wavelength), grid = self.array(), self.fitted_site.grid
             assert grid is not None
+            grid = coarsen_grid(grid, self.stride)
             renderer = SpectrumRenderer(array, grid, wavelength, torch.zeros(grid.height, grid.width))
             turns = torch.from_numpy(2 * np.pi / wavelength * array).float()
             how = self.fitted_site.normalisation

@@ -2,13 +2,11 @@
 
 The mean is what paths found from all spectra together are expected to look like, mixed with the mean image; a
 process over places and carriers learns what is left: rows of a place observed at some carriers tell the rest.
+Beside it stand processes of each carrier alone, weighed by rows that were left out. All of it is computed in
+the strongest principal components of the images.
 """
 
 from __future__ import annotations
-
-import math
-from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import torch
@@ -17,143 +15,107 @@ from torch import Tensor
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.models.baselines.gp import principal_components
+from gsparc.models.carriers.alone import CarriersAlone
 from gsparc.models.carriers.array import SAME_PLACE, OneArray
 from gsparc.models.carriers.geometry import SharedPaths, find_paths
+from gsparc.models.carriers.joint import Covariance, choose_joint
 from gsparc.models.method import Prediction
+from gsparc.models.stack import choose_weights, error_products
+from gsparc.models.target_rows import training_targets
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import distances, matern32
-from gsparc.processes.left_out import left_out_residuals, rows_of_groups
+from gsparc.processes.left_out import rows_of_groups
 from gsparc.processes.neighbourhood import covering_rows
-from gsparc.processes.stored import Stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
-PIXELS = 500  # of an image, that settings are chosen on
-LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
-SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
-NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
-OWN, ALONE = (
-    (0.0, 2.0),
-    0.2,
-)  # of the same, what images have in common within .2 octaves at neighbouring places
-NOISES_ALONE = (0.03, 0.1, 0.3, 1.0)  # of carriers that tell nothing of each other
+COMPONENTS = 100  # of images: more of them hold under 1e-3 of what varies
 MOST_ROWS, CHOSEN_ON = 4000, 500  # rows that are learned from, and that settings are chosen on
-
-
-@dataclass(frozen=True)
-class Covariance(Stored):
-    """Covariance of residual images over places and carriers, in units of the part that a place shares.
-
-    Attributes:
-        length: over places [m].
-        shared: of what neighbouring places share, at all carriers.
-        near: of what near carriers of a place share.
-        own: of what neighbouring places share at near carriers alone.
-        noise: of each row.
-        place: 1; 0 where carriers tell nothing of each other.
-        amplitude: of the whole, per pixel.
-    """
-
-    length: float
-    shared: float
-    near: float
-    own: float
-    noise: float
-    place: float = 1.0
-    amplitude: float = 1.0
-
-    def between(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
-        apart = distances(a[:, :3], b[:, :3])
-        octaves = (a[:, None, 3] - b[None, :, 3]).abs()
-        here, alike = (apart < SAME_PLACE).double(), matern32(octaves, OCTAVES)
-        around, own = matern32(apart, self.length), self.own * matern32(octaves, ALONE)
-        # Of a carrier alone: its mean image, and what varies over places.
-        return self.shared * around + own * (1 + around) + here * (self.place + self.near * alike)
-
-    def gram(self, rows: Tensor) -> Tensor:
-        """Return covariances (n, n) of rows (n, 4) with their noise."""
-        return self.between(rows, rows) + self.noise * torch.eye(len(rows), dtype=torch.float64)
-
-    @property
-    def prior(self) -> float:
-        """Variance of a row without noise."""
-        return self.shared + 2 * self.own + self.place + self.near
+COARSE = 24  # rows of pixels, at least, that expected images are computed on
 
 
 class CarrierField(OneArray):
-    """Shared paths, and a process over places and carriers.
+    """Shared paths, a process over places and carriers, and processes of each carrier alone.
 
     Args:
         name: as it appears in tables.
     """
 
     effects = "line_of_sight, specular"
-    stored = (*OneArray.stored, "paths", "weight", "covariance", "rows", "left")
+    stored = (
+        *OneArray.stored, "paths", "weight", "covariance", "rows", "left", "axes", "lost", "alone", "shares",
+    )  # fmt: skip
     paths: SharedPaths
+    weight: float  # of paths
     covariance: Covariance
-    _kept: Tensor | None = None
+    rows: Tensor  # (n, 4) float64, places [m] and log2 of carriers
+    left: Tensor  # (n, P) float64, what paths do not explain as weights of the rows' covariances
+    axes: Tensor  # (P, H * W) float32, orthonormal rows
+    lost: float  # mean square per pixel that the components leave out
+    alone: CarriersAlone
+    shares: tuple[float, float]  # of `alone` at new places, and at places with rows
+    _inverse: Tensor | None = None
+    _thin: tuple[Tensor, Tensor] | None = None  # the mean (p,) and what gives components (p, P) of pixels
 
     def __init__(self, name: str = "carriers") -> None:
         self.name = name
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Find planes, then condition a process on what they do not explain.
+        """Find planes, then condition processes on what they do not explain.
 
         Raises:
-            ValueError: not spectra of one array at several carriers, or too many.
+            ValueError: not spectra of one array at several carriers.
         """
         watch, known = Stopwatch(), np.concatenate([fold.train, fold.val])
         whole, known = len(known), known[_at_covering_places(data.tx[known], MOST_ROWS)]
         images, groups = self.read_rows(data, known)
         carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()
-        assert carrier is not None and grid is not None
-        self.rows = torch.from_numpy(np.c_[data.tx[known], np.log2(carrier[known])])
+        assert carrier is not None and grid is not None and data.station is not None
         power = [images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups]
         seen = torch.stack([lags.to_lags(one).mean(0) for one in power])
         self.paths = find_paths(lags, seen, self.places, *self.pose())
-        expected, which = self.expected(self.paths, self.places) - self.mean, torch.empty(len(known)).long()
-        for place, rows in enumerate(groups):
-            which[rows] = place
-        few, images = _at_covering_places(data.tx[known], CHOSEN_ON), images.sub_(self.mean)
-        of_few = rows_of_groups(which[few].numpy())
-        self._choose(self.rows[few], images[few], expected[which[few]], of_few)
-        left = images.sub_(self.weight * expected[which])
-        self._kept, factor = None, Factor.from_gram(self.covariance.gram(self.rows))
-        self.left = factor.solve(left.double()).float()
+        few = _at_covering_places(data.tx[known], CHOSEN_ON)
+        targets = training_targets(data, known[few])
+        self.axes = torch.from_numpy(principal_components(targets, data.site.target, COMPONENTS).axes)
+        images.sub_(self.mean)
+        values = (images @ self.axes.T).double()
+        beyond = float(images.square().sum(dtype=torch.float64)) - float(values.square().sum())
+        self.lost = max(beyond, 0.0) / images.numel()
+
+        self.rows = torch.from_numpy(np.c_[data.tx[known], np.log2(carrier[known])])
+        place, station = torch.empty(len(known)).long(), torch.from_numpy(data.station[known])
+        for number, rows in enumerate(groups):
+            place[rows] = number
+        self._inverse = self._thin = None
+        paths = self._expected_values(self.places)[place]
+        self._choose(values[few], paths[few], place[few], station[few], few)
+        factor = Factor.from_gram(self.covariance.gram(self.rows))
+        self.left = factor.solve(values - self.weight * paths)
+        self.alone = self.alone.condition(self.rows[:, :3], values, station)
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
-        one = self.covariance
-        parts = f"shared {one.shared:.3g}, near {one.near:.3g}, own {one.own:.3g}, noise {one.noise:.3g}"
-        kernel = f"length {one.length:.3g} m, {parts}" + " (each carrier alone)" * (not one.place)
-        notes = [f"{self.name}: {planes}; {kernel}, chosen on left-out places"]
+        shares = "{:.0%} of new places and {:.0%} of known ones by carriers alone".format(*self.shares)
+        chosen = f"{planes}; {self.covariance.description}; {shares}, chosen on rows left out"
+        notes = [f"{self.name}: {chosen}"]
         if len(known) < whole:
             some = f"{len(known)} of {whole} rows are learned from, at places all over the site"
             notes.append(f"{self.name}: {some}")
         return FitReport(watch.seconds, tuple(notes))
 
-    def _choose(self, rows: Tensor, images: Tensor, expected: Tensor, groups: list[Tensor]) -> None:
-        """Set the weight of paths and the covariance of least error at places and rows left out."""
-        step = max(1, images.shape[1] // PIXELS)
-        both = torch.cat([images[:, ::step], expected[:, ::step]], 1).double()
-        diagonal = float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0
-        best = math.inf
-        together = (Covariance(1.0, *one) for one in product(SHARES, NEAR_CARRIERS, OWN, NOISES))
-        apart = (Covariance(1.0, 0.0, 0.0, 1.0, noise, place=0.0) for noise in NOISES_ALONE)
-        for length, one in product(LENGTHS, (*together, *apart)):
-            one = replace(one, length=length * diagonal)
-            inverse = Factor.from_gram(one.gram(rows)).inverse
-            solved = inverse @ both
-            away, variance = left_out_residuals(inverse, solved, groups)
-            # Residuals are linear in what is taken off: the best weight is a quotient.
-            image, path = away.chunk(2, dim=1)
-            weight = float((image * path).sum() / path.square().sum().clamp_min(1e-9))
-            weight = min(max(weight, 0.0), 1.0)
-            missed = (image - weight * path).square().mean(1)
-            image, path = left_out_residuals(inverse, solved)[0].chunk(2, dim=1)
-            error = float(missed.mean()) * float((image - weight * path).square().mean())
-            if error < best:
-                best, self.weight = error, weight
-                self.covariance = replace(one, amplitude=float((missed / variance).mean()))
+    def _choose(
+        self, values: Tensor, paths: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
+    ) -> None:
+        """Set settings by some rows (n,) whose places and carriers (n,) are numbered."""
+        at, count, entries = self.rows[rows], len(self._stations), self.axes.shape[1]
+        joint = choose_joint(at, values, paths, rows_of_groups(place.numpy()), entries)
+        self.covariance, self.weight = joint.covariance, joint.weight
+        self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
+        known, missed = self.alone.has_process(station), self.alone.left_out(station)
+        none, unit = torch.zeros_like(values[known]), place[known].numpy()
+        shares = []
+        for errors in (joint.new, joint.seen):
+            products = error_products([errors[known], missed[known]], none)
+            shares.append(float(choose_weights(products, unit, deviations=2.0)[1]) if known.any() else 0.0)
+        self.shares = shares[0], shares[1]
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `query.station` says which carrier.
@@ -161,32 +123,51 @@ class CarrierField(OneArray):
         Raises:
             ValueError: it does not.
         """
-        site = self.fitted_site
-        assert site.stations is not None and site.stations.carrier_hz is not None
         if query.station is None:
-            raise ValueError(
-                f"{self.name}: which carrier? say station=, one of {', '.join(site.stations.shown)}"
-            )
-        places, which = torch.unique(query.tx.cpu().double(), dim=0, return_inverse=True)
-        octaves = torch.from_numpy(np.log2(site.stations.carrier_hz))[query.station.cpu()]
-        cross = self.covariance.between(torch.cat([places[which], octaves[:, None]], 1), self.rows)
-        paths = self.expected(self.paths, places) - self.mean
-        image = self.mean + self.weight * paths[which] + cross.float() @ self.left
-        prior = self.covariance.prior
-        certain = (cross @ self._inverse() * cross).sum(1)
-        variance = (prior - certain).clamp(0, prior)
-        error = self.covariance.amplitude * (variance + self.covariance.noise)
-        mean = self.answer_images(image, query)
-        return Prediction(mean, error.to(mean.dtype), (variance / prior).to(mean.dtype))
+            names = ", ".join(self._stations.shown)
+            raise ValueError(f"{self.name}: which carrier? say station=, one of {names}")
+        station, at = query.station.cpu(), query.tx.cpu().double()
+        places, which = torch.unique(at, dim=0, return_inverse=True)
+        carrier = self._stations.carrier_hz
+        assert carrier is not None
+        rows = torch.cat([at, torch.from_numpy(np.log2(carrier))[station][:, None]], 1)
+        cross, one = self.covariance.between(rows, self.rows), self.covariance
+        value = self.weight * self._expected_values(places)[which] + cross @ self.left
+        if self._inverse is None:
+            self._inverse = Factor.from_gram(one.gram(self.rows)).inverse
+        variance = (one.prior - (cross @ self._inverse * cross).sum(1)).clamp(0, one.prior)
+        unknown, error = variance / one.prior, one.amplitude * (variance + one.noise)
+        near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE
+        share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * self.alone.has_process(station)
+        if share.any():
+            mean, own = (part.nan_to_num() for part in self.alone.answer(at, station))
+            apart = (mean - value).square().sum(1) / self.axes.shape[1]
+            value = value.lerp(mean, share[:, None])
+            error = error.lerp(own, share) + share * (1 - share) * apart  # law of total variance
+        image = self.answer_images(torch.addmm(self.mean, value.float(), self.axes), query)
+        return Prediction(image, (error + self.lost).to(image.dtype), unknown.to(image.dtype))
 
     def count_components(self) -> int:
         """Return the number of mirror planes."""
         return len(self.paths.planes)
 
-    def _inverse(self) -> Tensor:
-        if self._kept is None:
-            self._kept = Factor.from_gram(self.covariance.gram(self.rows)).inverse
-        return self._kept
+    @property
+    def stride(self) -> int:
+        """See `OneArray`: an array of few elements sees nothing finer."""
+        grid = self.fitted_site.grid
+        assert grid is not None
+        return next((one for one in (4, 3, 2) if not grid.width % one and grid.height >= one * COARSE), 1)
+
+    def _expected_values(self, places: Tensor) -> Tensor:
+        """Components (n, P) float64 of what paths to places (n, 3) are expected to look like."""
+        grid, step = self.fitted_site.grid, slice(None, None, self.stride)
+        assert grid is not None
+        if self._thin is None:
+            parts = (one.unflatten(-1, (grid.height, grid.width)) for one in (self.mean, self.axes))
+            mean, axes = (one[..., step, step].flatten(-2) for one in parts)
+            self._thin = mean, torch.linalg.pinv(axes)
+        mean, to_values = self._thin
+        return ((self.expected(self.paths, places) - mean) @ to_values).double()
 
 
 def _at_covering_places(places: np.ndarray, most: int) -> np.ndarray:

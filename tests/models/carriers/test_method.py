@@ -1,5 +1,6 @@
 """Spectra of one array at several carriers: paths that all share, what carriers tell of each other."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import kinds
@@ -11,13 +12,14 @@ from kinds import CARRIERS, CEILING, ELEMENTS, WALL
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
+from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.carriers import method
 from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.carriers.geometry import STEP, find_paths, ways
 from gsparc.models.carriers.method import CarrierField
 from gsparc.models.carriers.plain import DirectBeam, OtherCarriers
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import wrap_per_station
+from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.lags import SpectrumLags
 from gsparc.training.context import FitContext
@@ -73,6 +75,7 @@ def test_new_places_are_told_by_paths_not_by_averages(room, fitted):
     assert said.unknown.shape == (len(LAST),) and (said.unknown > 0.1).all()
 
 
+@pytest.mark.slow
 def test_what_some_carriers_said_of_a_place_tells_the_others(room, fitted):
     rest = LAST[room.station[LAST] >= 3]
     half = fit(CarrierField(), room, rest)
@@ -122,3 +125,20 @@ def test_more_rows_than_a_process_takes_were_refused(room, monkeypatch):
     assert 30 <= learned <= 60 and learned % CARRIERS == 0
     assert f"{learned} of 100 rows are learned from" in report.notes[-1]
     assert torch.isfinite(field.predict(room.batch(np.arange(100, 150))).mean).all()
+
+
+@pytest.mark.slow
+def test_carriers_that_share_nothing_were_smoothed_over_all(room):
+    """Of carriers with smooth fields of their own: one process over all lost .5 dB to one of each."""
+    rng = np.random.default_rng(1)
+    waves = rng.normal(size=(CARRIERS, 3, 3)) * 0.7
+    phase = np.einsum("nd,ncd->nc", room.tx, waves[room.station].transpose(0, 2, 1)) + room.station[:, None]
+    shapes = rng.uniform(0, 1, (CARRIERS, 3, *room.target.shape[1:]))
+    mixed = np.einsum("nc,nchw->nhw", np.cos(phase), shapes[room.station]) / 6 + 0.5
+    alone = replace(room, target=mixed.astype(np.float32))
+    train = np.setdiff1d(np.arange(len(room)), LAST)
+    gp = PerStation(GaussianProcess())
+    gp.fit(alone, Fold(train, train[:0], LAST), FitContext(Path()))
+    field = fit(CarrierField(), alone, LAST)
+    assert field.shares[0] > 0.9
+    assert error(field, alone, LAST) < 1.05 * error(gp, alone, LAST)

@@ -1,0 +1,122 @@
+"""A process over places and carriers: what carriers of one place tell of each other, and of places nearby."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsparc.models.carriers.array import SAME_PLACE
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
+from gsparc.processes.stored import Stored
+
+LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
+SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
+NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
+OWN, ALONE = (0.0, 2.0), 0.2  # of the same, what images within .2 octaves share at neighbouring places
+
+
+@dataclass(frozen=True)
+class Covariance(Stored):
+    """Covariance of residual images over places and carriers, in units of the part that a place shares.
+
+    Attributes:
+        length: over places [m].
+        shared: of what neighbouring places share, at all carriers.
+        near: of what near carriers of a place share.
+        own: of what neighbouring places share at near carriers alone.
+        noise: of each row.
+        amplitude: of the whole, per pixel.
+    """
+
+    length: float
+    shared: float
+    near: float
+    own: float
+    noise: float
+    amplitude: float = 1.0
+
+    def between(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
+        apart = distances(a[:, :3], b[:, :3])
+        octaves = (a[:, None, 3] - b[None, :, 3]).abs()
+        here, alike = (apart < SAME_PLACE).double(), matern32(octaves, OCTAVES)
+        around, own = matern32(apart, self.length), self.own * matern32(octaves, ALONE)
+        # Of a carrier alone: its mean image, and what varies over places.
+        return self.shared * around + own * (1 + around) + here * (1 + self.near * alike)
+
+    def gram(self, rows: Tensor) -> Tensor:
+        """Return covariances (n, n) of rows (n, 4) with their noise."""
+        return self.between(rows, rows) + self.noise * torch.eye(len(rows), dtype=torch.float64)
+
+    @property
+    def prior(self) -> float:
+        """Variance of a row without noise."""
+        return self.shared + 2 * self.own + 1 + self.near
+
+    @property
+    def description(self) -> str:
+        """Its numbers in words."""
+        parts = f"shared {self.shared:.3g}, near {self.near:.3g}, own {self.own:.3g}, noise {self.noise:.3g}"
+        return f"length {self.length:.3g} m, {parts}"
+
+
+class JointChoice(NamedTuple):
+    """A covariance, the weight of paths beside it, and what both miss (n, P) of rows left out.
+
+    Attributes:
+        new: without all rows of the place.
+        seen: one by one.
+    """
+
+    covariance: Covariance
+    weight: float
+    new: Tensor
+    seen: Tensor
+
+
+def choose_joint(
+    rows: Tensor, images: Tensor, paths: Tensor, groups: list[Tensor], entries: int
+) -> JointChoice:
+    """Return the covariance and weight of paths of least error at places and at rows left out.
+
+    Args:
+        rows: (n, 4), places [m] and log2 of carriers.
+        images: (n, P) float64, components of images of so many `entries`, about their mean.
+        paths: (n, P) float64, images expected of paths, about the same mean.
+        groups: rows of each place.
+        entries: pixels.
+    """
+    both, best, result = torch.cat([images, paths], 1), math.inf, None
+    for one in _candidates(float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0):
+        inverse = Factor.from_gram(one.gram(rows)).inverse
+        solved = inverse @ both
+        away = left_out_residuals(inverse, solved, groups)
+        # Residuals are linear in what is taken off: the best weight is a quotient.
+        image, path = away.residual.chunk(2, dim=1)
+        weight = float((image * path).sum() / path.square().sum().clamp_min(1e-9))
+        weight = min(max(weight, 0.0), 1.0)
+        new, seen = (_without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved)))
+        error = float(new.square().mean()) * float(seen.square().mean())
+        if error < best:
+            scaled = replace(one, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries)
+            best, result = error, JointChoice(scaled, weight, new, seen)
+    assert result is not None
+    return result
+
+
+def _candidates(diagonal: float) -> Iterator[Covariance]:
+    for length, *parts in product(LENGTHS, SHARES, NEAR_CARRIERS, OWN, NOISES):
+        yield Covariance(length * diagonal, *parts)
+
+
+def _without_paths(errors: LeftOutErrors, weight: float) -> Tensor:
+    image, path = errors.residual.chunk(2, dim=1)
+    return image - weight * path
