@@ -286,15 +286,22 @@ def predict_in_batches(
     if data.site.freedom == "none":
         yield from predict_batches()
         return
-    told = list(predict_batches())
-    moments, back = Snapshots.from_rows(data, rows), np.argsort(order)
-    means = moments.arrange(torch.cat([said.mean.detach().cpu() for _, _, said in told])[back].numpy())
-    turns = align_factors(means * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
-    factors = torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
+    told, back = list(predict_batches()), np.argsort(order)
+    factors = factors_to_measured(
+        torch.cat([said.mean.detach().cpu() for _, _, said in told])[back], data, rows
+    )
     for chosen, batch, said in told:
         factor = factors[chosen]
         variance = None if said.variance is None else said.variance * factor[:, 0].abs().square().mean(1)
         yield chosen, batch, replace(said, mean=said.mean * factor, variance=variance)
+
+
+def factors_to_measured(means: Tensor, data: Measurements, rows: np.ndarray) -> Tensor:
+    """Return factors (n, 1, K) complex64 that turn means (n, A, K) to rows (n,) by what is free of these."""
+    moments = Snapshots.from_rows(data, rows)
+    told = moments.arrange(means.numpy())
+    turns = align_factors(told * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    return torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
 
 
 def to_double(part: T) -> T:

@@ -21,6 +21,7 @@ from torch import Tensor
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.method import factors_to_measured
 from gsparc.physics.decibels import TINY_POWER
 
 log = logging.getLogger(__name__)
@@ -183,11 +184,14 @@ def stack(
         if one.held is not None and len(rows):
             order = np.argsort(one.held.rows)
             mean = torch.cat([one.held.mean[order[np.searchsorted(one.held.rows, rows, sorter=order)]], mean])
-        predicted.append(data.site.target.in_error_unit(mean))
+        predicted.append(mean)
     rows = np.concatenate([rows, val])
     if len(rows) < LEAST_HELD:
         log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), first)
         return {first: 1.0}
+    if data.site.freedom != "none":  # errors are counted after it
+        predicted = [mean * factors_to_measured(mean, data, rows) for mean in predicted]
+    predicted = [data.site.target.in_error_unit(mean) for mean in predicted]
     target = data.site.target.in_error_unit(data.batch(rows).target)
     assert cut is not None
     single = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has

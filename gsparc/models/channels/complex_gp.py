@@ -107,18 +107,29 @@ class ComplexGP(ClosedForm):
                 waves = IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber)
                 yield Kernel((waves, WhiteNoise(noise)))
 
-    def _fit_one_factor(self, data: Measurements, known: np.ndarray) -> list[str]:
-        """Rows (n,) with one factor, settings chosen on some; factors of runs."""
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ClosedForm`; with the kernel that was chosen, where one factor holds all rows."""
+        if isinstance(self.posterior, Exact):
+            self.site = data.site
+            self._fit_one_factor(data, rows, replace(self.kernel, amplitude=1.0))
+        else:
+            super().condition(data, rows)
+
+    def _fit_one_factor(
+        self, data: Measurements, known: np.ndarray, kernel: Kernel | None = None
+    ) -> list[str]:
+        """Rows (n,) with one factor, settings chosen on some unless given; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
         runs = np.zeros(len(known)) if data.run is None else data.run[known]
         names, run = np.unique(runs, return_inverse=True)
         rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
-        few = rows.thin_rows(CHOSEN_ON)
-        if len(few) < len(rows):
-            notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
-        kernels = self._candidate_kernels(few.places, few.target)
-        kernel = min(kernels, key=lambda one: negative_log_likelihood(*_fit_factors(one, few, len(names))))
+        if kernel is None:
+            few = rows.thin_rows(CHOSEN_ON)
+            if len(few) < len(rows):
+                notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
+            kernels = self._candidate_kernels(few.places, few.target)
+            kernel = min(kernels, key=lambda k: negative_log_likelihood(*_fit_factors(k, few, len(names))))
         factors, ((_, told),) = _fit_factors(kernel, rows, len(names))
         prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
         self.posterior = Exact.from_values(prior, places, told.values, None, told.factor)

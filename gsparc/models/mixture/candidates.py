@@ -9,8 +9,8 @@ from typing import Any
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.turned_rows import FullPowerGP, TurnedNeighbours
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.known.method import KnownWallsGP
@@ -86,5 +86,6 @@ CANDIDATES: dict[str, Candidate] = {
     "joint_powers": make_joint_powers,
     "bearings": make_bearings,
     "process": lambda *unused: GaussianProcess(),
-    "aligned": lambda *unused: ComplexGP(),
+    "aligned": lambda *unused: FullPowerGP(),
+    "neighbours": lambda *unused: TurnedNeighbours(),
 }

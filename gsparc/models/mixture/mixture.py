@@ -157,8 +157,8 @@ class Mixture(LearnsTogether, ClosedForm):
         found, reports, read = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, watch, cut
         )
-        # A search that went on has errors of its own: here a mixture need not be surely better, too.
-        sure = 0.0 if set(found).intersection(fit_candidates.SEARCHES) else 1.0
+        # Searches have errors of their own, and of few squares nothing is sure: a mixture need not be.
+        sure = 0.0 if set(found).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
         chosen = stack(found, data, fold.val, cut, sure)
         heeded.count_reads(*(path for name in chosen for path in read[name]))
         self.members, self.weights = [found[name] for name in chosen], tuple(chosen.values())
