@@ -68,6 +68,23 @@ def fit_separable(blocks: Iterable[Tensor], lost: float) -> Separable:
     return Separable(_main_axes(row_gram, lost).contiguous(), _main_axes(column_gram, lost).T.contiguous())
 
 
+def separate_axes(
+    mean: Tensor, axes: Tensor, shape: tuple[int, int], lost: float
+) -> tuple[Separable, Tensor, Tensor]:
+    """Return a basis of images, and the mean (K,) and axes (P, K) in it.
+
+    Args:
+        mean: (H * W,) float32.
+        axes: (P, H * W) float32, each as large as what it explains.
+        shape: height and width.
+        lost: share of the energy of axes, and of the mean, in (0, 1).
+    """
+    images, middle = axes.unflatten(1, shape), mean.view(1, *shape)
+    alike = middle * (axes.norm() / mean.norm().clamp_min(torch.finfo(mean.dtype).tiny))
+    basis = fit_separable([images, alike], lost)
+    return basis, basis.project(middle)[0], basis.project(images)
+
+
 def _main_axes(gram: Tensor, lost: float) -> Tensor:
     """Eigenvectors (P, K) float32 of the largest eigenvalues; the others hold at most the share `lost`."""
     values, vectors = torch.linalg.eigh(gram)

@@ -24,6 +24,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import power_rows
+from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
@@ -41,6 +42,7 @@ from gsparc.processes.prior import Prior
 LOOKED_AT = 600  # rows that tell the strongest components
 STRONGEST = 32  # components that they are chosen by
 STARTS = np.array([0.01, 0.05, 0.25])  # lengths that a search starts from, of the extent
+FINER = 0.01  # of the share that components leave out, what their numbers by rows and columns may
 ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
 
 
@@ -130,12 +132,13 @@ class GaussianProcess(Differentiable, ClosedForm):
     """
 
     name = "gp"
-    stored = ("mean", "axes", "lost", "scores", "powers")
+    stored = ("mean", "axes", "pixels", "lost", "scores", "powers")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
     count_gaussians = 0  # type: ignore[assignment]
     powers: PowerProcess | None = None  # None: not powers
     scores: Posterior | None = None  # of what is not
+    pixels: tuple[Tensor, Tensor] | None = None  # rows, columns that mean and axes are numbers of
 
     def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
         check_arguments(locals(), components=whole(1), mean=choice(*MEANS))
@@ -219,10 +222,16 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def _targets_of_scores(self, scores: Tensor, dtype: torch.dtype) -> Tensor:
         """Targets (B, ...) of components (B, P)."""
-        return self._to_targets(torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype)))
+        rows = torch.addmm(self.mean.to(dtype), scores.to(dtype), self.axes.to(dtype))
+        if self.pixels is not None:
+            rows = Separable(*(part.to(dtype) for part in self.pixels)).images(rows)
+        return self._to_targets(rows)
 
     def with_strongest(self, lost: float) -> GaussianProcess:
-        """Return it with the fewest components that leave out at most a share `lost` of what targets vary."""
+        """Return it with the fewest components that leave out at most a share `lost` of what targets vary.
+
+        Spectra are then made of the few numbers that an array resolves: a query reads these, not all pixels.
+        """
         if not isinstance(self.scores, Exact):
             return self
         energy, order = self.scores.given_values().square().sum(0).sort(descending=True)
@@ -231,6 +240,12 @@ class GaussianProcess(Differentiable, ClosedForm):
         result = self._with_components(order[:count])
         entries = len(self.scores.rows) * len(self.mean)
         result.lost = self.lost + max(float(beyond[count - 1]), 0.0) / entries
+        if self.kind == "spectrum" and self.pixels is None and lost:
+            size = energy[:count].sqrt().float()[:, None].clamp_min(TINY)
+            shape = self.shape[0], self.shape[1]
+            basis, mean, axes = separate_axes(self.mean, result.axes * size, shape, lost * FINER)
+            if 2 * len(mean) <= len(self.mean):  # else nothing is gained
+                result.mean, result.axes, result.pixels = mean, axes / size, (basis.rows, basis.columns)
         return result
 
     def _with_components(self, chosen: Tensor) -> GaussianProcess:
@@ -258,10 +273,14 @@ class GaussianProcess(Differentiable, ClosedForm):
         chosen = self.scores.weights.square().sum(0).topk(count).indices if count < len(self.axes) else None
         lean = copy.copy(self) if chosen is None else self._with_components(chosen)
         if stride > 1:
-            parts = (
-                part.unflatten(-1, self.shape)[..., ::stride, ::stride] for part in (lean.mean, lean.axes)
-            )
-            lean.mean, lean.axes = (part.flatten(-2).contiguous() for part in parts)
+            if lean.pixels is not None:
+                few = Separable(*lean.pixels).subsample_pixels(stride)
+                lean.pixels = few.rows, few.columns
+            else:
+                parts = (
+                    part.unflatten(-1, self.shape)[..., ::stride, ::stride] for part in (lean.mean, lean.axes)
+                )
+                lean.mean, lean.axes = (part.flatten(-2).contiguous() for part in parts)
             lean.shape = tuple(-(-side // stride) for side in self.shape)
         lean.seen = len(lean.axes)
         means = MeanOnly(lean, lean.mean_at)

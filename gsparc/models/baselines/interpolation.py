@@ -118,7 +118,8 @@ class Interpolator(Method):
     def _relearn(self, state: dict[str, Any]) -> None:
         """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
-            setattr(self, name, from_plain(state[name]))
+            if name in state or not hasattr(type(self), name):  # older checkpoints lack what has a default
+                setattr(self, name, from_plain(state[name]))
 
 
 class Differentiable(Interpolator):

@@ -23,6 +23,7 @@ from gsparc.models.carriers.joint import Covariance, choose_joint
 from gsparc.models.method import Prediction
 from gsparc.models.stack import choose_weights, error_products
 from gsparc.models.target_rows import training_targets
+from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.factor import Factor
 from gsparc.processes.left_out import rows_of_groups
 from gsparc.processes.neighbourhood import covering_rows
@@ -30,6 +31,7 @@ from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
 COMPONENTS = 100  # of images: more of them hold under 1e-3 of what varies
+LOST, TINY = 1e-4, 1e-12  # of the energy of these by numbers of rows and columns; a component that is none
 MOST_ROWS, CHOSEN_ON = 4000, 500  # rows that are learned from, and that settings are chosen on
 COARSE = 24  # rows of pixels, at least, that expected images are computed on
 
@@ -43,14 +45,17 @@ class CarrierField(OneArray):
 
     effects = "line_of_sight, specular"
     stored = (
-        *OneArray.stored, "paths", "weight", "covariance", "rows", "left", "axes", "lost", "alone", "shares",
+        *OneArray.stored, "paths", "weight", "covariance", "rows", "left", "pixels", "middle", "axes", "lost",
+        "alone", "shares",
     )  # fmt: skip
     paths: SharedPaths
     weight: float  # of paths
     covariance: Covariance
     rows: Tensor  # (n, 4) float64, places [m] and log2 of carriers
     left: Tensor  # (n, P) float64, what paths do not explain as weights of the rows' covariances
-    axes: Tensor  # (P, H * W) float32, orthonormal rows
+    pixels: tuple[Tensor, Tensor]  # rows (H, R) and columns (C, W) of images, by whose products are told
+    middle: Tensor  # (R * C,) the mean image
+    axes: Tensor  # (P, R * C) principal components, orthonormal in pixels
     lost: float  # mean square per pixel that the components leave out
     alone: CarriersAlone
     shares: tuple[float, float]  # of `alone` at new places, and at places with rows
@@ -76,9 +81,12 @@ class CarrierField(OneArray):
         self.paths = find_paths(lags, seen, self.places, *self.pose())
         few = _at_covering_places(data.tx[known], CHOSEN_ON)
         targets = training_targets(data, known[few])
-        self.axes = torch.from_numpy(principal_components(targets, data.site.target, COMPONENTS).axes)
+        axes = torch.from_numpy(principal_components(targets, data.site.target, COMPONENTS).axes)
         images.sub_(self.mean)
-        values = (images @ self.axes.T).double()
+        values = (images @ axes.T).double()
+        size = values.square().mean(0).sqrt().float()[:, None].clamp_min(TINY)
+        basis, self.middle, sized = separate_axes(self.mean, axes * size, (grid.height, grid.width), LOST)
+        self.axes, self.pixels = sized / size, (basis.rows, basis.columns)
         beyond = float(images.square().sum(dtype=torch.float64)) - float(values.square().sum())
         self.lost = max(beyond, 0.0) / images.numel()
 
@@ -105,7 +113,7 @@ class CarrierField(OneArray):
         self, values: Tensor, paths: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
     ) -> None:
         """Set settings by some rows (n,) whose places and carriers (n,) are numbered."""
-        at, count, entries = self.rows[rows], len(self._stations), self.axes.shape[1]
+        at, count, entries = self.rows[rows], len(self._stations), len(self.mean)
         joint = choose_joint(at, values, paths, rows_of_groups(place.numpy()), entries)
         self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
@@ -141,10 +149,11 @@ class CarrierField(OneArray):
         share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * self.alone.has_process(station)
         if share.any():
             mean, own = (part.nan_to_num() for part in self.alone.answer(at, station))
-            apart = (mean - value).square().sum(1) / self.axes.shape[1]
+            apart = (mean - value).square().sum(1) / len(self.mean)
             value = value.lerp(mean, share[:, None])
             error = error.lerp(own, share) + share * (1 - share) * apart  # law of total variance
-        image = self.answer_images(torch.addmm(self.mean, value.float(), self.axes), query)
+        image = Separable(*self.pixels).images(torch.addmm(self.middle, value.float(), self.axes))
+        image = self.answer_images(image.flatten(1), query)
         return Prediction(image, (error + self.lost).to(image.dtype), unknown.to(image.dtype))
 
     def count_components(self) -> int:
@@ -160,12 +169,10 @@ class CarrierField(OneArray):
 
     def _expected_values(self, places: Tensor) -> Tensor:
         """Components (n, P) float64 of what paths to places (n, 3) are expected to look like."""
-        grid, step = self.fitted_site.grid, slice(None, None, self.stride)
-        assert grid is not None
         if self._thin is None:
-            parts = (one.unflatten(-1, (grid.height, grid.width)) for one in (self.mean, self.axes))
-            mean, axes = (one[..., step, step].flatten(-2) for one in parts)
-            self._thin = mean, torch.linalg.pinv(axes)
+            some = Separable(*self.pixels).subsample_pixels(self.stride)
+            mean, axes = (some.images(one).flatten(1) for one in (self.middle[None], self.axes))
+            self._thin = mean[0], torch.linalg.pinv(axes)
         mean, to_values = self._thin
         return ((self.expected(self.paths, places) - mean) @ to_values).double()
 

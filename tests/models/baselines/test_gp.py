@@ -1,5 +1,7 @@
 """The Gaussian process against brute force, scikit-learn and the real data."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -61,6 +63,28 @@ def test_the_strongest_components_leave_out_a_stated_share(campaign, folds, tmp_
     assert float((one.mean - other.mean).square().mean()) < 0.2 * float(one.mean.var())
     assert (other.variance > one.variance).all()
     assert len(whole.with_strongest(0.0).axes) == len(whole.axes)
+
+
+def test_a_query_of_an_averaged_process_read_every_pixel_of_its_components(campaign, folds, tmp_path):
+    """Smooth images are told by few rows and columns: their numbers are read, thinned pixels too."""
+    data, fold = campaign("spectrum", 40), folds(40).folds[0]
+    row, column = np.ogrid[:12, :24]
+    waves = [np.cos(np.pi * k * row / 12) * np.sin(np.pi * k * column / 12 + k) for k in (1, 2, 3)]
+    smooth = 0.5 + np.einsum("nk,khw->nhw", np.sin(data.tx), waves) / 8
+    data = replace(data, target=smooth.astype(np.float32))
+    whole = GaussianProcess()
+    whole.fit(data, fold, FitContext(tmp_path))
+    less, batch = whole.with_strongest(1e-3), data.batch(fold.test)
+    assert less.axes.shape[1] < whole.axes.shape[1] / 2
+    one, other = whole.mean_at(batch), less.mean_at(batch)
+    assert float((one - other).square().mean()) < 2e-3 * float(one.var(0).mean())
+    again = GaussianProcess()
+    again.restore(data.site, less.state())
+    assert again.mean_at(batch).equal(other)
+    thin = [
+        each.reduce({"stride": 2, "confidence": False}, {}).inner.predict(batch) for each in (whole, less)
+    ]
+    torch.testing.assert_close(thin[1].mean, thin[0].mean, atol=0.02, rtol=0)
 
 
 def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
