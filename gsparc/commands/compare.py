@@ -11,9 +11,9 @@ from typing import Any
 import pandas as pd
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import run_directory, show_result
+from gsparc.commands.shared.output import begin_run, show_result
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.shared.train_job import train_job
 from gsparc.data.files import platform_cache
 from gsparc.data.limits import POSITIVE
@@ -40,8 +40,7 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods and report."""
-    RunSettings.from_config(config)
-    run_dir = run_directory()
+    run_dir = begin_run(config)
     settings = to_dict(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)

@@ -10,9 +10,9 @@ from typing import Any
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import run_directory
+from gsparc.commands.shared.output import begin_run
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.settings import to_dict
 from gsparc.data.instantiate import from_settings
 from gsparc.evaluation import simulated, summary
 from gsparc.evaluation.console import open_console
@@ -54,8 +54,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 def task(config: DictConfig) -> Outcome | None:
     """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
-    RunSettings.from_config(config)
-    run_dir, console = run_directory(), open_console()
+    run_dir, console = begin_run(config), open_console()
     if config.scene.name == "help":
         console.print(simulated.table_of_scenes())
         console.print(OTHERS)

@@ -11,8 +11,8 @@ import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.shared.train_job import train_job
 from gsparc.data.instantiate import config_node
 from gsparc.data.load import load, split_for
@@ -44,9 +44,9 @@ def configs_of(config: DictConfig) -> dict[str, DictConfig]:
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
-    settings = RunSettings.from_config(config)
+    run_dir = begin_run(config)
     build(config.model)  # its parts check themselves
-    run_dir, conditions = run_directory(), instantiate(config.kind).conditions()
+    conditions = instantiate(config.kind).conditions()
     data = load(to_dict(config.dataset))
     split = split_for(to_dict(config.split), data)
     try:
@@ -59,7 +59,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     rows = average_rounds(fits, conditions, data, split, clock)
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": int(config.rounds),
+        "seed": config.seed, "study/rounds": int(config.rounds),
     }  # fmt: skip
     title = f"{data.site.name}, split {split.title}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))

@@ -59,7 +59,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     kept = points[points.kept_with_model == 1]
     if config.store:
         operating_point.store_points(Path(config.ckpt), kept.to_dict("records"), inputs)
-    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of_csv(points))
+    write_samples(run_dir / "tradeoff.csv", points.drop(columns=tradeoff.MADE).to_dict("list"))
     title = f"{data.site.name}, split {run.split.title}, {config.eval_on}: {method.name}"
     save(tradeoff.draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
     facts = {

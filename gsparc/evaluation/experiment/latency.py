@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import torch
 
@@ -21,12 +20,11 @@ from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction.timing import (
     BLOCKS,
-    COPY,
+    SPEED,
     Call,
     ClockSettings,
-    p50_p95,
     query_calls,
-    reference_copy,
+    time_beside_copy,
     time_interleaved,
 )
 
@@ -40,24 +38,19 @@ SLOW = ClockSettings(rounds=5, least=1, warmup=0, rounds_s=20.0)
 ONCE = replace(SLOW, rounds=1)
 
 
-SPEED = ["query_ms", "query_p95_ms", "to_copy"]  # the last in units of a 16 MiB copy of the same rounds
-TIMED = ["dataset", "split", "method", *SPEED]
+TIMED = ["dataset", "split", "method", *SPEED[:3]]
 
 
 def time_queries(
     files: Mapping[str, Path], data: Measurements, split: Split, fast: ClockSettings = FAST
 ) -> dict[str, dict[str, float]]:
-    """Return `SPEED` and the number of `rounds` of models by name; slow ones have clocks of their own."""
+    """Return `SPEED` of models by name; slow ones have clocks of their own."""
     methods: dict[str, Method] = {name: loading.load(file)[0] for name, file in files.items()}
     calls = query_calls(methods, data, split.folds[0].test)
     found: dict[str, dict[str, float]] = {}
 
     def timed(names: Iterable[str], clock: ClockSettings) -> None:
-        times = time_interleaved({COPY: reference_copy(), **{name: calls[name] for name in names}}, clock)
-        copy = float(np.median(times.pop(COPY)))
-        for name, values in times.items():
-            p50, p95 = p50_p95(values)
-            found[name] = dict(zip(SPEED, (p50, p95, p50 / copy), strict=True)) | {"rounds": len(values)}
+        found.update(time_beside_copy({name: calls[name] for name in names}, clock))
 
     # By speed, before any takes a share of the rounds; a first call may make what later ones keep.
     timed(calls, ONCE)
