@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import functools
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any, TypeVar
 
 import hydra
@@ -201,10 +201,6 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
 
 def _may_match(pattern: str, dataset: str, split: str) -> bool:
     """Whether a pattern of cells can match this problem, so that others need not be loaded."""
-    # Without strict: a pattern may have fewer parts than a cell's name, and more than two.
-    for part, name in zip(pattern.split("/"), (dataset, split), strict=False):
-        if "*" in part:  # it may stand for what follows, too
-            return fnmatchcase(name, part.partition("*")[0] + "*")
-        if not fnmatchcase(name, part):
-            return False
-    return True
+    # Up to the first of its signs, which may stand for all that follows.
+    fixed, name = re.split(r"[*?[]", pattern)[0], f"{dataset}/{split}/"
+    return name.startswith(fixed) or fixed.startswith(name)
