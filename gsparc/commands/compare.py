@@ -20,7 +20,6 @@ from gsparc.data.limits import POSITIVE
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.cells import Contender, job_of_cell, plan_cells, plugin_contenders
 from gsparc.evaluation.experiment.latency import time_by_dataset
-from gsparc.evaluation.experiment.pictures import draw_efforts, draw_splits
 from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
 from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.table import (
@@ -33,6 +32,7 @@ from gsparc.evaluation.experiment.table import (
     table_of,
     title_of,
 )
+from gsparc.evaluation.plots import draw_efforts, draw_splits
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)

@@ -17,10 +17,10 @@ from gsparc.commands.shared.train_job import train_job
 from gsparc.data.instantiate import config_node
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.pictures import draw_study
 from gsparc.evaluation.experiment.problem import compose
 from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.study import Condition, average_rounds, plan_rounds
+from gsparc.evaluation.plots import draw_study
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.registry import build, method_class

@@ -1,4 +1,4 @@
-"""Combinations of knobs scored on the test rows and timed in turns, and their front drawn."""
+"""Combinations of knobs scored on the test rows and timed in turns."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import fit_baseline
-from gsparc.evaluation.drawing import panels, set_latency_axes, style_of
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.scores import rows_to_score, score_methods
@@ -110,21 +107,6 @@ def find_better(point: Row, others: pd.DataFrame) -> str | None:
     """Return the most accurate other that is neither slower nor worse than a point; None without one."""
     better = others[(others.render_ms_p50 <= point["render_ms_p50"]) & (others.score >= point["score"])]
     return None if better.empty else str(better.label[better.score.astype(float).idxmax()])
-
-
-def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: str) -> Figure:
-    """Draw the points of a method beside others, see `measure_points`."""
-    best, beaten = points[points.front == 1], points[points.front == 0]
-    figure, ((axes,),) = panels(7.5, 4.2)
-    axes.scatter(beaten.render_ms_p50, beaten.value, s=9, c="0.75", label="beaten")
-    reach = [np.zeros(len(best)), best.render_ms_p95 - best.render_ms_p50]
-    how: dict[str, Any] = {"fmt": "o-", "color": style_of(method).colour, "capsize": 2, "lw": 1, "ms": 4}
-    axes.errorbar(best.render_ms_p50, best.value, xerr=reach, label="not beaten", **how)
-    beside = zip(others.label, others.render_ms_p50, others.value, strict=True)
-    set_latency_axes(axes, best.figure.iloc[0], best.value, beside)
-    axes.legend(loc="lower right", fontsize=8)
-    axes.set_title(title, fontsize=10)
-    return figure
 
 
 def _cell(value: Any) -> Any:

@@ -16,10 +16,10 @@ from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gsparc.evaluation import summary
+from gsparc.evaluation import plots, summary
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
-from gsparc.evaluation.report import plots, tables
+from gsparc.evaluation.report import tables
 from gsparc.evaluation.results import STUDY, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
 

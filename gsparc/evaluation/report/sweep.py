@@ -75,8 +75,8 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
     and its table.
     """
+    from gsparc.evaluation import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.experiment.latency import time_again
-    from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
     from gsparc.evaluation.report.page import write_report
     from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
     from gsparc.evaluation.results import frame, own_rows
