@@ -16,11 +16,9 @@ from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.shared.train_job import train_job
 from gsparc.data.files import platform_cache
-from gsparc.data.limits import POSITIVE
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.cells import Contender, job_of_cell, plan_cells, plugin_contenders
+from gsparc.evaluation.experiment.cells import plan_jobs
 from gsparc.evaluation.experiment.latency import time_by_dataset
-from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
 from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.table import (
     CELL,
@@ -44,18 +42,9 @@ def task(config: DictConfig) -> pd.DataFrame:
     settings = to_dict(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)
-    methods = plugin_contenders() | read_entries("methods", Contender, settings["methods"])
     folder = settings["cells"]
     cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
-    problems = load_every_problem(settings)
-    for effort in settings["efforts"]:
-        POSITIVE.check("efforts", effort)
-    counted = settings["efforts"], settings["seeds"], settings["only"]
-    own = {name: of or {} for name, of in settings["datasets"].items()}
-    jobs = [
-        job_of_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
-        for problem, cell in plan_cells(problems, methods, *counted)
-    ]
+    jobs = plan_jobs(settings, cells_dir)
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     log.info("cells are in %s", cells_dir)
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
@@ -63,8 +52,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         filled = run_jobs(jobs, train_job, bool(settings["train"]), limit_s)
     if filled.empty:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
-    by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
-    timed = time_by_dataset(filled, by_name) if settings["latency"] else None
+    timed = time_by_dataset(filled) if settings["latency"] else None
     return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 

@@ -17,7 +17,7 @@ from gsparc.commands.shared.train_job import train_job
 from gsparc.data.instantiate import config_node
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.problem import compose
+from gsparc.evaluation.experiment.cells import compose
 from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.study import Condition, average_rounds, plan_rounds
 from gsparc.evaluation.plots import draw_study

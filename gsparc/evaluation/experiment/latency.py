@@ -12,9 +12,9 @@ import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.experiment.problem import Problem
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import frame_of_runs, own_rows, read_run
+from gsparc.evaluation.scores import rows_to_score
 from gsparc.evaluation.summary import write_samples
 from gsparc.models import loading
 from gsparc.models.method import Method
@@ -61,23 +61,21 @@ def time_queries(
     return {name: found[name] for name in methods}
 
 
-def time_by_dataset(filled: pd.DataFrame, problems: Mapping[tuple[str, str], Problem]) -> pd.DataFrame:
+def time_by_dataset(filled: pd.DataFrame) -> pd.DataFrame:
     """Return columns `TIMED`, of the first split of each dataset that is there and keeps its models.
 
     Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_jobs`.
     """
     rows = []
     for dataset, here in filled.groupby("dataset", sort=False):
-        split = str(here.split.iloc[0])
+        own = here[(here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))]
         # The first of a method's cells stands for all of its efforts and seeds.
-        own = here[(here.split == split) & here.run.map(lambda run: bool(run.checkpoints))]
-        files = own.drop_duplicates("method").set_index("method").run.map(lambda run: run.checkpoints[0])
-        if len(files):
+        first = own.drop_duplicates("method").set_index("method")
+        if len(first):
             log.info("%s: timing single queries of every method in turns", dataset)
-            problem = problems[str(dataset), split]
-            found = time_queries(files.to_dict(), problem.data, problem.folds)
-            where = {"dataset": dataset, "split": split}
-            rows += [{**where, "method": name, **one} for name, one in found.items()]
+            files, job = first.run.map(lambda run: run.checkpoints[0]), first.job.iloc[0]
+            found = time_queries(files.to_dict(), job.data, job.split)
+            rows += [{**first.loc[name, TIMED[:2]], "method": name, **one} for name, one in found.items()]
     return pd.DataFrame(rows, columns=TIMED)
 
 
@@ -91,23 +89,19 @@ def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) 
         rounds: visits to each.
         rounds_s: no new round after this [s].
     """
-    runs, calls = list(own_rows(rows).run), dict[int, Call]()
+    runs, calls, threads = list(own_rows(rows).run), dict[int, Call](), dict[int, int]()
     for number, run in enumerate(runs):
         try:
             opened = open_files(run.checkpoints[:1])
             # A folder used twice may hold the model of one run beside the summary of the other.
             if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
                 raise ValueError("its checkpoint is of another run than its summary")
-            if not len(opened.split.folds[0].test):
-                log.warning("%s is not timed again: it has no test rows", run.folder)
-                continue
+            tested = rows_to_score(opened.split.folds[0], "test")
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
-        calls[number] = opened.predictor.cycle_places(opened.data.moving[opened.split.folds[0].test])
-    threads = {
-        number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
-    }
+        calls[number] = opened.predictor.cycle_places(opened.data.moving[tested])
+        threads[number] = int(run.facts.get("machine/threads") or torch.get_num_threads())
     times = time_interleaved(calls, replace(BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
     for number, ms in times.items():
         write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})

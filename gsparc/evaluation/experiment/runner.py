@@ -68,7 +68,7 @@ class Job:
         # The program, not the commit, decides: most commits change nothing that a method computes.
         changed = edited(read_summary(self.folder / RECORD) or {})
         earlier = str(run.facts.get("git"))[:8] if changed else ""
-        return {**run.rows()[0], **asdict(self.name), "earlier": earlier}
+        return {**run.rows()[0], **asdict(self.name), "job": self, "earlier": earlier}
 
 
 Fit = Callable[[Job, str | None], object]
@@ -98,8 +98,8 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
         limit_s: no job is started that would end later [s].
 
     Returns:
-        Columns of `results.frame`, those of the jobs' names, and `earlier` (commit of another program that it
-        was measured with; "" for this one's).
+        Columns of `results.frame`, those of the jobs' names, `job`, and `earlier` (commit of another program
+        that it was measured with; "" for this one's).
 
     Raises:
         ValueError: none can be done; why the first cannot.

@@ -6,8 +6,9 @@ import logging
 import sys
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pandas as pd
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
@@ -15,13 +16,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from gsparc.data.errors import list_first
-from gsparc.evaluation import summary
+from gsparc.evaluation import plots, summary
 from gsparc.evaluation.console import error_in_one_line, open_console
+from gsparc.evaluation.experiment.latency import time_again
 from gsparc.evaluation.experiment.options import REDRAW
 from gsparc.evaluation.ledger import FAILURE
-
-if TYPE_CHECKING:
-    import pandas as pd
+from gsparc.evaluation.report.page import write_report
+from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
+from gsparc.evaluation.results import frame, own_rows
 
 log = logging.getLogger(__name__)
 
@@ -75,12 +77,6 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
     and its table.
     """
-    from gsparc.evaluation import plots  # here: every training imports this module, pandas is slow
-    from gsparc.evaluation.experiment.latency import time_again
-    from gsparc.evaluation.report.page import write_report
-    from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
-    from gsparc.evaluation.results import frame, own_rows
-
     rows = frame(folder)
     if settings.retime:
         rows = time_again(rows, rounds=settings.rounds, rounds_s=settings.rounds_s)
