@@ -56,7 +56,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
         raise KeyboardInterrupt(message) from None
     clock = ClockSettings(rounds=int(config.queries), rounds_s=float(config.query_s))
-    rows = average_rounds(fits, conditions, data, split, clock)
+    rows = average_rounds(fits, conditions, clock)
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
         "seed": config.seed, "study/rounds": int(config.rounds),
