@@ -14,12 +14,11 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import begin_run, show_result
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import to_dict
-from gsparc.commands.shared.train_job import train_job
+from gsparc.commands.train import train_job
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.cells import plan_jobs
-from gsparc.evaluation.experiment.latency import time_by_dataset
-from gsparc.evaluation.experiment.runner import run_jobs
+from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
 from gsparc.evaluation.experiment.table import (
     CELL,
     average_cells,
@@ -68,13 +67,11 @@ def write_comparison(
     """
     rows = average_cells(filled, timed)
     blocks = split_by_problem(rows)
-    by_draw = rows[rows.draws]
-    by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
     write_samples(run_dir / "compare.csv", columns_of_csv(rows))
     write_samples(run_dir / "cells.csv", filled[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
-    for here in by_set:
-        draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)
+    for dataset, here in rows[rows.draws].groupby("dataset", sort=False):
+        draw_splits(here, run_dir / f"{dataset}.png", figures)
     if not rows.draws.all():
         draw_efforts(rows[~rows.draws], run_dir / "compare.png", ours, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.latency import time_again
+from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.report.page import write_report
 from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns
 

@@ -14,8 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.latency import time_queries
-from gsparc.evaluation.experiment.runner import Job
+from gsparc.evaluation.experiment.runner import Job, time_queries
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.ledger import measurements_hash
 from gsparc.evaluation.scores import score_methods

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.evaluation.baselines import PLAIN
-from gsparc.evaluation.experiment.latency import TIMED
+from gsparc.evaluation.experiment.runner import TIMED
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     GIVEN_HEARD,

@@ -18,8 +18,8 @@ from rich.console import Console
 from gsparc.data.errors import list_first
 from gsparc.evaluation import plots, summary
 from gsparc.evaluation.console import error_in_one_line, open_console
-from gsparc.evaluation.experiment.latency import time_again
 from gsparc.evaluation.experiment.options import REDRAW
+from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.ledger import FAILURE
 from gsparc.evaluation.report.page import write_report
 from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from gsparc.evaluation import plots
-from gsparc.evaluation.experiment import latency
+from gsparc.evaluation.experiment import runner
 from gsparc.evaluation.experiment.table import (
     average_cells,
     columns_of_csv,
@@ -55,7 +55,7 @@ FOUND = [
 ]  # fmt: skip
 TIMED = pd.DataFrame(
     [["rfid", "random", "gp", 2.0, 3.0, 1.5], ["rfid", "random", "gsparc", 0.5, 0.6, 0.4]],
-    columns=latency.TIMED,
+    columns=runner.TIMED,
 )
 
 
