@@ -13,7 +13,6 @@ from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import begin_run, show_result
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.train import train_job
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED
@@ -37,8 +36,7 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods and report."""
-    run_dir = begin_run(config)
-    settings = to_dict(config)
+    run_dir, settings = begin_run(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)
     folder = settings["cells"]

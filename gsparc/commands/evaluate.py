@@ -9,7 +9,6 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
@@ -59,12 +58,12 @@ def evaluate_files(
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Test checkpoints; return the facts written to `summary.json` in the run directory."""
-    run_dir = begin_run(config)
+    run_dir, settings = begin_run(config)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     evaluation, data, split = evaluate_files(
         paths,
-        to_dict(config.dataset),
-        to_dict(config.split),
+        settings["dataset"],
+        settings["split"],
         eval_on=config.eval_on,
         baselines=config.baselines,
     )

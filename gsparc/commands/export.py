@@ -33,7 +33,7 @@ Facts = tuple[dict[str, Any], list[str]]
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Export, and say what is lost; returns the facts of `summary.json`."""
-    run_dir = begin_run(config)
+    run_dir, _ = begin_run(config)
     check_arguments(config, **LIMITS)
     path = Path(config.ckpt)
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)

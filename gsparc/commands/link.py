@@ -15,7 +15,6 @@ from omegaconf import DictConfig
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
@@ -42,7 +41,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:
         raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
-    run_dir, settings = begin_run(config), to_dict(config)
+    run_dir, settings = begin_run(config)
     # Bits, noise and channels of PUSCH are drawn from torch's global generator.
     torch.manual_seed(int(config.seed))
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])

@@ -16,7 +16,6 @@ from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
 from gsparc.apps.maps.promised import map_notes, read_or_gather
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
@@ -56,7 +55,7 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Map, draw and write; returns the facts of `summary.json`."""
-    run_dir, settings = begin_run(config), to_dict(config)
+    run_dir, settings = begin_run(config)
     floor = read_plan_settings(settings)
     predictor = load(config.ckpt)
     how = PromiseSettings(**settings["promise"])

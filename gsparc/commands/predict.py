@@ -7,17 +7,16 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.evaluation.answers import predict_file
 from gsparc.prediction.operating_point import load
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Predict at places of a table; return the facts written to `summary.json` in the run directory."""
-    run_dir = begin_run(config)
+    run_dir, settings = begin_run(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     station = None if config.station is None else str(config.station)
-    how: dict[str, Any] = {"columns": to_dict(config.columns), "overwrite": bool(config.overwrite)}
+    how: dict[str, Any] = {"columns": settings["columns"], "overwrite": bool(config.overwrite)}
     facts = predict_file(predictor, config.places, config.out, station=station, **how)
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:

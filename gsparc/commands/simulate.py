@@ -54,10 +54,10 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 def task(config: DictConfig) -> Outcome | None:
     """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
-    run_dir = begin_run(config)
     if config.scene.name == "help":
         open_console().print(simulated.table_of_scenes(), OTHERS)
         return None
+    run_dir, _ = begin_run(config)
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
     # The folder of parts is locked: a second run of the same file would add its shards to it.

@@ -44,11 +44,11 @@ def configs_of(config: DictConfig) -> dict[str, DictConfig]:
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
-    run_dir = begin_run(config)
+    run_dir, settings = begin_run(config)
     build(config.model)  # its parts check themselves
     conditions = instantiate(config.kind).conditions()
-    data = load(to_dict(config.dataset))
-    split = split_for(to_dict(config.split), data)
+    data = load(settings["dataset"])
+    split = split_for(settings["split"], data)
     try:
         jobs = plan_rounds(configs_of(config), conditions, int(config.rounds), data, split, run_dir)
         fits = run_jobs(jobs, train_job)

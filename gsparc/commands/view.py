@@ -15,7 +15,6 @@ from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
 from gsparc.apps.view.viewed import open_model
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import whole
@@ -30,11 +29,11 @@ SAVED = (".html", ".ply")
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
-    run_dir = begin_run(config)
+    run_dir, settings = begin_run(config)
     save = None if config.save is None else Path(str(config.save))
     # Before model and data are read, which takes seconds.
     check(save, int(config.port))
-    view = view_of(to_dict(config))
+    view = view_of(settings)
     end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
     viewed, site = view.viewed, view.viewed.site
     facts = {

@@ -12,7 +12,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import RenderableType
 
-from gsparc.commands.shared.settings import RunSettings
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import open_console, repeated_warnings
@@ -25,14 +25,15 @@ def run_directory() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def begin_run(config: DictConfig) -> Path:
-    """Check the settings of a run, before anything is read; return where the running command writes.
+def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
+    """Check the settings of a run, before anything is read; return where it writes, and plain settings.
 
     Raises:
         ValueError: a setting that cannot be.
+        MissingMandatoryValue: one that was not given.
     """
     RunSettings.from_config(config)
-    return run_directory()
+    return run_directory(), to_dict(config)
 
 
 def in_multirun() -> bool:
