@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.open_runs import calibrate_and_store, collect_evidence
 from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
@@ -23,10 +22,8 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Gather, resample, write; returns the facts of `summary.json`."""
-    RunSettings.from_config(config)
-    run_dir = run_directory()
+    run_dir, settings = begin_run(config)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    settings = to_dict(config)
     evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, int(config.seed)

@@ -11,18 +11,13 @@ from typing import Any
 import pandas as pd
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import run_directory, show_result
+from gsparc.commands.shared.output import begin_run, show_result
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.commands.shared.train_job import train_job
+from gsparc.commands.train import train_job
 from gsparc.data.files import platform_cache
-from gsparc.data.limits import POSITIVE
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.cells import Contender, job_of_cell, plan_cells, plugin_contenders
-from gsparc.evaluation.experiment.latency import time_by_dataset
-from gsparc.evaluation.experiment.pictures import draw_efforts, draw_splits
-from gsparc.evaluation.experiment.problem import load_every_problem, read_entries
-from gsparc.evaluation.experiment.runner import run_jobs
+from gsparc.evaluation.experiment.cells import plan_jobs
+from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
 from gsparc.evaluation.experiment.table import (
     CELL,
     average_cells,
@@ -33,6 +28,7 @@ from gsparc.evaluation.experiment.table import (
     table_of,
     title_of,
 )
+from gsparc.evaluation.plots import draw_efforts, draw_splits
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
@@ -40,23 +36,12 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Fill the cells that are asked for and not there yet, then time all methods and report."""
-    RunSettings.from_config(config)
-    run_dir = run_directory()
-    settings = to_dict(config)
+    run_dir, settings = begin_run(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)
-    methods = plugin_contenders() | read_entries("methods", Contender, settings["methods"])
     folder = settings["cells"]
     cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
-    problems = load_every_problem(settings)
-    for effort in settings["efforts"]:
-        POSITIVE.check("efforts", effort)
-    counted = settings["efforts"], settings["seeds"], settings["only"]
-    own = {name: of or {} for name, of in settings["datasets"].items()}
-    jobs = [
-        job_of_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
-        for problem, cell in plan_cells(problems, methods, *counted)
-    ]
+    jobs = plan_jobs(settings, cells_dir)
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     log.info("cells are in %s", cells_dir)
     # The folder of cells is shared by all comparisons here: two would fill the same ones.
@@ -64,8 +49,7 @@ def task(config: DictConfig) -> pd.DataFrame:
         filled = run_jobs(jobs, train_job, bool(settings["train"]), limit_s)
     if filled.empty:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
-    by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
-    timed = time_by_dataset(filled, by_name) if settings["latency"] else None
+    timed = time_by_dataset(filled) if settings["latency"] else None
     return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
 
 
@@ -81,13 +65,11 @@ def write_comparison(
     """
     rows = average_cells(filled, timed)
     blocks = split_by_problem(rows)
-    by_draw = rows[rows.draws]
-    by_set = [here for _, here in by_draw.groupby("dataset", sort=False)]
     write_samples(run_dir / "compare.csv", columns_of_csv(rows))
     write_samples(run_dir / "cells.csv", filled[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
-    for here in by_set:
-        draw_splits(here, run_dir / f"{here.dataset.iloc[0]}.png", figures)
+    for dataset, here in rows[rows.draws].groupby("dataset", sort=False):
+        draw_splits(here, run_dir / f"{dataset}.png", figures)
     if not rows.draws.all():
         draw_efforts(rows[~rows.draws], run_dir / "compare.png", ours, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}

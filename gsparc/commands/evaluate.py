@@ -8,8 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
@@ -59,13 +58,12 @@ def evaluate_files(
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Test checkpoints; return the facts written to `summary.json` in the run directory."""
-    RunSettings.from_config(config)
-    run_dir = run_directory()
+    run_dir, settings = begin_run(config)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     evaluation, data, split = evaluate_files(
         paths,
-        to_dict(config.dataset),
-        to_dict(config.split),
+        settings["dataset"],
+        settings["split"],
         eval_on=config.eval_on,
         baselines=config.baselines,
     )

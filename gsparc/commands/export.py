@@ -14,8 +14,8 @@ from gsparc.apps.export.along import deepmimo
 from gsparc.apps.export.along.taps import Trajectory, write_taps
 from gsparc.apps.export.compiled.blob import pack_form
 from gsparc.apps.export.compiled.make import FIGURES, compile_model
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.settings import to_dict
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
 from gsparc.data.query_places import read_query_places, read_times
@@ -33,7 +33,7 @@ Facts = tuple[dict[str, Any], list[str]]
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Export, and say what is lost; returns the facts of `summary.json`."""
-    RunSettings.from_config(config)
+    run_dir, _ = begin_run(config)
     check_arguments(config, **LIMITS)
     path = Path(config.ckpt)
     out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
@@ -45,7 +45,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     with whole_folder(out) as folder:
         facts, lines = WRITERS[config.to](predictor, config, folder, out)
     facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
-    return finish_run(run_directory(), facts, lines=lines, before="summary ")
+    return finish_run(run_dir, facts, lines=lines, before="summary ")
 
 
 def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:

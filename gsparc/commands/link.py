@@ -14,8 +14,7 @@ from omegaconf import DictConfig
 
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
@@ -42,10 +41,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:
         raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
-    RunSettings.from_config(config)
+    run_dir, settings = begin_run(config)
     # Bits, noise and channels of PUSCH are drawn from torch's global generator.
     torch.manual_seed(int(config.seed))
-    run_dir, settings = run_directory(), to_dict(config)
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
     # Seconds of the experiments alone: reading the data is not theirs.
     started = time.perf_counter()

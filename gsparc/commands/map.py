@@ -5,7 +5,7 @@ from __future__ import annotations
 from fnmatch import fnmatch
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
@@ -15,19 +15,13 @@ from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
 from gsparc.apps.maps.promised import map_notes, read_or_gather
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.timing import peak_memory
 
 SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
-
-
-def settings_of(config: DictConfig) -> RunSettings:
-    """Check the settings of a run, of which `stations` is not one here: it holds names."""
-    return RunSettings.from_config(OmegaConf.masked_copy(config, [str(k) for k in config if k != "stations"]))
 
 
 def stations_of(setting: Any) -> list[str | int] | None:
@@ -61,8 +55,7 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Map, draw and write; returns the facts of `summary.json`."""
-    settings_of(config)
-    run_dir, settings = run_directory(), to_dict(config)
+    run_dir, settings = begin_run(config)
     floor = read_plan_settings(settings)
     predictor = load(config.ckpt)
     how = PromiseSettings(**settings["promise"])

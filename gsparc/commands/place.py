@@ -10,8 +10,7 @@ from omegaconf import DictConfig
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promised import read_or_gather, reopen_training
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
@@ -20,8 +19,7 @@ from gsparc.prediction.operating_point import load
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Try candidates, draw and write; returns the facts of `summary.json`."""
-    RunSettings.from_config(config)
-    run_dir, settings, path = run_directory(), to_dict(config), str(config.ckpt)
+    (run_dir, settings), path = begin_run(config), str(config.ckpt)
     if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)

@@ -13,17 +13,15 @@ from gsparc.apps.maps.geojson import write_shapes
 from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promised import read_or_gather
-from gsparc.commands.map import settings_of, stations_of
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import to_dict
+from gsparc.commands.map import stations_of
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.prediction.operating_point import load
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Choose, draw and write; returns the facts of `summary.json`."""
-    settings_of(config)
-    run_dir, settings = run_directory(), to_dict(config)
+    run_dir, settings = begin_run(config)
     stations = stations_of(settings["stations"])
     floor = read_plan_settings(settings)
     # Before anything is measured there is no model, and places are spread over the area.

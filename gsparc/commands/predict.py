@@ -6,18 +6,17 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.answers import predict_file
 from gsparc.prediction.operating_point import load
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Predict at places of a table; return the facts written to `summary.json` in the run directory."""
-    RunSettings.from_config(config)
+    run_dir, settings = begin_run(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     station = None if config.station is None else str(config.station)
-    how: dict[str, Any] = {"columns": to_dict(config.columns), "overwrite": bool(config.overwrite)}
+    how: dict[str, Any] = {"columns": settings["columns"], "overwrite": bool(config.overwrite)}
     facts = predict_file(predictor, config.places, config.out, station=station, **how)
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
@@ -28,4 +27,4 @@ def task(config: DictConfig) -> dict[str, Any]:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
     before += f", {empty} predictions empty" if (empty := facts["predict/empty"]) else ""
     before += f"; predictions in {facts['out']}; summary "
-    return finish_run(run_directory(), facts | {"ckpt": str(config.ckpt)}, before=before)
+    return finish_run(run_dir, facts | {"ckpt": str(config.ckpt)}, before=before)

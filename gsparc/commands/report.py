@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.commands.shared.output import run_directory
-from gsparc.evaluation.console import open_console
+from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.latency import time_again
+from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.report.page import write_report
 from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns
-from gsparc.evaluation.summary import write_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -31,13 +29,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.retime:
         rows = time_again(rows, rounds=int(config.rounds), rounds_s=float(config.rounds_s))
     out = run_directory()
-    origin = write_report(out, config.title, rows, _fronts(paths), config.figures)
+    write_report(out, config.title, rows, _fronts(paths), config.figures)
     count, studies = len(own_rows(rows)), rows.groupby(STUDY, dropna=False).ngroups
-    facts: dict[str, Any] = {"report/runs": count, "report/studies": studies, **origin}
-    write_summary(out / "summary.json", facts)
-    runs_read = f"{count} run{'s' * (count > 1)}"
-    open_console().print(f"{runs_read}; written to {out / 'report.html'}", highlight=False)
-    return facts
+    facts = {"report/runs": count, "report/studies": studies}
+    return finish_run(out, facts, before=f"{count} run{'s' * (count > 1)}; report.html ")
 
 
 def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -10,12 +9,13 @@ from typing import Any
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import run_directory
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.settings import to_dict
 from gsparc.data.instantiate import from_settings
-from gsparc.evaluation import simulated, summary
+from gsparc.evaluation import simulated
 from gsparc.evaluation.console import open_console
+from gsparc.prediction.timing import machine_facts
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import Effects
@@ -54,12 +54,10 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 def task(config: DictConfig) -> Outcome | None:
     """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
-    RunSettings.from_config(config)
-    run_dir, console = run_directory(), open_console()
     if config.scene.name == "help":
-        console.print(simulated.table_of_scenes())
-        console.print(OTHERS)
+        open_console().print(simulated.table_of_scenes(), OTHERS)
         return None
+    run_dir, _ = begin_run(config)
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
     # The folder of parts is locked: a second run of the same file would add its shards to it.
@@ -71,20 +69,15 @@ def task(config: DictConfig) -> Outcome | None:
     # The exact shoebox has walls, but no triangles.
     if len(triangles):
         write_walls(triangles, run_dir / "walls.yaml")
-    if outcome.decision is not None:
-        console.print(choice_table(outcome.decision.choice))
-    load = os.getloadavg()[0] / (os.cpu_count() or 1)
     facts = {
+        **machine_facts(),
         **summary_facts(outcome),
         "time/total_s": seconds,
         "time/cpu_s": time.process_time() - busy,  # of all threads: what a busy machine cannot inflate
-        "machine/load": load,
         "out": str(config.out),
         "out/mb": out.stat().st_size / 1e6,
-        **summary.provenance(),
     }
-    summary.write_summary(run_dir / "summary.json", facts)
-    for line in closing_sentences(outcome, seconds, load):
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
-    console.print(f"written to {out}; summary and pictures in {run_dir}", highlight=False, soft_wrap=True)
+    tables = [] if outcome.decision is None else [choice_table(outcome.decision.choice)]
+    lines = closing_sentences(outcome, seconds, facts["machine/load"])
+    finish_run(run_dir, facts, *tables, lines=lines, before=f"rows in {out}; summary and pictures ")
     return outcome

@@ -11,16 +11,16 @@ import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.commands.shared.train_job import train_job
+from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.settings import to_dict
+from gsparc.commands.train import train_job
 from gsparc.data.instantiate import config_node
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.pictures import draw_study
-from gsparc.evaluation.experiment.problem import compose
+from gsparc.evaluation.experiment.cells import compose
 from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.study import Condition, average_rounds, plan_rounds
+from gsparc.evaluation.plots import draw_study
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.registry import build, method_class
@@ -44,11 +44,11 @@ def configs_of(config: DictConfig) -> dict[str, DictConfig]:
 
 def task(config: DictConfig) -> pd.DataFrame:
     """Run the study, show its table, write its files."""
-    settings = RunSettings.from_config(config)
+    run_dir, settings = begin_run(config)
     build(config.model)  # its parts check themselves
-    run_dir, conditions = run_directory(), instantiate(config.kind).conditions()
-    data = load(to_dict(config.dataset))
-    split = split_for(to_dict(config.split), data)
+    conditions = instantiate(config.kind).conditions()
+    data = load(settings["dataset"])
+    split = split_for(settings["split"], data)
     try:
         jobs = plan_rounds(configs_of(config), conditions, int(config.rounds), data, split, run_dir)
         fits = run_jobs(jobs, train_job)
@@ -56,10 +56,10 @@ def task(config: DictConfig) -> pd.DataFrame:
         message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
         raise KeyboardInterrupt(message) from None
     clock = ClockSettings(rounds=int(config.queries), rounds_s=float(config.query_s))
-    rows = average_rounds(fits, conditions, data, split, clock)
+    rows = average_rounds(fits, conditions, clock)
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split),
-        "seed": settings.seed, "study/rounds": int(config.rounds),
+        "seed": config.seed, "study/rounds": int(config.rounds),
     }  # fmt: skip
     title = f"{data.site.name}, split {split.title}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))

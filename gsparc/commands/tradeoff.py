@@ -21,6 +21,7 @@ from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
 from gsparc.evaluation.ledger import State, measurements_hash, run_once
 from gsparc.evaluation.open_runs import Opened, open_files
+from gsparc.evaluation.plots import draw_front
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models.reduced import list_settings, with_reduction
@@ -59,9 +60,9 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     kept = points[points.kept_with_model == 1]
     if config.store:
         operating_point.store_points(Path(config.ckpt), kept.to_dict("records"), inputs)
-    write_samples(run_dir / "tradeoff.csv", tradeoff.columns_of_csv(points))
+    write_samples(run_dir / "tradeoff.csv", points.drop(columns=tradeoff.MADE).to_dict("list"))
     title = f"{data.site.name}, split {run.split.title}, {config.eval_on}: {method.name}"
-    save(tradeoff.draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
+    save(draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
     facts = {
         **tradeoff.facts_of(points, beside),
         **peak_memory(), **run.facts(),

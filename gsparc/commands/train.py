@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,10 @@ from gsparc.evaluation import summary
 from gsparc.evaluation.baselines import same_as_baseline
 from gsparc.evaluation.evaluate import TrainedRun, evaluate
 from gsparc.evaluation.experiment import folds, options
+from gsparc.evaluation.experiment.runner import Job
 from gsparc.evaluation.ledger import set_earlier_aside
 from gsparc.evaluation.pictures import draw_run
+from gsparc.models.array_vectors.vector_cache import forget_vectors
 from gsparc.training import tracking
 from gsparc.training.context import FitContext
 
@@ -55,7 +59,6 @@ def train(
         if in_full:
             describe_inputs(config, inputs)
         write_split(run_dir / "split.json", split, len(data), data.site.sha256, run_id)
-
         with tracking.open_loggers(config) as loggers:
             whole = FitContext(
                 **folds.effort_settings(config),
@@ -76,7 +79,6 @@ def train(
                 fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
                 options.ask_one_query(fits.methods[0], data, split, config.eval_on)
             unused = options.warn_of_unheeded(inputs.reads, fits.methods[0], data) if in_full else None
-
             evaluation = evaluate(
                 fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
                 shared=same_as_baseline(config, method), timed=in_full,
@@ -89,6 +91,17 @@ def train(
         evaluation.write(run_dir, run_id=run_id)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)
+
+
+def train_job(job: Job, left: str | None) -> None:
+    """Train a job into its folder, from what an interrupted try has `left` there."""
+    config = deepcopy(job.config)
+    forget_vectors()  # solved for another job, they would be missing from this one's processor seconds
+    config.ckpt_path = config.ckpt_path or left  # what the settings name to go on from wins
+    inputs = replace(read_inputs(config, job.data), split=job.split, learned=job.learned)
+    _, made = train(config, job.folder, inputs, in_full=False)
+    for file in () if job.keeps_models else made.checkpoints:
+        file.unlink()
 
 
 def train_and_show(config: DictConfig, run_dir: Path, inputs: RunInputs) -> None:

@@ -14,8 +14,7 @@ from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
 from gsparc.apps.view.viewed import open_model
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import whole
@@ -30,18 +29,18 @@ SAVED = (".html", ".ply")
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
-    RunSettings.from_config(config)
+    run_dir, settings = begin_run(config)
     save = None if config.save is None else Path(str(config.save))
     # Before model and data are read, which takes seconds.
     check(save, int(config.port))
-    view = view_of(to_dict(config))
+    view = view_of(settings)
     end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
     viewed, site = view.viewed, view.viewed.site
     facts = {
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": viewed.predictor.method.name,
         "ckpt": str(config.ckpt), **peak_memory(),
     }  # fmt: skip
-    return finish_run(run_directory(), facts, lines=[*viewed.notes, end], before="summary ")
+    return finish_run(run_dir, facts, lines=[*viewed.notes, end], before="summary ")
 
 
 def check(save: Path | None, port: int) -> None:

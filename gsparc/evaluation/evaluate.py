@@ -25,7 +25,7 @@ from gsparc.evaluation.summary import write_samples
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.prediction import timing
-from gsparc.prediction.timing import COPY, ClockSettings, p50_p95, query_calls, time_interleaved
+from gsparc.prediction.timing import ClockSettings, query_calls, time_beside_copy, time_interleaved
 
 log = logging.getLogger(__name__)
 
@@ -182,27 +182,25 @@ def time_methods(
     Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
     clock = clock or ClockSettings()
-    singles = query_calls(methods, data, rows)
-    one = time_interleaved({**singles, COPY: timing.reference_copy()}, clock)
+    one = time_beside_copy(query_calls(methods, data, rows), clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
-    # A median: one interruption by another process moves a mean of few rounds.
-    quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
+    quick = {name: m for name, m in methods.items() if one[name]["query_ms"] * BATCH < SLOWEST_BATCH_MS}
+    # Without a copy beside them, which empties the caches.
     many = time_interleaved(query_calls(quick, data, rows, BATCH), fewer)
-    copy_ms = float(np.median(one[COPY]))
+    first = next(iter(one.values()))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {
-        "time/copy_ms": copy_ms,
-        "time/rounds": len(one[COPY]),
+        "time/copy_ms": first["query_ms"] / first["to_copy"],
+        "time/rounds": first["rounds"],
         "time/includes": (
             f"one query end to end, a position in host memory in, a {shape} {data.site.kind} in host memory "
             "out; warm, plans made before; no file, no picture"
         ),
     }
-    for room in methods:
-        p50, p95 = p50_p95(one[room])
-        times = {"render_ms_p50": p50, "render_ms_p95": p95, "ratio_to_copy": p50 / copy_ms}
+    for room, (p50, p95, to_copy, _) in ((name, own.values()) for name, own in one.items()):
+        times = {"render_ms_p50": p50, "render_ms_p95": p95, "ratio_to_copy": to_copy}
         facts |= {f"{room}/{key}": value for key, value in times.items()}
-        together = float(np.median(many[room])) / BATCH if room in quick else None
+        together = float(np.median(many[room])) / BATCH if room in many else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
     return facts
 

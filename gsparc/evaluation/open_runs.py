@@ -27,21 +27,9 @@ from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.prediction import confidence
+from gsparc.prediction import confidence, risk
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
-from gsparc.prediction.risk import (
-    MOST_LAX_DB,
-    Evidence,
-    Guarantee,
-    calibrate_threshold,
-    design_effect,
-    explain_kind,
-    explain_too_few,
-    join_evidence,
-    number_patches,
-    relax_guarantee,
-)
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -312,7 +300,7 @@ def _trained(
 
 def collect_evidence(
     paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
-) -> tuple[Evidence, dict[str, Any]]:
+) -> tuple[risk.Evidence, dict[str, Any]]:
     """Gather evidence of every checkpoint's own test rows, no row twice, and the facts that name them."""
     parts, seen = [], np.zeros(0, np.int64)
     facts: dict[str, Any] = {}
@@ -324,12 +312,12 @@ def collect_evidence(
             parts.append(confidence.gather_evidence(run.methods[0], run.data, fold, rows, own))
         seen = np.concatenate([seen, rows])
         facts = facts or run.facts()
-    return join_evidence(parts), facts
+    return risk.join_evidence(parts), facts
 
 
 def calibrate_and_store(
-    path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: Guarantee, kind: str, spatial: bool,
-    seed: int,
+    path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: risk.Guarantee, kind: str,
+    spatial: bool, seed: int,
 ) -> tuple[confidence.Trusted, str]:  # fmt: skip
     """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
     run, own, fold = _unseen(path, dataset, split)
@@ -337,7 +325,7 @@ def calibrate_and_store(
     rows = rows_to_score(run.split.folds[0], "test")
     evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
     how = kind, spatial, seed
-    kind_used, choice, _, choose_on = calibrate_threshold(evidence, guarantee, *how, tested=False)
+    kind_used, choice, _, choose_on = risk.calibrate_threshold(evidence, guarantee, *how, tested=False)
     threshold = confidence.confidence_threshold(kind_used, choice)
     known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
     box = confidence.calibrated_box(known, evidence.position)
@@ -345,7 +333,7 @@ def calibrate_and_store(
     earlier = confidence.read_trusted(run.stored[0].extra)
     before = earlier.kind or "the model's own"
     # Programs that read confidences get another number from now on: it is said.
-    why = f", {explain_kind(evidence, choose_on)}" if kind == "auto" else ""
+    why = f", {risk.explain_kind(evidence, choose_on)}" if kind == "auto" else ""
     kind_changed = f"confidence={kind_used}{why}, before: {before}; "
     if kind == "auto" and not np.isfinite(threshold):
         # Without a promise a choice by chance would replace what falls away from the measurements.
@@ -359,12 +347,12 @@ def calibrate_and_store(
         of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {path}"
         return stored, f"{kind_changed}{from_there}: {of}"
     wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
-    effect = design_effect(wrong, number_patches(evidence.position)) if spatial else 1.0
+    effect = risk.design_effect(wrong, risk.number_patches(evidence.position)) if spatial else 1.0
     bad = float(wrong.mean())
-    if few := explain_too_few(len(evidence), guarantee, bad, effect):
+    if few := risk.explain_too_few(len(evidence), guarantee, bad, effect):
         return stored, f"{kind_changed}no threshold keeps the bound: {few}"
-    other = relax_guarantee(evidence, guarantee, *how)
-    hint = f"limit_db={other.limit_db:g} would be" if other else f"no limit_db= up to {MOST_LAX_DB} is"
+    other = risk.relax_guarantee(evidence, guarantee, *how)
+    hint = f"limit_db={other.limit_db:g} would be" if other else f"no limit_db= up to {risk.MOST_LAX_DB} is"
     reason = "the others are not told from them surely enough"
     if bad < guarantee.alpha:
         reason = f"so few do not show that at most alpha={guarantee.alpha:g} are"

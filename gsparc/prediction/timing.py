@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ Call = Callable[[int], object]
 
 QUERIES = 64  # different ones, by turns
 COPY = "copy"
+SPEED = ("query_ms", "query_p95_ms", "to_copy", "rounds")  # to_copy: in units of a copy of the same rounds
 COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second everywhere
 
 
@@ -127,6 +128,18 @@ def p50_p95(times: np.ndarray) -> tuple[float, float]:
     (50.0, 95.0)
     """
     return float(np.median(times)), float(np.quantile(times, 0.95))
+
+
+def time_beside_copy(
+    calls: Mapping[Key, Call], clock: ClockSettings | None = None, threads: Mapping[Key, int] | None = None
+) -> dict[Key, dict[str, float]]:
+    """Return `SPEED` of calls by name, timed in turns with one another and a copy; see `time_interleaved`."""
+    every: dict[Any, Call] = {COPY: reference_copy(), **calls}
+    # A copy of memory is made by one thread.
+    times = time_interleaved(every, clock, None if threads is None else {COPY: 1} | dict(threads))
+    copy_ms = float(np.median(times.pop(COPY)))
+    rows = ((name, *p50_p95(ms), len(ms)) for name, ms in times.items())
+    return {name: dict(zip(SPEED, (p50, p95, p50 / copy_ms, n), strict=True)) for name, p50, p95, n in rows}
 
 
 def reference_copy() -> Call:

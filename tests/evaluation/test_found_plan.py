@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from gsparc.data.own import from_arrays
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
-from gsparc.evaluation import found_plan
-from gsparc.evaluation.found_plan import draw_found
+from gsparc.evaluation import site_plan
+from gsparc.evaluation.site_plan import draw_found
 
 STATION = np.array([101.0, 204.0, 2.0])
 HALF = np.sqrt(0.5)
@@ -26,7 +26,7 @@ def room():
 
 def drawn(monkeypatch, data, objects, known=None) -> Figure:
     kept: list[Figure] = []
-    monkeypatch.setattr(found_plan, "save", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(site_plan, "save", lambda figure, path: kept.append(figure))
     draw_found(data, objects, "unused.png", known)
     kept[0].draw_without_rendering()
     return kept[0]

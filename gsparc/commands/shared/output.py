@@ -12,6 +12,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import RenderableType
 
+from gsparc.commands.shared.settings import RunSettings, to_dict
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import open_console, repeated_warnings
@@ -22,6 +23,17 @@ from gsparc.prediction.timing import machine_facts
 def run_directory() -> Path:
     """Return where the running command writes."""
     return Path(HydraConfig.get().runtime.output_dir)
+
+
+def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
+    """Check the settings of a run, before anything is read; return where it writes, and plain settings.
+
+    Raises:
+        ValueError: a setting that cannot be.
+        MissingMandatoryValue: one that was not given.
+    """
+    RunSettings.from_config(config)
+    return run_directory(), to_dict(config)
 
 
 def in_multirun() -> bool:

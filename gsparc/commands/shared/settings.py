@@ -58,6 +58,8 @@ class RunSettings(Checked):
         assert isinstance(values, dict)
         refuse_seconds(dict(_leaves(values)))
         known: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        if "model" not in values:  # names of stations to ask, not how they are learned
+            known.pop("stations", None)
         settings = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
         trainer = values.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")

@@ -1,17 +1,21 @@
-"""A list of fits done one after the other in one process, which reads data once; each is kept as it ends."""
+"""A list of fits done one after the other in one process, which reads data once; each is kept as it ends.
+
+Their models are timed at the end, asked in turns, with nothing beside them.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 from omegaconf import DictConfig
 
 from gsparc.data.executor import run_each
@@ -21,11 +25,27 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.ledger import RECORD, State, edited, read_finished, run_once
 from gsparc.evaluation.metric_formats import number_format
-from gsparc.evaluation.results import as_frame, read_run, read_summary
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.results import as_frame, frame_of_runs, own_rows, read_run, read_summary
+from gsparc.evaluation.scores import rows_to_score
+from gsparc.evaluation.summary import write_samples
+from gsparc.models import loading
+from gsparc.models.method import Method
+from gsparc.prediction import timing
+from gsparc.prediction.timing import SPEED, Call, ClockSettings, time_beside_copy
 
 log = logging.getLogger(__name__)
 
 REFUSED = "not possible"  # in the error of an effect that the data do not allow
+SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
+ENDLESS_MS = 10_000.0  # from here on it is timed once
+# 60 rounds give a 95th percentile from three samples beyond it.
+FAST = ClockSettings(rounds=60, rounds_s=30.0)
+SLOW = ClockSettings(rounds=5, least=1, warmup=0, rounds_s=20.0)
+ONCE = replace(SLOW, rounds=1)
+
+
+TIMED = ["dataset", "split", "method", *SPEED[:3]]
 
 
 @dataclass(frozen=True)
@@ -68,7 +88,7 @@ class Job:
         # The program, not the commit, decides: most commits change nothing that a method computes.
         changed = edited(read_summary(self.folder / RECORD) or {})
         earlier = str(run.facts.get("git"))[:8] if changed else ""
-        return {**run.rows()[0], **asdict(self.name), "earlier": earlier}
+        return {**run.rows()[0], **asdict(self.name), "job": self, "earlier": earlier}
 
 
 Fit = Callable[[Job, str | None], object]
@@ -98,8 +118,8 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
         limit_s: no job is started that would end later [s].
 
     Returns:
-        Columns of `results.frame`, those of the jobs' names, and `earlier` (commit of another program that it
-        was measured with; "" for this one's).
+        Columns of `results.frame`, those of the jobs' names, `job`, and `earlier` (commit of another program
+        that it was measured with; "" for this one's).
 
     Raises:
         ValueError: none can be done; why the first cannot.
@@ -136,3 +156,70 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
     if refused and not found:
         raise ValueError(next(iter(refused.values())))
     return as_frame(found[str(one.name)] for one in jobs if str(one.name) in found)
+
+
+def time_queries(
+    files: Mapping[str, Path], data: Measurements, split: Split, fast: ClockSettings = FAST
+) -> dict[str, dict[str, float]]:
+    """Return `SPEED` of models by name; slow ones have clocks of their own."""
+    methods: dict[str, Method] = {name: loading.load(file)[0] for name, file in files.items()}
+    calls = timing.query_calls(methods, data, split.folds[0].test)
+    found: dict[str, dict[str, float]] = {}
+
+    def timed(names: Iterable[str], clock: ClockSettings) -> None:
+        found.update(time_beside_copy({name: calls[name] for name in names}, clock))
+
+    # By speed, before any takes a share of the rounds; a first call may make what later ones keep.
+    timed(calls, ONCE)
+    timed([name for name, one in found.items() if SLOW_MS < one["query_ms"] <= ENDLESS_MS], ONCE)
+    speeds = {name: one["query_ms"] for name, one in found.items()}
+    timed([name for name, ms in speeds.items() if ms <= SLOW_MS], fast)
+    timed([name for name, ms in speeds.items() if SLOW_MS < ms <= ENDLESS_MS], SLOW)
+    return {name: found[name] for name in methods}
+
+
+def time_by_dataset(filled: pd.DataFrame) -> pd.DataFrame:
+    """Return columns `TIMED`, of the first split of each dataset that is there and keeps its models.
+
+    Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_jobs`.
+    """
+    rows = []
+    for dataset, here in filled.groupby("dataset", sort=False):
+        own = here[(here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))]
+        # The first of a method's cells stands for all of its efforts and seeds.
+        first = own.drop_duplicates("method").set_index("method")
+        if len(first):
+            log.info("%s: timing single queries of every method in turns", dataset)
+            files, job = first.run.map(lambda run: run.checkpoints[0]), first.job.iloc[0]
+            found = time_queries(files.to_dict(), job.data, job.split)
+            rows += [{**first.loc[name, TIMED[:2]], "method": name, **one} for name, one in found.items()]
+    return pd.DataFrame(rows, columns=TIMED)
+
+
+def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) -> pd.DataFrame:
+    """Return the frame with the times of single queries, which each run's `render_ms.csv` has from now on.
+
+    A sweep runs jobs at the same time, which disturbs their times; call this after it.
+
+    Args:
+        rows: those of runs without a readable checkpoint keep the times they have.
+        rounds: visits to each.
+        rounds_s: no new round after this [s].
+    """
+    runs, calls, threads = list(own_rows(rows).run), dict[int, Call](), dict[int, int]()
+    for number, run in enumerate(runs):
+        try:
+            opened = open_files(run.checkpoints[:1])
+            # A folder used twice may hold the model of one run beside the summary of the other.
+            if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
+                raise ValueError("its checkpoint is of another run than its summary")
+            tested = rows_to_score(opened.split.folds[0], "test")
+        except (ValueError, IndexError) as error:
+            log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
+            continue
+        calls[number] = opened.predictor.cycle_places(opened.data.moving[tested])
+        threads[number] = int(run.facts.get("machine/threads") or torch.get_num_threads())
+    times = timing.time_interleaved(calls, replace(timing.BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
+    for number, ms in times.items():
+        write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
+    return frame_of_runs(read_run(run.folder) for run in runs)

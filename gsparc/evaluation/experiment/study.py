@@ -14,8 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.experiment.latency import time_queries
-from gsparc.evaluation.experiment.runner import Job
+from gsparc.evaluation.experiment.runner import Job, time_queries
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.ledger import measurements_hash
 from gsparc.evaluation.scores import score_methods
@@ -108,15 +107,13 @@ def plan_rounds(
     return jobs
 
 
-def ask_moved(
-    fits: pd.DataFrame, conditions: Sequence[Condition], data: Measurements, split: Split
-) -> pd.DataFrame:
+def ask_moved(fits: pd.DataFrame, conditions: Sequence[Condition]) -> pd.DataFrame:
     """Return a row per variant, round and condition, of the frame of `run_jobs`.
 
     Under a `query` condition what was learned from undisturbed rows is asked where these are said to be.
     `rows` are what was learned from, mean over folds; `model` is the file of the first fold's.
     """
-    rows = []
+    rows, (data, split) = [], (fits.job.iloc[0].data, fits.job.iloc[0].split)
     for condition, fit in product(conditions, fits.to_dict("records")):
         if (fit["what"], fit["amount"]) != (condition.learned.what, condition.learned.amount):
             continue
@@ -132,15 +129,12 @@ def ask_moved(
     return pd.DataFrame(rows)
 
 
-def average_rounds(
-    fits: pd.DataFrame, conditions: Sequence[Condition], data: Measurements, split: Split,
-    clock: ClockSettings,
-) -> pd.DataFrame:  # fmt: skip
+def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: ClockSettings) -> pd.DataFrame:
     """Put rounds together, and time the models of the last one in turns.
 
     Args:
         fits: the frame of `run_jobs`.
-        conditions, data, split: of the study.
+        conditions: of the study.
         clock: of the queries.
 
     Returns:
@@ -152,7 +146,7 @@ def average_rounds(
         `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms].
         NaN where there is no spread.
     """
-    every = ask_moved(fits, conditions, data, split)
+    every, job = ask_moved(fits, conditions), fits.job.iloc[0]
     every = every.astype(dict.fromkeys(("value", "train_s", "train_cpu_s"), float))
     # The model of the last round is timed: rounds differ in weights, not in size.
     last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
@@ -162,7 +156,7 @@ def average_rounds(
     order = [list(fits.variant.unique()).index(variant) for variant in rows.variant]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     # Conditions that share a training share its model and its time: a file is timed once.
-    times = time_queries({str(file): file for file in rows.model.unique()}, data, split, clock)
+    times = time_queries({str(file): file for file in rows.model.unique()}, job.data, job.split, clock)
     for name in ("query_ms", "query_p95_ms"):
         rows[name] = [times[str(file)][name] for file in rows.model]
     return rows.assign(effects=rows.effects.str.replace("+", ", "))[list(ROW)]

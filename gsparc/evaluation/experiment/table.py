@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.evaluation.baselines import PLAIN
-from gsparc.evaluation.experiment.latency import SPEED, TIMED
+from gsparc.evaluation.experiment.runner import TIMED
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
     GIVEN_HEARD,
@@ -106,7 +106,7 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())
     timed = pd.DataFrame(columns=TIMED) if timed is None else timed
-    rows = rows.merge(timed, "left").astype(dict.fromkeys(SPEED, float))
+    rows = rows.merge(timed, "left").astype(dict.fromkeys(TIMED[3:], float))
     rows["order"] = rows.groupby(PROBLEM, sort=False).ngroup()
     rows = rows.sort_values(["order", "effort", "method"], na_position="first")
     return rows[[*ROW, "results"]].reset_index(drop=True)

@@ -1,4 +1,4 @@
-"""Combinations of knobs scored on the test rows and timed in turns, and their front drawn."""
+"""Combinations of knobs scored on the test rows and timed in turns."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import fit_baseline
-from gsparc.evaluation.drawing import panels, set_latency_axes, style_of
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.scores import rows_to_score, score_methods
@@ -26,7 +23,7 @@ from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import Settings
 from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import COPY, ClockSettings, p50_p95, reference_copy, time_interleaved
+from gsparc.prediction.timing import ClockSettings, time_beside_copy
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +31,8 @@ POINT = (  # columns of the table of points
     Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
     Column("ms p95", ".3g", of="render_ms_p95"),
 )  # fmt: skip
-TIMES = ["render_ms_p50", "render_ms_p95"]
-FIRST = ["label", *TIMES, "ratio_to_copy"]
-LAST = ["closeness_db", "front", "kept_with_model", "threads", "num_gaussians"]
+TIMES = {"render_ms_p50": "query_ms", "render_ms_p95": "query_p95_ms", "ratio_to_copy": "to_copy"}
+MADE = ["settings", "figure", "value", "score"]  # columns that are not in `tradeoff.csv`
 CLOSEST_DB = 100.0  # the precision of float32
 
 
@@ -56,25 +52,28 @@ def measure_points(
 
     Returns:
         A row per candidate and number of threads, the fastest first, and one per other. Columns are the
-        figures, `FIRST` and `LAST` (see `tradeoff.csv`), `settings`, and of the deciding figure its name
-        `figure`, `value` and `score`, larger is better. `front` marks those that no candidate beats,
+        those of `tradeoff.csv`, `settings`, and of the deciding figure its name `figure`, `value` and
+        `score`, larger is better. `front` marks those that no candidate beats,
         `kept_with_model` those by their closeness to the full model, which takes no measurement.
 
     Raises:
         ValueError: these rows do not define the deciding figure.
     """
     ways: list[dict[str, Any]] = []
-    whole = None
+    asked: list[Method] = []
     for number, (settings, method) in enumerate(candidates):
         means: list[Tensor] = []
         own = pool_figures(score_methods([method], data, split, eval_on, means=means), data, split)
         answers = torch.cat(means)
-        whole = answers if whole is None else whole
-        own |= {"closeness_db": closeness_db(answers, whole), "num_gaussians": method.count_components()}
+        if not ways:
+            whole = answers
+        own |= {"closeness_db": closeness_db(answers, whole), "front": 0, "kept_with_model": 0}
         for used in threads:
             label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
-            way = {"label": label, "threads": used, "method": method, "settings": settings}
-            ways.append({**own, **way, **{f"set/{knob}": _cell(value) for knob, value in settings.items()}})
+            sizes = {"threads": used, "num_gaussians": method.count_components(), "settings": settings}
+            knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
+            ways.append({"label": label, **dict.fromkeys(TIMES), **own, **sizes, **knobs})
+            asked.append(method)
         if number % 10 == 9:
             log.info("%d of %d faster variants scored", number + 1, len(candidates))
     figure, count = deciding_figure(ways[0], data.site.scored), len(ways)
@@ -82,22 +81,18 @@ def measure_points(
         fitted = fit_baseline(name, data, split, eval_on)
         own = pool_figures(fitted.scores, data, split)
         if own[figure] is not None:
-            ways.append({**own, "label": name, "threads": 1, "method": fitted.methods[0]})
+            ways.append({**own, "label": name, "threads": 1})
+            asked.append(fitted.methods[0])
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
-    calls = {str(i): Predictor(way["method"], data.site).cycle_places(places) for i, way in enumerate(ways)}
-    # A copy of memory, the unit of the others' times, is made by one thread.
-    using = {COPY: 1} | {name: way["threads"] for name, way in zip(calls, ways, strict=True)}
-    times = time_interleaved({COPY: reference_copy(), **calls}, clock, using)
-    rows = pd.DataFrame(ways, dtype=object).assign(figure=figure)
-    rows[TIMES] = [p50_p95(times[name]) for name in calls]
-    rows["ratio_to_copy"] = rows.render_ms_p50 / np.median(times[COPY])
-    rows["value"] = [defined_figure(way, figure) for way in ways]
+    calls = {i: Predictor(method, data.site).cycle_places(places) for i, method in enumerate(asked)}
+    times = pd.DataFrame(time_beside_copy(calls, clock, {i: way["threads"] for i, way in enumerate(ways)})).T
+    rows = pd.DataFrame(ways, dtype=object).assign(**{name: times[of] for name, of in TIMES.items()})
+    rows = rows.assign(figure=figure, value=[defined_figure(way, figure) for way in ways])
     rows["score"] = [score_of(figure, value) for value in rows.value]
     points, beside = rows[:count].copy(), rows[count:]
     for column, by in (("front", points.score), ("kept_with_model", points.closeness_db)):
-        best = pareto_front(points.render_ms_p50.to_list(), by.to_list())
-        points[column] = points.index.isin(best).astype(int)
+        points.loc[pareto_front(points.render_ms_p50.to_list(), by.to_list()), column] = 1
     return points.sort_values("render_ms_p50", kind="stable"), beside
 
 
@@ -112,29 +107,6 @@ def find_better(point: Row, others: pd.DataFrame) -> str | None:
     """Return the most accurate other that is neither slower nor worse than a point; None without one."""
     better = others[(others.render_ms_p50 <= point["render_ms_p50"]) & (others.score >= point["score"])]
     return None if better.empty else str(better.label[better.score.astype(float).idxmax()])
-
-
-def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: str) -> Figure:
-    """Draw the points of a method beside others, see `measure_points`."""
-    best, beaten = points[points.front == 1], points[points.front == 0]
-    figure, ((axes,),) = panels(7.5, 4.2)
-    axes.scatter(beaten.render_ms_p50, beaten.value, s=9, c="0.75", label="beaten")
-    reach = [np.zeros(len(best)), best.render_ms_p95 - best.render_ms_p50]
-    how: dict[str, Any] = {"fmt": "o-", "color": style_of(method).colour, "capsize": 2, "lw": 1, "ms": 4}
-    axes.errorbar(best.render_ms_p50, best.value, xerr=reach, label="not beaten", **how)
-    beside = zip(others.label, others.render_ms_p50, others.value, strict=True)
-    set_latency_axes(axes, best.figure.iloc[0], best.value, beside)
-    axes.legend(loc="lower right", fontsize=8)
-    axes.set_title(title, fontsize=10)
-    return figure
-
-
-def columns_of_csv(points: pd.DataFrame) -> dict[str, list[Any]]:
-    """Return the columns of `tradeoff.csv`: what it is and its times, figures, and what makes it."""
-    own = ["method", "settings", "figure", "value", "score"]
-    knobs = [name for name in points if name.startswith("set/")]
-    figures = [name for name in points if name not in {*FIRST, *LAST, *own, *knobs}]
-    return points[[*FIRST, *figures, *LAST, *knobs]].to_dict("list")
 
 
 def _cell(value: Any) -> Any:
@@ -152,7 +124,7 @@ def facts_of(points: pd.DataFrame, others: pd.DataFrame) -> dict[str, Any]:
         "tradeoff/figure": figure,
         "tradeoff/front_beaten_by_others": sum(find_better(row, others) is not None for row in best),
         "time/copy_ms": full["render_ms_p50"] / full["ratio_to_copy"],
-        **{f"time/{name}": full[name] for name in TIMES},
+        **{f"time/{name}": full[name] for name in ("render_ms_p50", "render_ms_p95")},
         f"test/{figure}": full["value"],
     }
     for other in others.itertuples():

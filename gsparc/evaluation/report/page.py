@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,10 +16,10 @@ from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gsparc.evaluation import summary
+from gsparc.evaluation import plots, summary
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
-from gsparc.evaluation.report import plots, tables
+from gsparc.evaluation.report import tables
 from gsparc.evaluation.results import STUDY, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
 
@@ -36,6 +35,7 @@ class Section:
 
     Attributes:
         title: dataset and split.
+        rows: their frame, settings in short.
         remarks: what a reader must know first.
         tables: in reading order.
         figures: plots.
@@ -43,6 +43,7 @@ class Section:
     """
 
     title: str
+    rows: pd.DataFrame
     remarks: list[str]
     tables: list[Table]
     figures: list[Figure]
@@ -66,7 +67,7 @@ def make_sections(
     """
     sections = []
     for (dataset, split), group in rows.groupby(STUDY, sort=False, dropna=False):
-        study = short_settings(group)
+        title, study = f"{dataset}, split {split}", short_settings(group)
         own = own_rows(study)
         firsts = own.drop_duplicates("setting")
         # With one run a setting, spreads over seeds would be empty brackets.
@@ -82,7 +83,7 @@ def make_sections(
         ]
         shown = [table for table in (kind(study) for kind in kinds) if table.rows]
         figures = [plots.draw_pareto(study, swept), plots.draw_distributions(study, of_sample)]
-        sections.append(Section(f"{dataset}, split {split}", warnings(study), shown, figures, pictures))
+        sections.append(Section(title, study, warnings(study), shown, figures, pictures))
     return sections
 
 
@@ -127,13 +128,10 @@ def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
 def write_report(
     folder: Path, title: str, rows: pd.DataFrame, fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
     figures: Sequence[str] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`.
-
-    Returns where the program comes from, see `provenance`.
-    """
-    sections, origin, count = make_sections(rows, fronts), summary.provenance(), len(own_rows(rows))
-    note = f"{count} run{'s' * (count > 1)}; made by {summary.program_version(origin)}"
+) -> list[Section]:  # fmt: skip
+    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`."""
+    sections, count = make_sections(rows, fronts), len(own_rows(rows))
+    note = f"{count} run{'s' * (count > 1)}; made by {summary.program_version(summary.provenance())}"
     (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:
@@ -147,7 +145,7 @@ def write_report(
             name = f"{_slug(study.title)}-{_slug(str(figure.get_label()))}.png"
             save(figure, folder / name, also=figures)
     (folder / "report.md").write_text("\n".join(parts), encoding="utf-8")
-    return origin
+    return sections
 
 
 def _slug(text: str) -> str:

@@ -6,8 +6,9 @@ import logging
 import sys
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import pandas as pd
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
@@ -15,13 +16,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from gsparc.data.errors import list_first
-from gsparc.evaluation import summary
+from gsparc.evaluation import plots, summary
 from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.evaluation.experiment.options import REDRAW
+from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.ledger import FAILURE
-
-if TYPE_CHECKING:
-    import pandas as pd
+from gsparc.evaluation.report.page import write_report
+from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
+from gsparc.evaluation.results import frame, own_rows
 
 log = logging.getLogger(__name__)
 
@@ -75,30 +77,23 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
     and its table.
     """
-    from gsparc.evaluation.experiment.latency import time_again
-    from gsparc.evaluation.report import plots  # here: every training imports this module, pandas is slow
-    from gsparc.evaluation.report.page import write_report
-    from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
-    from gsparc.evaluation.results import STUDY, frame, own_rows, short_settings
-
     rows = frame(folder)
     if settings.retime:
         rows = time_again(rows, rounds=settings.rounds, rounds_s=settings.rounds_s)
-    origin = write_report(folder, title, rows)
-    for number, (study, together) in enumerate(rows.groupby(STUDY, sort=False, dropna=False)):
-        group = short_settings(together)
-        own = own_rows(group)
+    for number, section in enumerate(write_report(folder, title, rows)):
+        group, own = section.rows, own_rows(section.rows)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
-        plots.draw_sweep(group, f"{title}: {', split '.join(map(str, study))}", folder / f"{stem}.png")
+        plots.draw_sweep(group, f"{title}: {section.title}", folder / f"{stem}.png")
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
         seeds = {run.config.get("split.seed") for run in own.run}
-        if study[1] == "random" and len(seeds) > 1 == own.draw.nunique():
+        if own.split.iloc[0] == "random" and len(seeds) > 1 == own.draw.nunique():
             log.warning("split.seed moves validation rows alone: %s", REDRAW)
         for same in equal_settings(own):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
-    summary.write_summary(folder / "summary.json", {"sweep/runs": len(own_rows(rows)), **origin})
+    facts = {"sweep/runs": len(own_rows(rows)), **summary.provenance()}
+    summary.write_summary(folder / "summary.json", facts)
     console.print(f"written to {folder}", highlight=False)
 
 

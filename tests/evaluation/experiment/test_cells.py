@@ -6,8 +6,7 @@ import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
 
-from gsparc.evaluation.experiment.cells import Contender, plan_cells
-from gsparc.evaluation.experiment.problem import SplitChoice, read_entries
+from gsparc.evaluation.experiment.cells import Contender, SplitChoice, plan_cells, read_entries
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),

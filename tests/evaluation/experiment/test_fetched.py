@@ -9,7 +9,7 @@ from hydra.core.global_hydra import GlobalHydra
 from releases import real
 
 from gsparc.commands.shared.settings import to_dict
-from gsparc.evaluation.experiment.problem import load_every_problem
+from gsparc.evaluation.experiment.cells import load_every_problem
 
 ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
 

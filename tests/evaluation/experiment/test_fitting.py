@@ -6,10 +6,8 @@ import json
 import pytest
 from hydra import initialize_config_module
 
-from gsparc.evaluation.experiment.cells import Cell, Contender, job_of_cell
-from gsparc.evaluation.experiment.latency import time_by_dataset
-from gsparc.evaluation.experiment.problem import Problem, _may_match
-from gsparc.evaluation.experiment.runner import run_jobs
+from gsparc.evaluation.experiment.cells import Cell, Contender, Problem, _may_match, job_of_cell
+from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
 from gsparc.evaluation.ledger import run_once
 from gsparc.evaluation.results import Run, as_frame
 from gsparc.evaluation.summary import write_summary
@@ -24,7 +22,7 @@ def problem(campaign, folds):
 def test_a_cell_whose_model_is_gone_is_not_timed(tmp_path):
     """Times that a comparison had kept stood in tables of other programs' models."""
     gone = Run(tmp_path / "gp", {}).rows()[0] | {"dataset": "toy", "split": "random"}
-    assert time_by_dataset(as_frame([gone]), {}).empty
+    assert time_by_dataset(as_frame([gone])).empty
 
 
 def prepared(problem, folder, model="gsparc", effort=0.5, seed=0, settings=None, choose=()):

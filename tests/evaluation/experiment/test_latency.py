@@ -6,7 +6,7 @@ import pytest
 import torch
 from clocks import WoundClock
 
-from gsparc.evaluation.experiment import latency
+from gsparc.evaluation.experiment import runner
 from gsparc.models.method import Prediction
 from gsparc.prediction import timing
 
@@ -32,15 +32,15 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     watch = WoundClock()
     monkeypatch.setattr(timing.time, "perf_counter", watch)
     monkeypatch.setattr(
-        latency.loading,
+        runner.loading,
         "load",
         lambda path: (made.setdefault(path.parent.name, Waiting(path.parent.name, watch)), None),
     )
-    monkeypatch.setattr(latency, "SLOW_MS", 150.0)
-    monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)
+    monkeypatch.setattr(runner, "SLOW_MS", 150.0)
+    monkeypatch.setattr(runner, "ENDLESS_MS", 600.0)
     files = {name: tmp_path / name / "model.ckpt" for name in WAITS}
-    fast = replace(latency.FAST, rounds=12)
-    found = latency.time_queries(files, campaign("spectrum", 20), folds(20), fast)
+    fast = replace(runner.FAST, rounds=12)
+    found = runner.time_queries(files, campaign("spectrum", 20), folds(20), fast)
     assert list(found) == list(WAITS)
     assert {name: one["rounds"] for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}
     assert found["slow"]["query_ms"] == pytest.approx(200, abs=1) and found["quick"]["query_ms"] < 1

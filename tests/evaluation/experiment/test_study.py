@@ -46,7 +46,7 @@ def run(folder, names, conditions=AS_IT_IS, rounds=1, data=None, split=None):
     data, split = data or invent(), split or divide(48)
     configs = {name: OmegaConf.create({"model": name, "seed": 3}) for name in names}
     fits = run_jobs(plan_rounds(configs, conditions, rounds, data, split, folder), fit)
-    return average_rounds(fits, conditions, data, split, CLOCK), fits
+    return average_rounds(fits, conditions, CLOCK), fits
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gsparc.evaluation.experiment import latency, pictures
-from gsparc.evaluation.experiment.pictures import draw_efforts
+from gsparc.evaluation import plots
+from gsparc.evaluation.experiment import runner
 from gsparc.evaluation.experiment.table import (
     average_cells,
     columns_of_csv,
@@ -17,6 +17,7 @@ from gsparc.evaluation.experiment.table import (
     title_of,
 )
 from gsparc.evaluation.paired import lead_over_rows
+from gsparc.evaluation.plots import draw_efforts
 from gsparc.evaluation.results import Run, as_frame
 
 
@@ -54,7 +55,7 @@ FOUND = [
 ]  # fmt: skip
 TIMED = pd.DataFrame(
     [["rfid", "random", "gp", 2.0, 3.0, 1.5], ["rfid", "random", "gsparc", 0.5, 0.6, 0.4]],
-    columns=latency.TIMED,
+    columns=runner.TIMED,
 )
 
 
@@ -93,8 +94,8 @@ def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, mon
     drawn = {"kind": "rssi", "drawn": True}
     found = averages([filled(method, 5.0, 0, split=split, **drawn) for split, method in there])
     figures = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
-    pictures.draw_splits(found, tmp_path / "city.png")
+    monkeypatch.setattr(plots, "save", lambda figure, path, also: figures.append(figure))
+    plots.draw_splits(found, tmp_path / "city.png")
     texts = [[text.get_text() for text in axis.texts] for axis in figures[0].axes]
     assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
 
@@ -102,14 +103,14 @@ def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, mon
 def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monkeypatch):
     """The legend drew every mark with an error bar, also of points without one."""
     figures = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
+    monkeypatch.setattr(plots, "save", lambda figure, path, also: figures.append(figure))
     draw_efforts(averages(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
     (legend,) = figures[0].legends
     marks = {
         text.get_text(): line.get_marker()
         for text, line in zip(legend.texts, legend.get_lines(), strict=True)
     }
-    assert marks == {name: pictures.style_of(name).mark for name in ("gp", "gsparc", "gsrf")}
+    assert marks == {name: plots.style_of(name).mark for name in ("gp", "gsparc", "gsrf")}
 
 
 def test_losers_are_not_hidden():
@@ -185,7 +186,7 @@ def test_gains_of_rows_have_the_difference_of_scores_as_their_mean(figure, colum
 
 def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, monkeypatch):
     figures = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path, also: figures.append(figure))
+    monkeypatch.setattr(plots, "save", lambda figure, path, also: figures.append(figure))
     near = [filled("gp", 30.0), filled("gsparc", 29.0, **{"time/train_cpu_s": 4.0})]
     draw_efforts(averages(near, TIMED), tmp_path / "compare.png", "gsparc")
     figures[0].canvas.draw()

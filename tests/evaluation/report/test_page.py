@@ -8,8 +8,8 @@ from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
+from gsparc.evaluation import plots
 from gsparc.evaluation.drawing import style_of
-from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import make_sections, render_html, warnings
 from gsparc.evaluation.results import Run, frame, frame_of_runs
 

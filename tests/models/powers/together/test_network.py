@@ -16,7 +16,7 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.data.units import power_in_decibels
-from gsparc.evaluation.sector_levels import draw_sector_levels
+from gsparc.evaluation.pictures import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, wrap_per_station
@@ -162,7 +162,7 @@ def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
     method, report = fitted(one, 6, tmp_path)
     named = contradicted(report.notes)
     figures = []
-    monkeypatch.setattr("gsparc.evaluation.sector_levels.save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr("gsparc.evaluation.pictures.save", lambda figure, path: figures.append(figure))
     draw_sector_levels(method, one.data(6), Fold(np.arange(3960), NONE, NONE), tmp_path / "sectors.png")
     titles = [axis.get_title() for axis in figures[0].axes]
     assert figures[0].get_suptitle() == "12 of 30 sectors, contradicted azimuths first"
