@@ -6,9 +6,8 @@ import logging
 import sys
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
@@ -16,14 +15,13 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from gsparc.data.errors import list_first
-from gsparc.evaluation import plots, summary
+from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.evaluation.experiment.options import REDRAW
-from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.ledger import FAILURE
-from gsparc.evaluation.report.page import write_report
-from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
-from gsparc.evaluation.results import frame, own_rows
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +75,13 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """Write `sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory,
     and its table.
     """
+    # Here, as they take half a second, and a mistyped option is to be named at once.
+    from gsparc.evaluation import plots
+    from gsparc.evaluation.experiment.runner import time_again
+    from gsparc.evaluation.report.page import write_report
+    from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
+    from gsparc.evaluation.results import frame, own_rows
+
     rows = frame(folder)
     if settings.retime:
         rows = time_again(rows, rounds=settings.rounds, rounds_s=settings.rounds_s)
