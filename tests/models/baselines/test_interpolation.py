@@ -24,23 +24,6 @@ def fitted(name, data, fold, tmp_path):
     return method
 
 
-@pytest.mark.parametrize("static_end", ["rx", "tx"])
-@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
-@pytest.mark.parametrize("name", [*NAMES, "kriging"])
-def test_every_baseline_serves_every_kind(campaign, folds, tmp_path, name, kind, static_end):
-    data, fold = campaign(kind, 30, static_end), folds(30).folds[0]
-    method = fitted(name, data, fold, tmp_path)
-    batch = data.batch(fold.test)
-    found = method.predict(batch)
-    assert found.mean.shape == batch.target.shape and found.mean.dtype == batch.target.dtype
-    again = method_class(name)()
-    again.restore(data.site, method.state())
-    assert torch.equal(again.predict(batch).mean, found.mean)
-    assert again.count_components() == len(fold.train) + len(fold.val)
-    for value in (found.confidence, found.variance):
-        assert value is None or (value.shape == (len(batch),) and (value >= 0).all())
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_no_test_row_is_looked_at_and_validation_rows_are_learned_from(campaign, folds, tmp_path, name):
     data, fold = campaign("csi", 30), folds(30).folds[0]

@@ -8,7 +8,6 @@ import lightning.pytorch as L
 import numpy as np
 import pytest
 import torch
-import yaml
 from campaigns import compose
 from lightning.pytorch.loggers import CSVLogger
 from scenes import lobes, room
@@ -18,49 +17,19 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.experiment.folds import build_callbacks
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
-from gsparc.models import checkpoint, loading
+from gsparc.models import checkpoint
 from gsparc.models.method import HasGaussians
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext
 from gsparc.training.effort import Effort
 
-SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
-CHANNELS = ("gsrf", "ngrf", "newrf")
 SMALL = {"gsrf": {"count": 40}, "wrfgs": {"count": 40}, "swiftwrf": {"count": 40}, "ngrf": {"count": 20},
          "newrf": {"width": 16, "samples": 8}, "nerf2": {"width": 16, "samples": 8, "rays": 64}}  # fmt: skip
 
 
 def brief(name: str, **more):
     return method_class(name)(**{**SMALL[name], "max_steps": 3, **more})
-
-
-def scene(kind: str, tmp_path, moving: str = "tx"):
-    return lobes(tmp_path, moving) if kind == "spectrum" else room(40, directions=True)[:2]
-
-
-@pytest.mark.parametrize(
-    ("kind", "name", "moving"),
-    [("spectrum", n, end) for n in SPECTRA for end in ("tx", "rx")] + [("csi", n, "rx") for n in CHANNELS],
-)
-def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
-    torch.set_num_threads(1)
-    data, fold = scene(kind, tmp_path, moving)
-    method = brief(name)
-    assert method.fit(data, fold, FitContext(tmp_path)).seconds > 0
-    batch = data.batch(fold.test)
-    said = method.predict(batch).mean
-    assert said.shape == batch.target.shape and said.dtype == batch.target.dtype
-    assert torch.isfinite(said).all()
-    cls = method_class(name)
-    config = {"model": {"_target_": f"{cls.__module__}.{cls.__name__}", **SMALL[name], "budget_s": 60.0}}
-    checkpoint.save(tmp_path / "model.ckpt", method, yaml.safe_dump(config))
-    again = loading.load(tmp_path / "model.ckpt")[0]  # a file of when seconds ended fits
-    # Another object may choose another of the equally good summation orders.
-    torch.testing.assert_close(again.predict(batch).mean, said, rtol=1e-5, atol=1e-6)
-    twin = brief(name)
-    twin.fit(data, fold, FitContext(tmp_path))
-    assert torch.equal(twin.predict(batch).mean, said), "the same steps give the same model"
 
 
 def test_a_peer_takes_counted_steps_times_the_effort(tmp_path, monkeypatch):

@@ -10,10 +10,8 @@ from cities import city, deaf, fold, folder
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import baselines_for
-from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
@@ -114,27 +112,6 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
         assert ((found.confidence > 0) & (found.confidence < 1)).all()
         error, sure = _relative(found.mean, true), found.confidence > found.confidence.median()
         assert error[sure].median() < factor * error[~sure].median()
-
-
-SEARCH = SearchSettings(rounds=2, picks=4, final=2)
-MAKES = {
-    "ridge": Ridge, "of all antennas": lambda: Ridge("all"), "fire": lambda: Fire(max_steps=5),
-    "uplink": lambda: UplinkField(SEARCH, teachers=60),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", MAKES)
-def test_methods_answer_and_keep(name, tmp_path) -> None:
-    make, data = MAKES[name], city("all" if name == "uplink" else 0)
-    method = make()
-    method.fit(data, fold(), FitContext(tmp_path))
-    batch = data.batch(fold().test)
-    before = method.predict(batch).mean
-    assert before.shape == batch.target.shape
-    checkpoint.save(tmp_path / "m.ckpt", method)
-    again, _ = loading.load(tmp_path / "m.ckpt")
-    assert torch.allclose(again.predict(batch).mean, before)
 
 
 @pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
