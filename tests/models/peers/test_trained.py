@@ -10,6 +10,7 @@ import pytest
 import torch
 from campaigns import compose
 from lightning.pytorch.loggers import CSVLogger
+from refusals import refused
 from scenes import lobes, room
 
 from gsparc.data.query import Query
@@ -91,8 +92,7 @@ def test_peers_had_loops_of_their_own(tmp_path):
     for name, value in whole.fitted().state_dict().items():
         assert torch.equal(value, goes_on.fitted().state_dict()[name]), name
     other = Fold(fold.train[1:], fold.val, fold.test)
-    with pytest.raises(ValueError, match="was trained with other rows"):
-        brief("nerf2").fit(data, other, FitContext(tmp_path, resume=last))
+    refused("was trained with other rows", brief("nerf2").fit, data, other, FitContext(tmp_path, resume=last))
 
 
 def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory(tmp_path, monkeypatch):
@@ -121,8 +121,7 @@ def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds)
         brief("newrf").fit(campaign("csi", 30, "tx"), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
         brief("ngrf").fit(campaign("spectrum", 30), fold, FitContext(tmp_path))
-    with pytest.raises(ValueError, match="gsrf: batch_size >= 1 is needed, got 0"):
-        brief("gsrf", batch_size=0)
+    refused("gsrf: batch_size >= 1 is needed, got 0", brief, "gsrf", batch_size=0)
 
 
 def test_a_loss_that_is_not_finite_stops_training(tmp_path):
@@ -137,8 +136,7 @@ def test_a_peer_shows_its_gaussians_and_what_they_emit(tmp_path, name, kind):
     data, fold = lobes(tmp_path) if kind == "spectrum" else room(40, directions=True)[:2]
     method = brief(name)
     assert isinstance(method, HasGaussians)
-    with pytest.raises(ValueError, match="not fitted"):
-        method.gaussians(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
+    refused("not fitted", method.gaussians, Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
     method.fit(data, fold, FitContext(tmp_path))
     one, other = (data.batch(fold.test[i : i + 1]) for i in (0, 1))
     cloud, elsewhere = (method.gaussians(batch) for batch in (one, other))
@@ -173,5 +171,4 @@ def test_planar_gaussians_are_shown_in_the_directions_that_they_brighten(tmp_pat
     assert turn @ towards @ (cloud.means[7] - receiver) > 0.95
     moving, fold = lobes(tmp_path, "rx")
     method.fit(moving, fold, FitContext(tmp_path))
-    with pytest.raises(ValueError, match="a receiver that moves"):
-        method.gaussians(batch)
+    refused("a receiver that moves", method.gaussians, batch)
