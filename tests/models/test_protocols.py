@@ -15,9 +15,10 @@ import pytest
 import torch
 import yaml
 from campaigns import RENDERED, channels, compose, spectra
-from cities import city
+from cities import city, deaf
 from contexts import short
 from invented import invent
+from refusals import refused
 from rooms import directed, shoebox
 from scenes import fold_of, lobes, room
 from worlds import World, arrays
@@ -134,6 +135,8 @@ LAYOUTS = {
     "SK, tx moves": lambda folder: own(channels(folder / "own.npz", moving="tx", shape="SK")),
     "SAK": lambda folder: own(channels(folder / "own.npz")),
     "powers": kinds.received,
+    "deaf": lambda _: deaf(city("all")),
+    "bands": kinds.bands,
     "runs": lambda _: from_arrays(arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0)),
 }
 FITTED = [name for name in built_in_methods() if name != "calibrated_raytracer"]
@@ -141,7 +144,7 @@ CASES = [
     *((name, "") for name in (*FITTED, "ridge, all antennas")),
     *((name, f"{kind}, {end} stands") for name in (*PLAIN, "zero") for kind, end in INVENTED),
     *((name, "lobes, rx moves") for name in ("gsrf", "wrfgs", "swiftwrf", "nerf2")),
-    ("gsrf", "room"), ("complex_gp", "runs"),
+    ("gsrf", "room"), ("complex_gp", "runs"), ("image_source_gp", "bands"),
     *(("splat", layout) for layout in ("spectra, rx moves", "S", "SK, tx moves", "SAK", "powers")),
 ]  # fmt: skip
 
@@ -173,21 +176,40 @@ def test_answers_are_as_targets_in_any_order_and_those_of_the_stored(name, layou
     assert name in UPLINK or again.count_components() == method.count_components()
     orders = fold.test, fold.test[::-1], fold.test[:1]
     whole, turned, one = (again.predict(data.batch(rows)) for rows in orders)
-    for part in ("mean", "confidence", "variance"):
-        values, stored = getattr(found, part), getattr(whole, part)
+    for part in ("mean", "confidence", "variance", "unknown", "explained"):
+        values, stored = (getattr(said, part, None) for said in (found, whole))
         assert (values is None) == (stored is None), part
         if values is None:
             continue
-        assert torch.isfinite(values).all() and (part == "mean" or values.shape == (len(batch),))
-        assert part == "mean" or ((values >= 0).all() and (part == "variance" or (values <= 1).all()))
+        assert torch.isfinite(values).all()
+        if part not in ("mean", "explained"):
+            assert values.shape == (len(batch),) and (values >= 0).all()
+            assert part == "variance" or (values <= 1).all()
         near = {"rtol": 1e-3, "atol": 1e-5 * float(values.abs().max())}
         torch.testing.assert_close(stored, values, **{**near, "rtol": 1e-5})
         torch.testing.assert_close(getattr(turned, part).flip(0), values, **near)
         torch.testing.assert_close(getattr(one, part), values[:1], **near)
 
 
+REFUSED = [
+    ("distance_law", "csi, rx stands", "distance_law: needs received powers"), ("ridge", "deaf", "has none"),
+    ("array", "spectrum, rx stands", "no antenna array"),
+    ("swiftwrf", "csi, rx stands", "swiftwrf: predicts .*holds csi"),
+    ("gsrf", "powers", "gsrf: predicts .*holds rssi"),
+    ("newrf", "csi, tx stands", "newrf: needs directions of arrival"),
+    ("ngrf", "spectrum, rx stands", "ngrf: spectra need .* array"),
+    *((name, "powers", f"{name}: the target is rssi") for name in NAMED[:1] + NAMED[2:4] + NAMED[5:]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "layout", "says"), REFUSED)
+def test_what_a_method_cannot_serve_is_refused_in_one_line(name, layout, says, tmp_path):
+    data = LAYOUTS[layout](tmp_path)
+    refused(says, lambda: unfitted(name).create_for(data).fit(data, fold_of(data), FitContext(tmp_path)))
+
+
 UNFITTED = (*VARIANCE, "nearest", "splat", "gsrf", "uplink", "ridge")
-POISONED = (*SMALL, "mean", "complex_gp", "splat", "array", "directional_gp", "uplink")
+POISONED = (*SMALL, *PLAIN, "complex_gp", "splat", "array", "directional_gp", "uplink")
 
 
 @pytest.mark.parametrize("name", UNFITTED)

@@ -111,16 +111,7 @@ def test_a_peer_trains_on_the_cpu_whatever_the_trainer_says(tmp_path, caplog):
     assert "in one process on the CPU" in caplog.text
 
 
-def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):
-    fold = folds(30).folds[0]
-    for name, kind in (("swiftwrf", "csi"), ("gsrf", "rssi")):
-        method = brief(name)
-        with pytest.raises(ValueError, match=f"{name}: predicts .*holds {kind}"):
-            method.fit(campaign(kind, 30), fold, FitContext(tmp_path))
-    with pytest.raises(ValueError, match="newrf: needs directions of arrival"):
-        brief("newrf").fit(campaign("csi", 30, "tx"), fold, FitContext(tmp_path))
-    with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
-        brief("ngrf").fit(campaign("spectrum", 30), fold, FitContext(tmp_path))
+def test_no_batch_is_refused():
     refused("gsrf: batch_size >= 1 is needed, got 0", brief, "gsrf", batch_size=0)
 
 

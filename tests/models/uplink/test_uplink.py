@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from cities import city, deaf, fold, folder
-from refusals import refused
 
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.splits import Split
@@ -127,13 +126,6 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     predicted = method.predict(replace(data.batch(fold().test), uplink=heard)).mean
     assert torch.isfinite(predicted).all() and predicted[:, 1:].abs().min() > 0
     assert inputs == "all" or (predicted[:, 0] == 0).all()
-
-
-def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
-    method, data = fitted
-    refused("has none", Ridge().fit, deaf(data), fold(), FitContext())
-    batch = data.batch(fold().test[:2])
-    refused("uplink= is needed", method.predict, replace(batch, uplink=None))
 
 
 def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:
