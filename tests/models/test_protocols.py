@@ -166,8 +166,6 @@ def test_answers_are_as_targets_in_any_order_and_those_of_the_stored(name, layou
     batch, config = data.batch(fold.test), {}
     found = method.predict(batch)
     assert found.mean.shape == batch.target.shape and found.mean.dtype == batch.target.dtype
-    if name in VARIANCE and not layout:
-        assert found.variance.dtype == torch.float32 and (found.variance > 0).all()
     assert name not in PLAIN or method.count_components() == len(fold.train) + len(fold.val)
     if name in SMALL:  # a file of when seconds ended fits is read too
         config = {"model": {"_target_": import_path(type(method)), **SMALL[name], "budget_s": 60.0}}
@@ -176,6 +174,12 @@ def test_answers_are_as_targets_in_any_order_and_those_of_the_stored(name, layou
     assert name in UPLINK or again.count_components() == method.count_components()
     orders = fold.test, fold.test[::-1], fold.test[:1]
     whole, turned, one = (again.predict(data.batch(rows)) for rows in orders)
+    if name in VARIANCE and not layout:
+        assert found.variance.dtype == torch.float32 and (found.variance > 0).all()
+        away = ends(method, places(method).float() + torch.tensor([1.0, 3, 30, 300, 3000])[:, None])
+        torch.testing.assert_close(
+            *(one.predict(away).variance for one in (method, again)), rtol=1e-5, atol=0
+        )
     for part in ("mean", "confidence", "variance", "unknown", "explained"):
         values, stored = (getattr(said, part, None) for said in (found, whole))
         assert (values is None) == (stored is None), part
