@@ -86,6 +86,16 @@ def test_a_carrier_that_was_never_measured_is_predicted(room):
     assert error(method, room, test) < 0.6 * error(fit(DirectBeam(), room, test), room, test)
 
 
+def test_a_stored_method_answers_the_same(room, fitted, tmp_path):
+    torch.save(fitted.state(), tmp_path / "state.pt")
+    again = CarrierField()
+    again.restore(room.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    batch = room.batch(LAST)
+    for part in ("mean", "variance", "unknown"):
+        torch.testing.assert_close(getattr(again.predict(batch), part), getattr(fitted.predict(batch), part))
+    assert again.count_components() == fitted.count_components()
+
+
 def test_a_query_without_a_carrier_is_asked_for_one(fitted):
     with pytest.raises(ValueError, match=r"which carrier\? say station=, one of rx at 1000 MHz"):
         fitted.predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
