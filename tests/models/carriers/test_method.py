@@ -73,12 +73,14 @@ def test_new_places_are_told_by_paths_not_by_averages(room, fitted):
     assert said.unknown.shape == (len(LAST),) and (said.unknown > 0.1).all()
 
 
+@pytest.mark.slow
 def test_what_some_carriers_said_of_a_place_tells_the_others(room, fitted):
     rest = LAST[room.station[LAST] >= 3]
     half = fit(CarrierField(), room, rest)
     assert error(half, room, rest) < error(fitted, room, rest)
 
 
+@pytest.mark.slow
 def test_a_carrier_that_was_never_measured_is_predicted(room):
     test = np.flatnonzero(room.station == 2)
     method = fit(wrap_per_station(Gsparc(), room), room, test)

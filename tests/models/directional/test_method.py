@@ -142,7 +142,7 @@ def test_paths_sum_to_the_prediction(pillar):
     torch.testing.assert_close(gain.sum(-1), want.mean[:, :, 0], atol=1e-6, rtol=1e-4)
 
 
-@pytest.mark.parametrize("degrees", [0.2, 1.0, 3.0])
+@pytest.mark.parametrize("degrees", [1.0, *(pytest.param(d, marks=pytest.mark.slow) for d in (0.2, 3.0))])
 def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
     """Directions taken as exact left NMSE 0.08, 0.45 and 0.70."""
     data, fold, sources = directed(60, pillar=True)

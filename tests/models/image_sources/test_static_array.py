@@ -78,6 +78,7 @@ def test_four_antennas_at_a_hundred_places(four):
     assert np.linalg.norm(np.array(true)[:, None] - found, axis=-1).min(1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_paths_of_each_antenna_sum_to_the_prediction(four):
     method, data, fold = four
     batch = data.batch(fold.test[:5])
