@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from campaigns import brief, compose, plain, spectra
+from refusals import refused
 
 from gsparc.commands.calibrate import calibration_tables
 from gsparc.commands.evaluate import evaluate_files
@@ -85,8 +86,7 @@ def test_too_few_to_test_promise_nothing() -> None:
     good, promise = np.zeros(15, bool), Guarantee(alpha=0.1, delta=0.1)
     found = choose_threshold(score, good, threshold_levels(score, good, promise, 15), promise)
     assert found.accepted == 0  # 0.9^15 = 0.2 > delta
-    with pytest.raises(ValueError, match="above 0 and below 1"):
-        Guarantee(alpha=1.5)
+    refused("above 0 and below 1", Guarantee, alpha=1.5)
 
 
 def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
@@ -211,8 +211,7 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     assert len(split_choose_calibrate_test(two, "random", rng)[2]) == 16
     with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
         split_choose_calibrate_test(two, "spatial", rng)
-    with pytest.raises(ValueError, match="2 positions cannot be parted"):
-        split_choose_calibrate_test(_evidence(2), "random", rng)
+    refused("2 positions cannot be parted", split_choose_calibrate_test, _evidence(2), "random", rng)
 
 
 def test_positions_on_a_plumb_line_have_patches() -> None:

@@ -1,6 +1,7 @@
 """The configuration: every choice composes and builds; sweeps have directories of their own."""
 
 import re
+from dataclasses import is_dataclass
 from inspect import signature
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import main
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.models.method import MethodFactory
-from gsparc.models.registry import build, built_in_methods
+from gsparc.models.registry import build, built_in_methods, method_class
 
 CONF = Path(gsparc.conf.__path__[0])
 GROUPS = ("dataset", "split", "trainer", "callbacks", "logger")  # of train.yaml
@@ -38,22 +39,27 @@ def composed(monkeypatch, *overrides: str, command: str = "train"):
     return config
 
 
-def assert_builds(config) -> None:
-    assert isinstance(build(config.model), MethodFactory)
+def assert_builds(config) -> MethodFactory:
+    method = build(config.model)
+    assert isinstance(method, MethodFactory)
     for node in (config.callbacks or {}).values():
         instantiate(node)
     instantiate(config.trainer, accelerator="cpu", devices=1)  # there may be no other here
+    return method
 
 
 @pytest.mark.parametrize("row", range(max(map(len, CHOICES))))
 def test_every_choice_composes_and_builds(row, monkeypatch):
-    """One of each group at once; models without a name: `Interpolation key 'model.name' not found`."""
+    """One of each group at once; a model has the settings of its class, which `baselines=[NAME]` trains."""
     chosen = [choices[row] for choices in CHOICES if row < len(choices)]
     own = [] if any(one.startswith("dataset=") for one in chosen) else OWN
     config = composed(monkeypatch, *chosen, *own, *(word for one in chosen for word in NEEDED.get(one, ())))
-    assert_builds(config)
+    method, name = assert_builds(config), CHOICES[-1][row][6:]
+    for key, value in vars(method_class(name)()).items():
+        if isinstance(value, (int, float, str, tuple)) or is_dataclass(value):
+            assert getattr(method, key) == value, key
     if own:  # microseconds: no two share one
-        assert re.fullmatch(rf"outputs/own/{chosen[-1][6:]}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
+        assert re.fullmatch(rf"outputs/own/{name}/[\d_-]+-\d{{6}}", config.hydra.run.dir)
 
 
 def said_in(file: Path) -> dict:

@@ -12,6 +12,7 @@ import yaml
 from campaigns import channels, compose, powers
 from doors import assert_refused, knock
 from mirrors import mirrored
+from refusals import refused
 
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
@@ -157,11 +158,9 @@ def test_folds_need_their_checkpoints(trained, tmp_path):
     method, stored = loading.load(trained)
     fold = tmp_path / "fold.ckpt"
     checkpoint.save(fold, method, stored.config, {})
-    with pytest.raises(ValueError, match="give as many checkpoints"):
-        evaluate_files([fold, fold])
+    refused("give as many checkpoints", evaluate_files, [fold, fold])
     checkpoint.save(fold, method, stored.config, {"fold": 4})
-    with pytest.raises(ValueError, match="fold 4 was trained, split=random has 1 folds"):
-        evaluate_files([fold])
+    refused("fold 4 was trained, split=random has 1 folds", evaluate_files, [fold])
 
 
 def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_its_rest(tmp_path, caplog):

@@ -1,9 +1,9 @@
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import refusals
 from releases import write_release
 
 from gsparc.data.errors import DataError
@@ -14,12 +14,9 @@ def refused():
     """`refused(says, read, ...)`: the error of `read(...)`, of which each problem is one short line."""
 
     def error_of(says: str, read: Callable, *arguments, **more) -> DataError:
-        with pytest.raises(DataError) as caught:
-            read(*arguments, **more)
-        problems = caught.value.problems
-        assert all("\n" not in line and "Traceback" not in line and len(line) < 600 for line in problems)
-        assert any(says in line or re.search(says, line) for line in problems), problems
-        return caught.value
+        found = refusals.refused(says, read, *arguments, **more)
+        assert isinstance(found, DataError)
+        return found
 
     return error_of
 

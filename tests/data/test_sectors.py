@@ -59,14 +59,13 @@ def test_a_list_of_sites_is_read_whole(tmp_path):
     assert "'Cell Name'" in matched[0] and "'PCI+DL EARFCN'" in matched[0]
 
 
-def test_a_cell_number_that_two_listed_stations_share_is_named(tmp_path):
+def test_a_cell_number_that_two_listed_stations_share_is_named(tmp_path, refused):
     """Every cell of the drive was said to be in no list."""
     rng, cells = np.random.default_rng(0), [["A", 7, 0, 0], ["B", 8, 90, 0], ["C", 7, 9e4, 0]]
     rows = [[*rng.uniform(0, 90, 2).round(1), 7 + i % 2, -70 - i % 9] for i in range(40)]
     drive = write(tmp_path / "drive.csv", ["x", "y", "PCI", "RSRP [dBm]"], rows)
     listed = write(tmp_path / "sites.csv", ["name", "PCI", "x", "y"], cells)
-    with pytest.raises(DataError, match=r"PCI 7 names A, C of the list of stations; leave only"):
-        read_any(drive, stations_file=listed)
+    refused(r"PCI 7 names A, C of the list of stations; leave only", read_any, drive, stations_file=listed)
 
 
 def test_cells_that_a_list_lacks_are_counted(tmp_path):
@@ -187,9 +186,8 @@ def read_list(folder, **columns):
     ("EIRP", [2000], r"name its unit, as in 'EIRP \[W\]'"),
     ("Azimuth", [0, 0.9, 0.6], r"'Azimuth \[rad\]'"),
 ])  # fmt: skip
-def test_the_unit_that_fits_is_named(tmp_path, head, values, says):
-    with pytest.raises(DataError, match=says):
-        read_list(tmp_path, **{head: values})
+def test_the_unit_that_fits_is_named(tmp_path, head, values, says, refused):
+    refused(says, read_list, tmp_path, **{head: values})
 
 
 def test_unknown_azimuths_and_widths_are_no_numbers(tmp_path):

@@ -116,16 +116,13 @@ def test_index_file_for_other_data_warns(tmp_path, caplog):
     assert "made for other data" in caplog.text
 
 
-def test_bad_index_files_are_refused(tmp_path):
+def test_bad_index_files_are_refused(tmp_path, refused):
     path = tmp_path / "split.json"
-    with pytest.raises(DataError, match="no such split file"):
-        read_split(path, 400)
+    refused("no such split file", read_split, path, 400)
     path.write_text("[1, 2]")
-    with pytest.raises(DataError, match="not a split file"):
-        read_split(path, 400)
+    refused("not a split file", read_split, path, 400)
     write_split(path, make_split(_walk(), SplitSettings()), rows=400)
-    with pytest.raises(DataError, match="made for 400 rows, the dataset has 399"):
-        read_split(path, 399)
+    refused("made for 400 rows, the dataset has 399", read_split, path, 399)
     content = json.loads(path.read_text())
     edits = {"edited or damaged": ("test", content["folds"][0]["test"][1:]),
              "names a row twice": ("test", content["folds"][0]["train"]),
@@ -134,8 +131,7 @@ def test_bad_index_files_are_refused(tmp_path):
         spoilt = json.loads(json.dumps(content))
         spoilt["folds"][0][part] = rows
         path.write_text(json.dumps(spoilt))
-        with pytest.raises(DataError, match=pattern):
-            read_split(path, 400)
+        refused(pattern, read_split, path, 400)
 
 
 @pytest.mark.parametrize("settings, pattern", [
@@ -148,32 +144,27 @@ def test_bad_index_files_are_refused(tmp_path):
     ({"buffer_m": float("nan")}, "buffer_m=nan"),
     ({"corner": "north"}, "corner='north'"),
 ])  # fmt: skip
-def test_impossible_settings_are_refused(settings, pattern):
-    with pytest.raises(DataError, match=pattern):
-        SplitSettings(**settings)
+def test_impossible_settings_are_refused(settings, pattern, refused):
+    refused(pattern, SplitSettings, **settings)
 
 
-def test_impossible_splits_are_refused():
-    with pytest.raises(DataError, match="too few for 5 folds"):
-        make_split(_walk(8), SplitSettings("grouped"))
-    with pytest.raises(DataError, match="fold 0 has 0 training"):
-        make_split(_walk(40), SplitSettings("grouped", buffer_m=10.0))
-    with pytest.raises(DataError, match="too few to hold some out"):
-        make_split(_walk(), SplitSettings("blocks", side_m=5000))
+def test_impossible_splits_are_refused(refused):
+    refused("too few for 5 folds", make_split, _walk(8), SplitSettings("grouped"))
+    refused("fold 0 has 0 training", make_split, _walk(40), SplitSettings("grouped", buffer_m=10.0))
+    refused("too few to hold some out", make_split, _walk(), SplitSettings("blocks", side_m=5000))
 
 
-def test_split_for_reads_the_config_group(rfid_folder, tmp_path):
+def test_split_for_reads_the_config_group(rfid_folder, tmp_path, refused):
     data = load_rfid(rfid_folder)
     split = split_for({"name": "random", "seed": 0}, data)
     assert split.folds[0].test.tolist() == [1, 4]
     write_split(tmp_path / "s.json", split, len(data), data.site.sha256)
     again = split_for({"name": "file", "path": str(tmp_path / "s.json")}, data)
     assert again.sha256 == split.sha256 and again.name == "random"
-    with pytest.raises(DataError, match=r"split\.sed: no such setting"):
-        split_for({"name": "random", "sed": 0}, data)
+    refused(r"split\.sed: no such setting", split_for, {"name": "random", "sed": 0}, data)
 
 
-def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path):
+def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path, refused):
     """`+split.leave_out` and `+split.train_count` beside split=file were ignored."""
     data, path = load_rfid(rfid_folder), str(tmp_path / "s.json")
     split = split_for({"name": "random"}, data)
@@ -186,13 +177,12 @@ def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path):
     assert kept.sha256 != split.sha256
     with pytest.raises(DataError, match=r"split\.train_count: no such setting of split=file; there are"):
         split_for({"name": "file", "path": path, "train_count": 5}, data)
-    with pytest.raises(DataError, match=r"split\.path is not set"):
-        split_for({"name": "file"}, data)
+    refused(r"split\.path is not set", split_for, {"name": "file"}, data)
     with pytest.raises(DataError, match=r"split\.leave_out: row 999 of rows 0 to"):
         split_for({"name": "file", "path": path, "leave_out": [999]}, data)
 
 
-def test_thinning_by_distance_leaves_the_test_rows_alone():
+def test_thinning_by_distance_leaves_the_test_rows_alone(refused):
     positions = np.random.default_rng(0).uniform(0, 10, (600, 3)) * [1, 1, 0]
     dense, thin = (make_split(positions, SplitSettings(spacing_m=d)).folds[0] for d in (None, 0.8))
     np.testing.assert_array_equal(dense.test, thin.test)
@@ -201,8 +191,7 @@ def test_thinning_by_distance_leaves_the_test_rows_alone():
     assert apart[~np.eye(len(kept), dtype=bool)].min() >= 0.8
     left = np.setdiff1d(np.concatenate([dense.train, dense.val]), kept)
     assert np.linalg.norm(positions[left][:, None] - positions[kept][None], axis=-1).min(1).max() < 0.8
-    with pytest.raises(DataError, match="spacing_m"):
-        SplitSettings(spacing_m=0.0)
+    refused("spacing_m", SplitSettings, spacing_m=0.0)
 
 
 def test_blocks_are_whole_squares_until_the_share_is_reached():
@@ -227,7 +216,7 @@ def test_a_place_is_held_out_for_all_stations(name):
             assert len(getattr(fold, part)) == 4 * len(getattr(other, part))
 
 
-def test_stations_are_held_out_one_by_one_or_together():
+def test_stations_are_held_out_one_by_one_or_together(refused):
     station = np.repeat(np.arange(5), 20)
     positions = np.random.default_rng(0).uniform(0, 3, (100, 3))
     split = make_split(positions, SplitSettings("stations"), station=station)
@@ -237,13 +226,12 @@ def test_stations_are_held_out_one_by_one_or_together():
         assert not set(station[fold.val]) & set(station[fold.train])
     (fold,) = make_split(positions, SplitSettings("stations", leave_out=2), station=station).folds
     assert len(set(station[fold.test])) == 2
-    with pytest.raises(DataError, match="have one station"):
-        make_split(positions, SplitSettings("stations"))
+    refused("have one station", make_split, positions, SplitSettings("stations"))
     with pytest.raises(DataError, match="two at least must remain"):
         make_split(positions, SplitSettings("stations", leave_out=4), station=station)
 
 
-def test_whole_runs_are_held_out():
+def test_whole_runs_are_held_out(refused):
     run = np.repeat([3, 4, 7, 8, 9], 20)
     positions = np.random.default_rng(0).uniform(0, 3, (100, 3))
     (fold,) = make_split(positions, SplitSettings("runs"), station=run).folds
@@ -253,8 +241,7 @@ def test_whole_runs_are_held_out():
     assert len(set(run[fold.test])) == 2
     inner = inner_folds(positions, fold, SplitSettings("runs", test_fraction=0.4), 3, 0, None, run)
     assert inner.name == "runs" and all(len(set(run[one.test])) == 1 for one in inner.folds)
-    with pytest.raises(DataError, match="have one run; take split=random"):
-        make_split(positions, SplitSettings("runs"))
+    refused("have one run; take split=random", make_split, positions, SplitSettings("runs"))
 
 
 @pytest.mark.parametrize("text", ["[" * 50_000, '{"folds": [{"train": [' + "1" * 5000 + "]}]}"])

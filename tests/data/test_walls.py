@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from gsparc.data.errors import DataError
 from gsparc.data.walls import SIMULATED, polygon_area, read_walls
 from gsparc.simulate.scenes.build import SceneSettings
 
@@ -49,14 +48,10 @@ def test_walls_are_polygons(tmp_path):
         ("a.yaml", "walls: [[[0,0,0],[1,0,0],[1,1,1],[0,1,0]]]", r"walls\[0\]: .* off a plane; split it"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused_in_one_line(name, text, said, tmp_path):
-    with pytest.raises(DataError, match=said) as refused:
-        read_walls(written(tmp_path / name, text))
-    assert "\n" not in str(refused.value)
+def test_what_cannot_be_is_refused_in_one_line(name, text, said, tmp_path, refused):
+    refused(said, read_walls, written(tmp_path / name, text))
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(DataError, match=r"absent\.yaml: missing; expected"):
-        read_walls(tmp_path / "absent.yaml")
-    with pytest.raises(DataError, match=r"init\.file is missing; expected a file of `walls`"):
-        read_walls(None)
+def test_a_missing_file_is_named(tmp_path, refused):
+    refused(r"absent\.yaml: missing; expected", read_walls, tmp_path / "absent.yaml")
+    refused(r"init\.file is missing; expected a file of `walls`", read_walls, None)

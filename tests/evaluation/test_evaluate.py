@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from gsparc.data.own import from_arrays
 from gsparc.evaluation.baselines import baselines_for, fit_baseline
@@ -128,8 +129,7 @@ def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
     assert facts["train/samples"] == len(split.folds[0].train) and "test/ssim" not in facts
     # The nearest training row is the row itself: its error is no bar.
     assert facts["train/skill"] is None and facts["time/train_s"] is None
-    with pytest.raises(ValueError, match="eval_on='tset'"):
-        evaluate(methods, None, data, split, eval_on="tset", clock=QUICK)
+    refused("eval_on='tset'", evaluate, methods, None, data, split, eval_on="tset", clock=QUICK)
 
 
 @pytest.mark.parametrize("name", ["nearest", "gp"])
@@ -144,18 +144,15 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, na
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40, 2)
     methods, seconds = fit_all(Mean, data, split)
-    with pytest.raises(ValueError, match="1 methods for the 2 folds"):
-        evaluate(methods[0], seconds[:1], data, split, clock=QUICK)
-    with pytest.raises(ValueError, match="1 training times for 2 methods"):
-        evaluate(methods, seconds[0], data, split, clock=QUICK)
+    refused("1 methods for the 2 folds", evaluate, methods[0], seconds[:1], data, split, clock=QUICK)
+    refused("1 training times for 2 methods", evaluate, methods, seconds[0], data, split, clock=QUICK)
 
 
 def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
     (method,), _ = fit_all(Mean, data, split)
     method.value[3] = torch.nan
-    with pytest.raises(ValueError, match="NaN or Inf"):
-        evaluate(method, None, data, split, clock=QUICK)
+    refused("NaN or Inf", evaluate, method, None, data, split, clock=QUICK)
 
 
 def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, monkeypatch):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import gsparc
 from gsparc.data.errors import DataError
@@ -77,8 +78,7 @@ def test_a_second_survey_was_refused_where_it_heard_new_stations(caplog):
         ValueError, match=said + r"; dataset\.stations"
     ):  # a training would learn from less than it was given
         align_to_site(town(), site, whole=True)
-    with pytest.raises(ValueError, match=r"stations roof .* no name in common"):
-        align_to_site(town((2,)), site)
+    refused(r"stations roof .* no name in common", align_to_site, town((2,)), site)
     alone = from_arrays({"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0]})
     with pytest.raises(ValueError, match="arrays has one static end, the model 3 stations"):
         align_to_site(alone, replace(town().site, name="arrays"))
@@ -217,8 +217,7 @@ def test_data_centred_elsewhere_are_moved_not_misread(room):
 )
 def test_data_of_another_place_or_kind_are_refused(room, name, change, message):
     other = replace(room, site=replace(room.site, **{name: change(getattr(room.site, name))}))
-    with pytest.raises(ValueError, match=message):
-        align_to_site(other, room.site)
+    refused(message, align_to_site, other, room.site)
 
 
 def test_what_is_in_target_units_is_converted_with_the_target(room):
@@ -240,8 +239,7 @@ def test_locate_built_whatever_class_a_checkpoint_named():
     settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "effort": 2.0}
     split = SimpleNamespace(folds=[None])
     run = Opened([None], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, split)
-    with pytest.raises(ValueError, match=r"os\.system.*refused"):
-        run.retraining(5.0)
+    refused(r"os\.system.*refused", run.retraining, 5.0)
     settings["model"] = {"_target_": "gsparc.models.baselines.nearest.Nearest"}
     context = run.retraining(5.0).context
     assert (context.seed, context.effort, context.stations) == (3, 5.0, "auto")

@@ -10,6 +10,7 @@ from campaigns import compose, spectra
 from hydra.core.config_store import ConfigStore
 from hydra.errors import MissingConfigException
 from invented import invent
+from refusals import refused
 from scipy.spatial import cKDTree
 
 import gsparc
@@ -90,10 +91,8 @@ def test_a_method_that_could_not_answer_once_stored_was_trained(installed):
 
 
 def test_without_the_plugin_its_checkpoint_is_refused(installed, tmp_path):
-    with pytest.raises(ValueError, match="refused"):
-        build({"_target_": "own_method.NearestK"}, trusted=False)
-    with pytest.raises(ValueError, match="no method is called 'nearest_k'"):
-        method_class("nearest_k")
+    refused("refused", build, {"_target_": "own_method.NearestK"}, trusted=False)
+    refused("no method is called 'nearest_k'", method_class, "nearest_k")
 
 
 def test_a_broken_plugin_is_warned_of(installed, tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from states import same
 
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
@@ -115,13 +116,6 @@ def test_an_entry_marked_as_a_folder_is_read_all_the_same(path):
     path.write_bytes(content)
     found = checkpoint.read(path).state
     assert same(found, sound)
-
-
-def same(one, other) -> bool:
-    """Whether states are equal."""
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(part, other[name]) for name, part in one.items())
-    return torch.equal(one, other) if isinstance(one, torch.Tensor) else one == other
 
 
 def test_a_damaged_directory_is_no_traceback(path):

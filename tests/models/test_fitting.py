@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from posts import POSTS, heard
+from refusals import refused
 from scenes import fold_of
 
 from gsparc.data import executor
@@ -73,10 +74,8 @@ def test_a_part_is_not_taken_for_another(town, tmp_path):
     one, two = (data.subset(np.flatnonzero(data.station == t), station_site(data.site, t)) for t in (0, 1))
     assert one.site.sha256 != two.site.sha256 != data.site.sha256
     (tmp_path / "run" / "station1" / "model.ckpt").rename(tmp_path / "run" / "station0" / "model.ckpt")
-    with pytest.raises(ValueError, match="was trained with other data"):
-        fitted(town, tmp_path / "on", resume=tmp_path / "run")
-    with pytest.raises(ValueError, match=r"seed=0 \(here 1\)"):
-        fitted(town, tmp_path / "on", resume=tmp_path / "run", seed=1)
+    refused("was trained with other data", fitted, town, tmp_path / "on", resume=tmp_path / "run")
+    refused(r"seed=0 \(here 1\)", fitted, town, tmp_path / "on", resume=tmp_path / "run", seed=1)
 
 
 def test_a_run_that_begins_anew_leaves_no_parts_of_the_one_before(town, tmp_path):

@@ -150,12 +150,6 @@ def test_what_is_chosen_answers_the_same_by_its_own_name(name):
     same(both[0].method, both[1].method, asked(both[0]))
 
 
-@pytest.mark.parametrize("named", ["image_sources", "channels", "bearings", "array_process"])
-def test_a_method_of_another_kind_of_measurement_is_refused(named):
-    with pytest.raises(ValueError, match=f"{named}: the target is rssi"):
-        fit("powers", f"model={named}", small=())
-
-
 @pytest.mark.parametrize("name", KINDS)
 def test_far_from_all_data_nothing_is_known(name):
     fitted = default(name)

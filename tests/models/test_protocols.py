@@ -4,7 +4,7 @@ Methods are fitted once, on tiny data.
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,20 +13,25 @@ import kinds
 import numpy as np
 import pytest
 import torch
-from campaigns import RENDERED, compose
-from cities import city
+import yaml
+from campaigns import RENDERED, channels, compose, spectra
+from cities import city, deaf
 from contexts import short
+from invented import invent
+from refusals import refused
 from rooms import directed, shoebox
 from scenes import fold_of, lobes, room
 from worlds import World, arrays
 
+from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.gaussians import FieldSettings
+from gsparc.models import checkpoint, loading
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, MethodFactory, suitable_threads
+from gsparc.models.method import Method, MethodFactory, import_path, suitable_threads
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.per_station import wrap_per_station
@@ -42,13 +47,15 @@ VARIANCE = (
     "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
     "moving_array",
 )  # fmt: skip
+PLAIN = ("mean", "nearest", "idw", "gp", "kriging")
+INVENTED = [(kind, end) for kind in ("spectrum", "csi", "rssi") for end in ("rx", "tx")]
 # Settings of trainings that are over at once.
 SMALL: dict[str, dict[str, Any]] = {
     **{name: {"count": 40, "max_steps": 3} for name in ("gsrf", "wrfgs", "swiftwrf", "ngrf")},
     **{name: {"width": 16, "samples": 8, "max_steps": 3} for name in ("nerf2", "newrf")},
 }
 UPLINK: dict[str, dict[str, Any]] = {
-    "ridge": {}, "fire": {"max_steps": 3},
+    "ridge": {}, "ridge, all antennas": {"inputs": "all"}, "fire": {"max_steps": 3},
     "uplink": {"search": UplinkSearch(rounds=2, picks=4, final=2), "teachers": 60},
 }  # fmt: skip
 
@@ -62,6 +69,7 @@ MAKES = {  # what others than of received powers are fitted to
     **dict.fromkeys(SMALL, lambda folder: lobes(folder)[0]),
     **dict.fromkeys(("ngrf", "newrf"), lambda _: room(40, directions=True)[0]),
     **dict.fromkeys(UPLINK, lambda _: city("all")),
+    "ridge, all antennas": lambda _: city(0),  # of one antenna
     "directional_gp": lambda _: directed(60)[0],
     "image_source_gp": lambda _: shoebox(60)[1],
 }
@@ -81,13 +89,13 @@ def unfitted(name: str) -> MethodFactory:
     if name == "moving_array":
         search = BearingSearchSettings(sources=8, rows=30, candidates=1000, steps=20)
         return MovingArrayField(search=search, components=32)
-    return method_class(name)(**{**SMALL, **UPLINK}.get(name, {}))
+    return method_class(name.partition(",")[0])(**{**SMALL, **UPLINK}.get(name, {}))
 
 
 @cache
-def fitted(name: str) -> tuple[Method, Measurements, Fold]:
+def fitted(name: str, layout: str = "") -> tuple[Method, Measurements, Fold]:
     with TemporaryDirectory() as folder:
-        data = MAKES.get(name, kinds.received)(Path(folder))
+        data = {"": MAKES.get(name, kinds.received), **LAYOUTS}[layout](Path(folder))
         method = unfitted(name).create_for(data)
         fold = fold_of(data)
         method.fit(data, fold, short(Path(folder), 10, effort=0.1))
@@ -113,26 +121,99 @@ def ends(method: Method, moving: torch.Tensor) -> Query:
     return Query(moving, Pose(still, torch.from_numpy(turn).float()))
 
 
-@pytest.mark.parametrize("name", VARIANCE)
-def test_predictions_have_a_variance_and_are_the_same_of_a_stored_method(name, tmp_path):
-    """Its state alone says all, without the settings."""
-    method = fitted(name)[0]
-    query = ends(method, places(method).float())
-    said = method.predict(query)
-    variance = said.variance
-    assert variance is not None and variance.shape == (5,)
-    assert variance.dtype == torch.float32 and (variance > 0).all()
-    torch.save(method.state(), tmp_path / "state.pt")
-    again = method_class(name)()
-    again.restore(method.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    told = again.predict(query)
-    for part in ("mean", "confidence", "variance"):
-        torch.testing.assert_close(getattr(told, part), getattr(said, part))
-    assert again.count_components() == method.count_components()
+def invented(kind: str, end: str, _: Path) -> Measurements:
+    return invent(kind, 30, end)
+
+
+# Further layouts of rows, and who is fitted to them besides.
+LAYOUTS = {
+    **{f"{kind}, {end} stands": partial(invented, kind, end) for kind, end in INVENTED},
+    "lobes, rx moves": lambda folder: lobes(folder, "rx")[0],
+    "room": lambda _: room(40, directions=True)[0],
+    "spectra, rx moves": lambda folder: own(spectra(folder / "own.npz", moving="rx")),
+    "S": kinds.gains,
+    "SK, tx moves": lambda folder: own(channels(folder / "own.npz", moving="tx", shape="SK")),
+    "SAK": lambda folder: own(channels(folder / "own.npz")),
+    "powers": kinds.received,
+    "deaf": lambda _: deaf(city("all")),
+    "bands": kinds.bands,
+    "runs": lambda _: from_arrays(arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0)),
+}
+FITTED = [name for name in built_in_methods() if name != "calibrated_raytracer"]
+CASES = [
+    *((name, "") for name in (*FITTED, "ridge, all antennas")),
+    *((name, f"{kind}, {end} stands") for name in (*PLAIN, "zero") for kind, end in INVENTED),
+    *((name, "lobes, rx moves") for name in ("gsrf", "wrfgs", "swiftwrf", "nerf2")),
+    ("gsrf", "room"), ("complex_gp", "runs"), ("image_source_gp", "bands"),
+    *(("splat", layout) for layout in ("spectra, rx moves", "S", "SK, tx moves", "SAK", "powers")),
+]  # fmt: skip
+
+
+def own(file: Path) -> Measurements:
+    return load({"name": "own", "file": str(file)})
+
+
+def slow(cases: list[tuple[str, str]]) -> list[Any]:
+    """Cases, marked where a fit takes more than a second that is not taken by others."""
+    long = (*NAMED, "gsparc", "splat", "fire", "carriers", "ridge, all antennas")
+    return [pytest.param(*case, marks=[pytest.mark.slow] if case[0] in long else []) for case in cases]
+
+
+@pytest.mark.parametrize(("name", "layout"), slow(CASES))
+def test_answers_are_as_targets_in_any_order_and_those_of_the_stored(name, layout, tmp_path):
+    """A file of its state alone says all, but for the sizes of what is trained."""
+    method, data, fold = fitted(name, layout)
+    batch, config = data.batch(fold.test), {}
+    found = method.predict(batch)
+    assert found.mean.shape == batch.target.shape and found.mean.dtype == batch.target.dtype
+    assert name not in PLAIN or method.count_components() == len(fold.train) + len(fold.val)
+    if name in SMALL:  # a file of when seconds ended fits is read too
+        config = {"model": {"_target_": import_path(type(method)), **SMALL[name], "budget_s": 60.0}}
+    checkpoint.save(tmp_path / "m.ckpt", method, yaml.safe_dump(config))
+    again = loading.load(tmp_path / "m.ckpt")[0]
+    assert name in UPLINK or again.count_components() == method.count_components()
+    orders = fold.test, fold.test[::-1], fold.test[:1]
+    whole, turned, one = (again.predict(data.batch(rows)) for rows in orders)
+    if name in VARIANCE and not layout:
+        assert found.variance.dtype == torch.float32 and (found.variance > 0).all()
+        away = ends(method, places(method).float() + torch.tensor([1.0, 3, 30, 300, 3000])[:, None])
+        torch.testing.assert_close(
+            *(one.predict(away).variance for one in (method, again)), rtol=1e-5, atol=0
+        )
+    for part in ("mean", "confidence", "variance", "unknown", "explained"):
+        values, stored = (getattr(said, part, None) for said in (found, whole))
+        assert (values is None) == (stored is None), part
+        if values is None:
+            continue
+        assert torch.isfinite(values).all()
+        if part not in ("mean", "explained"):
+            assert values.shape == (len(batch),) and (values >= 0).all()
+            assert part == "variance" or (values <= 1).all()
+        near = {"rtol": 1e-3, "atol": 1e-5 * float(values.abs().max())}
+        torch.testing.assert_close(stored, values, **{**near, "rtol": 1e-5})
+        torch.testing.assert_close(getattr(turned, part).flip(0), values, **near)
+        torch.testing.assert_close(getattr(one, part), values[:1], **near)
+
+
+REFUSED = [
+    ("distance_law", "csi, rx stands", "distance_law: needs received powers"), ("ridge", "deaf", "has none"),
+    ("array", "spectrum, rx stands", "no antenna array"),
+    ("swiftwrf", "csi, rx stands", "swiftwrf: predicts .*holds csi"),
+    ("gsrf", "powers", "gsrf: predicts .*holds rssi"),
+    ("newrf", "csi, tx stands", "newrf: needs directions of arrival"),
+    ("ngrf", "spectrum, rx stands", "ngrf: spectra need .* array"),
+    *((name, "powers", f"{name}: the target is rssi") for name in NAMED[:1] + NAMED[2:4] + NAMED[5:]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "layout", "says"), REFUSED)
+def test_what_a_method_cannot_serve_is_refused_in_one_line(name, layout, says, tmp_path):
+    data = LAYOUTS[layout](tmp_path)
+    refused(says, lambda: unfitted(name).create_for(data).fit(data, fold_of(data), FitContext(tmp_path)))
 
 
 UNFITTED = (*VARIANCE, "nearest", "splat", "gsrf", "uplink", "ridge")
-POISONED = ("mean", "complex_gp", "gsrf", "newrf", "splat", "array", "directional_gp", "uplink")
+POISONED = (*SMALL, *PLAIN, "complex_gp", "splat", "array", "directional_gp", "uplink")
 
 
 @pytest.mark.parametrize("name", UNFITTED)
@@ -218,10 +299,10 @@ def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in built_in_methods() if name != "calibrated_raytracer"])
-def test_what_is_scored_is_what_is_served(name):
+@pytest.mark.parametrize(("name", "layout"), [case for case in CASES if case[1] != "runs"])
+def test_what_is_scored_is_what_is_served(name, layout):
     """`answer` of rows and `predict` of places were two ways, each with code of its own."""
-    method, data, fold = fitted(name)
+    method, data, fold = fitted(name, layout)
     rows, predictor = fold.test, Predictor(method, data.site)
     if data.station is not None:
         rows = rows[data.station[rows] == data.station[rows[0]]]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from invented import invent
 from known_arrays import array_site
+from refusals import refused
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.field.emission import EmissionSettings
@@ -94,8 +95,7 @@ def test_an_array_may_be_switched_off():
     ],
 )
 def test_terms_that_mean_nothing_here(kind, effects, message):
-    with pytest.raises(ValueError, match=message):
-        chosen(kind, effects)
+    refused(message, chosen, kind, effects)
 
 
 @pytest.mark.parametrize(
@@ -110,5 +110,4 @@ def test_terms_that_mean_nothing_here(kind, effects, message):
     ],
 )
 def test_what_known_walls_cannot_serve(kind, effects, count, message):
-    with pytest.raises(ValueError, match=f"init=scene is not possible: .*{message}"):
-        chosen(kind, effects, "scene", count=count)
+    refused(f"init=scene is not possible: .*{message}", chosen, kind, effects, "scene", count=count)

@@ -208,12 +208,12 @@ FEW = ("init.searches=3", "init.search_rows=200", "init.max_sources=8")
 
 PROBLEMS: dict[str, Problem] = {
     "spectra": Problem(lambda: spectra(60, declared=False)),
-    "spectra of an array": Problem(lambda: spectra(60, declared=True)),
+    "spectra of an array": Problem(lambda: spectra(60, declared=True), slow=True),
     "spectra of a moving array": Problem(
         lambda: spectra(44, declared=True, moving="rx"), "moving_array", slow=True
     ),
-    "one tone": Problem(lambda: channels(80), command=FEW),
-    "many tones": Problem(lambda: channels(60, tones=6), command=FEW),
+    "one tone": Problem(lambda: channels(80), command=FEW, slow=True),
+    "many tones": Problem(lambda: channels(60, tones=6), command=FEW, slow=True),
     "antennas": Problem(lambda: channels(60, tones=2, antennas=3), command=FEW, slow=True),
     "uplink of an array": Problem(lambda: channels(60, antennas=4, moving="tx"), command=FEW, slow=True),
     "uplink of snapshots": Problem(snapshots, "uplink", ("dataset=argos", "dataset.positions=true")),
@@ -225,7 +225,9 @@ PROBLEMS: dict[str, Problem] = {
     ),
     "aligned runs": Problem(runs, command=FEW),
     "both ends move, channels": Problem(both_ends),
-    "known walls": Problem(lambda: channels(60), command=("init=scene", "init.file={folder}/room.yaml")),
+    "known walls": Problem(
+        lambda: channels(60), command=("init=scene", "init.file={folder}/room.yaml"), slow=True
+    ),
     "directions": Problem(directed, "directional_gp"),
     "powers": Problem(lambda: powers(110)),
     "silent rows": Problem(silent),

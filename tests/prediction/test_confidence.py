@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 from towns import trained
 
 import gsparc
@@ -72,12 +73,9 @@ def test_two_moving_ends_are_accepted_where_both_were_measured(tmp_path) -> None
 def test_what_was_never_stored_is_said(site) -> None:
     data, fold, file = site
     world = data.tx[fold.test[:2]] + data.site.origin
-    with pytest.raises(ValueError, match="no threshold is stored"):
-        gsparc.load(file).accepts(tx=world)
-    with pytest.raises(ValueError, match=r"gsparc calibrate ckpt=FILE stores it"):
-        gsparc.load(file, confidence="distance")
-    with pytest.raises(ValueError, match="expected one of learned"):
-        gsparc.load(file, confidence="hope")
+    refused("no threshold is stored", gsparc.load(file).accepts, tx=world)
+    refused(r"gsparc calibrate ckpt=FILE stores it", gsparc.load, file, confidence="distance")
+    refused("expected one of learned", gsparc.load, file, confidence="hope")
     store_trusted(
         file, Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold))
     )

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from campaigns import plain
+from refusals import refused
 
 import gsparc
 from gsparc.commands.train import train
@@ -104,8 +105,7 @@ def test_decibels_of_no_known_reference_and_linear_powers_come_back():
     assert (found.unit, plain.unit) == ("dB", "linear")
     assert np.allclose(10 * np.log10(said), found.rssi(rx=PLACES[0]), atol=1e-4)
     assert np.allclose(said, found.rssi(rx=PLACES[0], unit="linear"), rtol=3e-5)
-    with pytest.raises(ValueError, match="unit=W: of powers in dB expected dBm, dBW, linear"):
-        found.rssi(rx=PLACES[0], unit="W")
+    refused("unit=W: of powers in dB expected dBm, dBW, linear", found.rssi, rx=PLACES[0], unit="W")
     with pytest.raises(ValueError, match="unit=dBm: goes with powers, not with csi"):
         gsparc.fit(rx=PLACES, tx=END, model="mean", **KINDS["csi"]).std(rx=PLACES[0], unit="dBm")
 
@@ -130,8 +130,7 @@ def test_a_station_with_too_few_rows_is_nan_among_the_others():
 
 def test_methods_without_deviations_say_so():
     found = gsparc.fit(rx=PLACES, tx=END, rssi=POWERS, model="nearest")
-    with pytest.raises(ValueError, match="nearest states no deviations"):
-        found.std(rx=PLACES[0])
+    refused("nearest states no deviations", found.std, rx=PLACES[0])
 
 
 @pytest.mark.parametrize("wrong, said", [

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, SurveyProbe
@@ -81,8 +82,7 @@ def test_words_become_a_deliverable(text, kind, tolerance):
     {"deliverable": "csi -20 dB please"}, {"rays": 0}, {"rays": 2}, {"confidence": 1.0}, {"probes": 3},
 ])  # fmt: skip
 def test_bad_settings_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        AutoSettings(**wrong)
+    refused(next(iter(wrong)), AutoSettings, **wrong)
 
 
 def test_coverage_drops_what_is_below_a_decibel():
@@ -141,8 +141,8 @@ def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
     row = taken.table[-1]
     assert taken.samples == 300 and not row.kept and row.effect == "rays > 300"
     assert row.error == pytest.approx(20 * np.log10(1.05), rel=1e-4)
-    for refused in (tried(4), auto.keep_all_rays(taken)):
-        assert refused.samples is None and refused.table[-1].kept
+    for without in (tried(4), auto.keep_all_rays(taken)):
+        assert without.samples is None and without.table[-1].kept
     assert Choice.from_dict(dataclasses.asdict(taken)) == taken
 
 
@@ -160,8 +160,7 @@ def test_spectra_are_judged_against_the_nearest_receiver():
     same = probe_of(paths, paths.select_paths(paths.order == 0))
     assert (same.errors(paths, Deliverable("spectrum", 0.1)) == 0).all()
     assert (same.errors(paths, Deliverable("csi", -20.0)) == -99).all()
-    with pytest.raises(ValueError, match="nearest"):
-        probe_of(paths).errors(FULL, Deliverable("spectrum", 0.1))
+    refused("nearest", probe_of(paths).errors, FULL, Deliverable("spectrum", 0.1))
 
 
 def test_channel_error_of_a_dropped_path_is_its_share_of_energy():

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 from crashes import small_campaign
+from refusals import refused
 
 from gsparc.commands.check import main as check
 from gsparc.data import blocks
@@ -232,8 +233,7 @@ def test_parts_of_another_simulation_are_refused(tmp_path):
     interrupted(campaigns, "_trace_all", listed, out)
     for another in (plan(shard=20), listed):
         table.write_text("x,y,z\n1,1,1.2\n2,1,1.2\n3,4,1.2\n")
-        with pytest.raises(ValueError, match="different simulation"):
-            simulate(another, out)
+        refused("different simulation", simulate, another, out)
 
 
 def test_interrupted_removal_leaves_no_shards_without_their_plan(tmp_path):
@@ -252,8 +252,7 @@ def test_interrupted_removal_leaves_no_shards_without_their_plan(tmp_path):
 
 def test_existing_file_is_not_overwritten(tmp_path):
     (tmp_path / "box.h5").write_text("mine")
-    with pytest.raises(ValueError, match="exists"):
-        simulate(plan(), tmp_path / "box.h5")
+    refused("exists", simulate, plan(), tmp_path / "box.h5")
     assert (tmp_path / "box.h5").read_text() == "mine"
 
 
@@ -418,8 +417,7 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
     ({"size_m": [4, 3, 2], "boxes_m": [[[1, 1, 1], [0, 2, 2]]]}, r"scene\.room\.boxes_m=.*lower corner"),
 ])  # fmt: skip
 def test_a_room_without_its_size_ended_in_a_key_error(tmp_path, room, words):
-    with pytest.raises(ValueError, match=words):
-        simulate(plan(scene=replace(SCENE, room=room)), tmp_path / "box.h5")
+    refused(words, simulate, plan(scene=replace(SCENE, room=room)), tmp_path / "box.h5")
 
 
 @pytest.mark.parametrize("changes, words", [
@@ -435,7 +433,6 @@ def test_a_room_without_its_size_ended_in_a_key_error(tmp_path, room, words):
     ({"receivers": {"knd": "grid"}}, "no such setting"),
 ])  # fmt: skip
 def test_bad_scenes_are_refused(tmp_path, changes, words):
-    with pytest.raises(ValueError, match=words) as raised:
-        simulate(plan(scene=SceneSettings(**{**vars(SCENE), **changes})), tmp_path / "box.h5")
-    assert "\n" not in str(raised.value)
+    scene = {**vars(SCENE), **changes}
+    refused(words, lambda: simulate(plan(scene=SceneSettings(**scene)), tmp_path / "box.h5"))
     assert not list(tmp_path.iterdir())

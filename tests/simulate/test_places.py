@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import polygon_area, read_walls
@@ -70,17 +71,14 @@ def test_a_third_coordinate_beside_degrees_was_ignored():
     ({"name": "a", "position_m": [0, 0, 1]}, "'a' twice"),
 ])  # fmt: skip
 def test_bad_transmitters_are_refused(entry, words):
-    with pytest.raises(ValueError, match=words) as raised:
-        place_transmitters([entry, entry], lambda across: np.zeros(len(across)), SOMEWHERE)
-    assert "\n" not in str(raised.value)
+    refused(words, place_transmitters, [entry, entry], lambda across: np.zeros(len(across)), SOMEWHERE)
 
 
 def test_grid_leaves_out_occupied_places():
     found = laid(kind="grid", spacing_m=2.0)
     assert len(found.places) == 11 * 6 - 4 and found.time_s is None
     assert (found.places[:, 2] >= 6).all() and (found.places[:, 2] <= 7).all()
-    with pytest.raises(ValueError, match=r"4 of 66 receivers .*\(0\.0, 0\.0\)"):
-        laid(kind="grid", spacing_m=2.0, inside="refuse")
+    refused(r"4 of 66 receivers .*\(0\.0, 0\.0\)", laid, kind="grid", spacing_m=2.0, inside="refuse")
 
 
 def test_streets_are_sampled_evenly():
@@ -97,8 +95,7 @@ def test_receivers_of_a_table_in_degrees_with_times(tmp_path):
     found = laid(SOMEWHERE, kind="file", file=str(tmp_path / "walk.csv"))
     np.testing.assert_allclose(found.places, np.stack([east, north, np.full(3, 6.5)], 1), atol=0.01)
     np.testing.assert_allclose(found.time_s, [0, 2, 5])
-    with pytest.raises(ValueError, match="nowhere on Earth"):
-        laid(kind="file", file=str(tmp_path / "walk.csv"))
+    refused("nowhere on Earth", laid, kind="file", file=str(tmp_path / "walk.csv"))
     (tmp_path / "hut.csv").write_text("x,y,z\n6,6,1\n7,7,1\n1,1,1\n")
     with pytest.raises(ValueError, match="1 of 3 receivers stand in or on something, the first at row 2"):
         laid(kind="file", file=str(tmp_path / "hut.csv"))
@@ -108,9 +105,7 @@ def test_receivers_of_a_table_in_degrees_with_times(tmp_path):
 @pytest.mark.parametrize("cell, words", [("noon", "finite number"), ("", "line 3: no number")])
 def test_bad_times_are_refused(cell, words, tmp_path):
     (tmp_path / "walk.tsv").write_text(f"x\ty\tz\ttime_s\n6\t5\t1\t0\n7\t5\t1\t{cell}\n")
-    with pytest.raises(ValueError, match=words) as raised:
-        laid(kind="file", file=str(tmp_path / "walk.tsv"))
-    assert "\n" not in str(raised.value)
+    refused(words, laid, kind="file", file=str(tmp_path / "walk.tsv"))
 
 
 @pytest.mark.parametrize("settings, words", [
@@ -123,17 +118,14 @@ def test_bad_times_are_refused(cell, words, tmp_path):
     ({"kind": "file", "file": "nowhere.csv"}, "nowhere.csv"),
 ])  # fmt: skip
 def test_bad_receivers_are_refused(settings, words):
-    with pytest.raises(ValueError, match=words) as raised:
-        laid(**settings)
-    assert "\n" not in str(raised.value)
+    refused(words, laid, **settings)
 
 
 def test_many_places_are_found_where_few_are_allowed():
     """Draws were 204,800 whatever was asked for: 100,000 did not fit where half is built on."""
     found = draw_places(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
     assert len(found) == 2_500 and (found[:, 0] < 0.2).all()
-    with pytest.raises(ValueError, match="0 of 20 receivers"):
-        draw_places(20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0)
+    refused("0 of 20 receivers", draw_places, 20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0)
 
 
 def test_mesh_is_read_back_as_walls(tmp_path):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from refusals import refused
 from shoeboxes import scatter
 
 from gsparc.data.schema import LIGHT
@@ -99,7 +100,5 @@ def test_positions_outside_are_refused():
     with pytest.raises(ValueError, match="rx, row 1"):
         trace_room(ROOM, np.array([0.0, 1, 1]), np.array([[0.0, 1, 1.5], [9.0, 1, 1]]), 2.4e9)
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
-    with pytest.raises(ValueError, match="inside an occluder"):
-        trace_room(room, np.array([1.2, 1.8, 1]), np.array([0.0, 1, 1.5]), 2.4e9)
-    with pytest.raises(ValueError, match="upper"):
-        Room(ROOM.upper, ROOM.lower, ROOM.reflection)
+    refused("inside an occluder", trace_room, room, np.array([1.2, 1.8, 1]), np.array([0.0, 1, 1.5]), 2.4e9)
+    refused("upper", Room, ROOM.upper, ROOM.lower, ROOM.reflection)

@@ -7,6 +7,7 @@ import yaml
 from campaigns import compose
 from clocks import wound
 from doors import knock
+from refusals import refused
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
@@ -22,8 +23,7 @@ def test_an_effort_multiplies_every_count_and_rows_by_its_cube_root():
     assert Effort().scale_by(1.0) == usual and more.evaluations == 8 * usual.evaluations
     assert more.chosen_on == 2 * usual.chosen_on and Effort().scale_by(1e-6).chosen_on == 150
     assert more.factor == 8.0 and Effort().scale_by(0.3).factor == 0.3
-    with pytest.raises(ValueError, match="effort=0: a number above 0 is needed"):
-        FitContext(effort=0)
+    refused("effort=0: a number above 0 is needed", FitContext, effort=0)
 
 
 def test_what_was_spent_before_and_elsewhere_counts(monkeypatch):
@@ -48,8 +48,7 @@ def test_seconds_on_the_command_line_are_refused_with_what_to_say_instead(comman
 def test_seconds_of_a_file_or_in_python_are_refused():
     with pytest.raises(ValueError, match="budget_s=60: no seconds end a fit"):
         RunSettings.from_config(compose("+budget_s=60", "logger=none"))
-    with pytest.raises(ValueError, match="budget_s=1: no seconds end a fit"):
-        gsparc.fit(rx=[[0.0, 0, 0]], rssi=[1.0], budget_s=1)
+    refused("budget_s=1: no seconds end a fit", gsparc.fit, rx=[[0.0, 0, 0]], rssi=[1.0], budget_s=1)
 
 
 def test_a_run_that_seconds_ended_goes_on_without_them(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 import torch
 import towns
 from campaigns import powers, spectra
+from refusals import refused
 
 import gsparc
 from gsparc.apps.locate import locate
@@ -126,6 +127,4 @@ def test_visits_of_a_place_are_snapshots_of_their_own():
     (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
 ])  # fmt: skip
 def test_values_of_another_kind_are_refused_in_one_line(trained, values, more, said):
-    with pytest.raises(ValueError, match=said) as raised:
-        locate(gsparc.load(trained), values, **more)
-    assert "\n" not in str(raised.value)
+    refused(said, locate, gsparc.load(trained), values, **more)

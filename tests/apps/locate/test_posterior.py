@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from gsparc.apps.locate.cells import cover_box
 from gsparc.apps.locate.posterior import PlacePosterior, densest_cells
@@ -34,15 +35,13 @@ def test_cells_near_trained_places():
     both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
     around = cover_box(both, 400, True)
     assert len(around) < 0.5 * len(cover_box(both, 400, False))
-    with pytest.raises(ValueError, match="single place"):
-        cover_box(np.ones((5, 3)), 100, False)
+    refused("single place", cover_box, np.ones((5, 3)), 100, False)
 
 
 def test_cells_where_a_plan_is_open():
     left = cover_box(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
     assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
-    with pytest.raises(ValueError, match="no open floor"):
-        cover_box(PLACES, 400, False, lambda places: np.zeros(len(places), bool))
+    refused("no open floor", cover_box, PLACES, 400, False, lambda places: np.zeros(len(places), bool))
 
 
 def test_peak_is_between_middles_of_cells():

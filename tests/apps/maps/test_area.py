@@ -7,13 +7,13 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import refused
 from towns import town_model
 
 import gsparc
 from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.area import lay_grid
 from gsparc.apps.maps.floor_plan import read_floor_plan
-from gsparc.data.errors import DataError
 
 SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
 
@@ -41,13 +41,6 @@ def test_a_plan_lies_where_its_two_points_say(tmp_path):
     assert np.allclose(turned.corners()[1], [0, 20]) and np.allclose(turned.corners()[3], [10, 0])
     grid = lay_grid(None, None, 1.5, 1.0, plan)
     assert grid.inside.sum() == 200
-
-
-def refused(said, call, *given, **how):
-    """In one line."""
-    with pytest.raises(DataError, match=said) as caught:
-        call(*given, **how)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("said, how", [

@@ -7,6 +7,7 @@ import pytest
 import torch
 from campaigns import channels
 from matplotlib.colors import rgb_to_hsv, to_rgb
+from refusals import refused
 from scipy.stats import norm
 from towns import MASTS, town_model
 
@@ -65,8 +66,7 @@ def test_a_unit_of_maps_changed_their_names_alone():
         np.testing.assert_allclose(getattr(other, name), getattr(own, name), atol=1e-6)
     assert "[dBm]" in next(iter(list_layers(other))).legend.label
     assert other.summarise()["map/unit"] == "dBm"
-    with pytest.raises(ValueError, match=r"unit=W: of powers in dBW expected dBm, dBW$"):
-        predict_map(predictor, unit="W")
+    refused(r"unit=W: of powers in dBW expected dBm, dBW$", predict_map, predictor, unit="W")
 
 
 def test_chunks_do_not_change_a_map(predictor, monkeypatch):
@@ -270,5 +270,4 @@ def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(
 
 
 def test_a_noise_of_a_billion_decibels_overflowed(predictor):
-    with pytest.raises(ValueError, match="noise_db"):
-        predict_map(predictor, step_m=20.0, noise_db=1e9)
+    refused("noise_db", predict_map, predictor, step_m=20.0, noise_db=1e9)

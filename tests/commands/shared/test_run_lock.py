@@ -9,6 +9,7 @@ import pytest
 from campaigns import compose, powers
 from doors import assert_refused, knock
 from omegaconf import OmegaConf
+from refusals import refused
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared import run_lock
@@ -48,8 +49,7 @@ def test_two_runs_in_one_directory(other, tmp_path):
 
 
 def test_training_from_python_took_no_lock(other, tmp_path):
-    with pytest.raises(ValueError, match=f"another run writes here .process {other.pid}"):
-        train(OmegaConf.create({}), tmp_path)
+    refused(f"another run writes here .process {other.pid}", train, OmegaConf.create({}), tmp_path)
     other.kill()
     other.wait()
     with locked(tmp_path), pytest.raises(ValueError, match="another run writes here"), locked(tmp_path):
@@ -113,11 +113,9 @@ def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_pa
         train(compose(*given), tmp_path / "other")
         mixed = tmp_path / "other" / name
         mixed.write_bytes((tmp_path / "run" / name).read_bytes())
-        with pytest.raises(ValueError, match="its summary, samples and split are of two runs"):
-            read_run(tmp_path / "other")
+        refused("its summary, samples and split are of two runs", read_run, tmp_path / "other")
     models = [tmp_path / folder / checkpoint.MODEL for folder in ("run", "other")]
-    with pytest.raises(ValueError, match="of different runs; give the folds of one"):
-        open_files(models)
+    refused("of different runs; give the folds of one", open_files, models)
 
 
 def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path):

@@ -128,9 +128,8 @@ def test_what_rows_do_not_tell_apart_is_said():
 
 
 @pytest.mark.parametrize("setting", ["zenith", "array_mm", "exchange_axes"])
-def test_a_convention_that_cannot_be_is_refused(tmp_path, setting):
-    with pytest.raises(DataError, match=f"dataset.{setting}"):
-        mended_by(tmp_path, channels(), setting)
+def test_a_convention_that_cannot_be_is_refused(tmp_path, setting, refused):
+    refused(f"dataset.{setting}", mended_by, tmp_path, channels(), setting)
 
 
 def test_tones_before_antennas_were_refused_without_what_to_say(tmp_path):

@@ -7,7 +7,6 @@ import pytest
 from cities import city, folder
 
 from gsparc.data.datasets.argos import TONES, load_argos, remove_uplink_offsets
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
 
 
@@ -54,18 +53,15 @@ def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
         (lambda p: [(p / f"{n}_index.txt").write_text("0 1") for n in ("train", "test")], "also in train"),
     ],
 )  # fmt: skip
-def test_bad_folders_are_refused_in_words(tmp_path, change, words) -> None:
+def test_bad_folders_are_refused_in_words(tmp_path, change, words, refused) -> None:
     place = _copy(tmp_path)
     change(place)
-    with pytest.raises(DataError, match=words):
-        load_argos(place)
+    refused(words, load_argos, place)
 
 
-def test_no_such_antenna_or_positions(tmp_path) -> None:
-    with pytest.raises(DataError, match="at least 0 and at most 63, or all"):
-        city(64)
-    with pytest.raises(DataError, match="true positions exist in the stand-in only"):
-        load_argos(_copy(tmp_path), positions="true")
+def test_no_such_antenna_or_positions(tmp_path, refused) -> None:
+    refused("at least 0 and at most 63, or all", city, 64)
+    refused("true positions exist in the stand-in only", load_argos, _copy(tmp_path), positions="true")
 
 
 def _without_third(places: np.ndarray) -> np.ndarray:
@@ -73,11 +69,10 @@ def _without_third(places: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("change", "words"), [(_without_third, "row 2"), (np.transpose, r"transposed\?")])
-def test_positions_that_are_none_are_refused(tmp_path, change, words) -> None:
+def test_positions_that_are_none_are_refused(tmp_path, change, words, refused) -> None:
     place = shutil.copytree(folder(), tmp_path / "city")
     np.save(place / "positions.npy", change(np.load(place / "positions.npy")))
-    with pytest.raises(DataError, match=words):
-        load_argos(place, positions="true")
+    refused(words, load_argos, place, positions="true")
 
 
 def test_absent_release_is_loud(caplog) -> None:

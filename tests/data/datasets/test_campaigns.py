@@ -24,7 +24,6 @@ from releases import release
 from gsparc.data.datasets.own import CAMPAIGNS, read_any
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.raw import Raw, read_raw, write_raw
 
@@ -233,11 +232,10 @@ def test_check_reads_a_measured_campaign_as_its_loader_does(file, campaign):
     assert reading.data.site.sha256 == loaded.site.sha256 and len(loaded) == rows
 
 
-def test_own_names_the_campaign_of_a_file(tmp_path):
+def test_own_names_the_campaign_of_a_file(tmp_path, refused):
     file = tmp_path / "hall.npz"
     np.savez(file, mobile_position=np.eye(3), station_position=np.eye(3), rssi_db=np.zeros((3, 3)))
-    with pytest.raises(DataError, match="this is a file of dataset=ble; say dataset=ble"):
-        load({"name": "own", "file": str(file)})
+    refused("this is a file of dataset=ble; say dataset=ble", load, {"name": "own", "file": str(file)})
 
 
 def test_units_of_a_converted_file_were_not_looked_at(tmp_path, refused):

@@ -8,7 +8,6 @@ from poses import boresight_degrees
 from releases import release
 
 from gsparc.data.datasets.rfid import WAVELENGTH, load_rfid, planar_array
-from gsparc.data.errors import DataError
 from gsparc.data.load import load, split_for
 from gsparc.models.per_station import station_site
 
@@ -95,13 +94,12 @@ def test_absent_release_is_loud_and_uses_the_stand_in(tmp_path, caplog):
 
 
 @pytest.mark.parametrize("name", ["rfid", "argos"])
-def test_a_mistyped_root_was_another_dataset(name, tmp_path):
+def test_a_mistyped_root_was_another_dataset(name, tmp_path, refused):
     """The stand-in took the place of any folder that is not there."""
-    with pytest.raises(DataError, match=r"nowhere (does not exist|is not there)"):
-        load({"name": name, "root": str(tmp_path / "nowhere")})
+    refused(r"nowhere (does not exist|is not there)", load, {"name": name, "root": str(tmp_path / "nowhere")})
 
 
-def test_a_moving_receiver_s_folder_is_read(rfid_folder):
+def test_a_moving_receiver_s_folder_is_read(rfid_folder, refused):
     """The layout of the paper's room: rx_pos.csv, spectra as arrays, the gateway transmits."""
     (rfid_folder / "tx_pos.csv").rename(rfid_folder / "rx_pos.csv")
     images = load_rfid_images(rfid_folder)
@@ -113,8 +111,7 @@ def test_a_moving_receiver_s_folder_is_read(rfid_folder):
     np.testing.assert_allclose(data.rx_position + data.site.origin, [[0.1 * i, 0.2, 1.0] for i in range(6)])
     assert data.batch(np.array([4, 0])).rx.batched
     np.save(rfid_folder / "spectrum" / "00002.npy", 1.5 * images[1])
-    with pytest.raises(DataError, match=r"00002.npy: expected an array of 90 x 360 numbers from 0 to 1"):
-        load_rfid(rfid_folder)
+    refused(r"00002.npy: expected an array of 90 x 360 numbers from 0 to 1", load_rfid, rfid_folder)
 
 
 def load_rfid_images(folder):
@@ -147,7 +144,6 @@ def test_carriers_of_rows_were_mixed_as_repeats(rfid_folder):
 
 
 @pytest.mark.parametrize("text", ["1\n60\n", "1 1 1 1 1 x", "1 1 1 1 1 6e10"])
-def test_carriers_that_are_none_are_refused(rfid_folder, text):
+def test_carriers_that_are_none_are_refused(rfid_folder, text, refused):
     (rfid_folder / "freq.txt").write_text(text)
-    with pytest.raises(DataError, match=r"freq.txt: . words; expected the carrier of each of the 6 rows"):
-        load_rfid(rfid_folder)
+    refused(r"freq.txt: . words; expected the carrier of each of the 6 rows", load_rfid, rfid_folder)

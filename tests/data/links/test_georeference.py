@@ -5,7 +5,6 @@ import pickle
 import numpy as np
 import pytest
 
-from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
 
 
@@ -54,18 +53,13 @@ def test_the_origin_is_the_rounded_median():
     (np.nan, 0, "latitude nan"),
     (0, np.inf, "longitude inf"),
 ])  # fmt: skip
-def test_what_is_not_on_earth_is_refused(latitude, longitude, said):
-    with pytest.raises(DataError, match=said):
-        Georeference(latitude, longitude)
-    with pytest.raises(DataError, match=said):
-        Georeference(0, 0).from_degrees([latitude], [longitude])
-    with pytest.raises(DataError, match=said):
-        Georeference.from_coordinates([latitude], [longitude])
+def test_what_is_not_on_earth_is_refused(latitude, longitude, said, refused):
+    refused(said, Georeference, latitude, longitude)
+    refused(said, Georeference(0, 0).from_degrees, [latitude], [longitude])
+    refused(said, Georeference.from_coordinates, [latitude], [longitude])
 
 
-def test_local_coordinates_that_are_none_are_refused():
+def test_local_coordinates_that_are_none_are_refused(refused):
     for xy in (np.zeros(2), np.zeros((3, 3)), [[np.nan, 0]], [[3e7, 0]]):
-        with pytest.raises(DataError, match="local coordinates"):
-            Georeference(0, 0).to_degrees(np.asarray(xy))
-    with pytest.raises(DataError, match="no places"):
-        Georeference.from_coordinates(np.zeros(0), np.zeros(0))
+        refused("local coordinates", Georeference(0, 0).to_degrees, np.asarray(xy))
+    refused("no places", Georeference.from_coordinates, np.zeros(0), np.zeros(0))

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
+from refusals import refused
 
 from gsparc.evaluation.experiment.cells import Contender, SplitChoice, plan_cells, read_entries
 
@@ -60,8 +61,7 @@ def test_a_method_takes_part_where_what_it_needs_is_there(needed):
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
     assert names("*/gp/*", "*/fast/0.3/0") == ["rfid/random/gp/any/any", "rfid/random/fast/0.3/0"]
-    with pytest.raises(ValueError, match="only: 'rfid/rndom/\\*' matches no cell"):
-        names("rfid/rndom/*")
+    refused("only: 'rfid/rndom/\\*' matches no cell", names, "rfid/rndom/*")
 
 
 @pytest.mark.slow
@@ -88,5 +88,4 @@ def test_one_model_of_a_network_was_fitted_under_four_names():
     ("splits", SplitChoice, {"draw": 3}, r"splits\.x\.draw: no such setting; there are choose, datasets"),
 ])  # fmt: skip
 def test_a_wrong_entry_is_named(group, of, entry, message):
-    with pytest.raises(ValueError, match=message):
-        read_entries(group, of, {"x": entry})
+    refused(message, read_entries, group, of, {"x": entry})

@@ -2,10 +2,10 @@
 
 import shutil
 
-import pytest
 from campaigns import compose
 from hydra import initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
+from refusals import refused
 from releases import real
 
 from gsparc.commands.shared.settings import to_dict
@@ -17,8 +17,7 @@ ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
 def test_a_fetched_set_needs_no_path(monkeypatch, tmp_path, caplog):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     settings = to_dict(compose("experiment=results/newrf", config="compare"))
-    with pytest.raises(ValueError, match="no dataset has a path"):
-        load_every_problem(settings)
+    refused("no dataset has a path", load_every_problem, settings)
     (tmp_path / "gsparc/data/newrf").mkdir(parents=True)
     shutil.copy(real(f"releases/newrf/{ROOM}"), tmp_path / "gsparc/data/newrf")
     GlobalHydra.instance().clear()

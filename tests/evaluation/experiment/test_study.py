@@ -3,6 +3,7 @@
 import pytest
 from invented import divide, invent
 from omegaconf import OmegaConf
+from refusals import refused
 
 from gsparc.evaluation.experiment.runner import Job, run_jobs
 from gsparc.evaluation.experiment.study import DataChanges, average_rounds, plan_rounds
@@ -59,8 +60,7 @@ def test_what_cannot_be_is_left_out_and_every_round_has_another_seed_once(tmp_pa
     caplog.clear()
     run(tmp_path, ["mean", "gp"], rounds=2, split=divide(48, 2))
     assert "4 cells, 4 already done" in caplog.text
-    with pytest.raises(ValueError, match="not possible"):
-        run(tmp_path, ["impossible"])
+    refused("not possible", run, tmp_path, ["impossible"])
 
 
 @pytest.mark.slow
@@ -81,5 +81,4 @@ def test_more_measurements_are_better_and_are_counted(tmp_path):
     assert list(rows.rows) == [36, 18, 9]
     values = list(rows.value)
     assert values == sorted(values, reverse=True) and values[0] > values[-1] + 1
-    with pytest.raises(ValueError, match="keep="):
-        DataChanges("", keep=[0.0])
+    refused("keep=", DataChanges, "", keep=[0.0])

@@ -70,6 +70,7 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     np.testing.assert_allclose(model.unknown_shares(batch.tx, batch.rx).numpy(), variance, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
     method, data, fold = trained
     said, batch = method.predict(Query(*_ends(data, fold.test))), data.batch(fold.test)

@@ -140,8 +140,3 @@ def test_powers_were_flat_nearer_than_the_nearest_row():
     law = fit_law(every.subset(np.flatnonzero(apart > np.quantile(apart, 0.3))), STILL)
     near = every.subset(np.flatnonzero((apart > apart.max() / 20) & (apart < np.quantile(apart, 0.1))))
     assert np.abs(near.decibels - law.mean(torch.from_numpy(near.places)).numpy()).mean() < 2.0
-
-
-def test_other_kinds_are_refused(campaign, folds, tmp_path):
-    with pytest.raises(ValueError, match="distance_law: needs received powers"):
-        DistanceLaw().fit(campaign("csi", 20), folds(20).folds[0], FitContext(tmp_path))

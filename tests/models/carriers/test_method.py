@@ -82,6 +82,7 @@ def test_what_some_carriers_said_of_a_place_tells_the_others(room, fitted):
     assert error(half, room, rest) < error(fitted, room, rest)
 
 
+@pytest.mark.slow
 def test_a_carrier_that_was_never_measured_is_predicted(room):
     test = np.flatnonzero(room.station == 2)
     method = fit(wrap_per_station(Gsparc(), room), room, test)

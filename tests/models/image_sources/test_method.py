@@ -9,6 +9,7 @@ import pytest
 import torch
 from gains import fitted
 from invented import invent
+from refusals import refused
 from rooms import WAVELENGTH, nmse, shoebox
 from scenes import error
 from shoeboxes import as_arrays
@@ -185,14 +186,11 @@ def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
 def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):
     """Of zero channels the library's sequences about a matrix that is not positive definite came."""
     fold = Fold(np.arange(30), np.arange(30, 36), np.arange(36, 48))
-    with pytest.raises(ValueError, match="needs complex channels"):
-        ImageSourceGP().fit(invent("spectrum"), fold, FitContext(tmp_path))
-    with pytest.raises(ValueError, match="not fitted"):
-        ImageSourceGP().state()
+    refused("needs complex channels", ImageSourceGP().fit, invent("spectrum"), fold, FitContext(tmp_path))
+    refused("not fitted", ImageSourceGP().state)
     _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
     silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
-    with pytest.raises(ValueError, match="every training channel is zero"):
-        fitted(silent, fold, tmp_path)
+    refused("every training channel is zero", fitted, silent, fold, tmp_path)
 
 
 @pytest.mark.slow
@@ -245,5 +243,4 @@ def test_sources_are_found_through_unknown_offsets_that_are_estimated(offsets, t
 
 
 def test_unknown_kind_of_offset_is_refused():
-    with pytest.raises(ValueError, match="phase_timing"):
-        ImageSourceGP(offsets="both")
+    refused("phase_timing", ImageSourceGP, offsets="both")

@@ -65,14 +65,10 @@ def four(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_four_antennas_at_a_hundred_places(four, tmp_path):
+def test_four_antennas_at_a_hundred_places(four):
     method, data, fold = four
     missed = error(method, data, fold.test)
-    torch.save(method.state(), tmp_path / "state.pt")
-    again = ImageSourceGP()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    assert missed < 0.02 and error(again, data, fold.test) == pytest.approx(missed, rel=1e-3)
-    assert (method.factors == 1).all()
+    assert missed < 0.02 and (method.factors == 1).all()
     true = [CENTRE]
     for _, (axis, wall) in WALLS[1:]:
         image = CENTRE.copy()
@@ -82,6 +78,7 @@ def test_four_antennas_at_a_hundred_places(four, tmp_path):
     assert np.linalg.norm(np.array(true)[:, None] - found, axis=-1).min(1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_paths_of_each_antenna_sum_to_the_prediction(four):
     method, data, fold = four
     batch = data.batch(fold.test[:5])

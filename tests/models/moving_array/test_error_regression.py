@@ -5,7 +5,7 @@ import pytest
 import torch
 from distances import far
 
-from gsparc.models.moving_array.error_regression import ImageErrors, _posterior_variance, fit_errors
+from gsparc.models.moving_array.error_regression import _posterior_variance, fit_errors
 from gsparc.processes.kernel import Kernel
 
 KERNEL, REACH, PRIOR = Kernel.from_length(1.0, 0.1), 2.0, 0.05
@@ -87,12 +87,3 @@ def test_a_column_that_never_changed_is_not_extrapolated():
     np.testing.assert_allclose(
         said_of(model, places, places, other), said_of(model, places, places, constant)
     )
-
-
-def test_few_rows_and_a_restored_model_predict_the_same():
-    places = np.eye(3)
-    model = fit(places, np.array([0.1, 0.2, 0.3]), features(3))
-    again = ImageErrors.read(model.state())
-    one, two = (said_of(d, places, places + 0.1, features(3)) for d in (model, again))
-    np.testing.assert_array_equal(one, two)
-    assert (one > 0).all() and np.isfinite(one).all()

@@ -11,6 +11,7 @@ import pytest
 import torch
 from doors import knock
 from omegaconf import OmegaConf
+from refusals import refused
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
@@ -107,8 +108,7 @@ def test_a_prior_in_decibels_is_a_setting_of_the_term(trees):
     known = {"rx": data["rx"], "tx": STILL, "rssi": data["rssi"], "model": "powers"}
     told = gsparc.fit(**known, terms=[trees(GROVE, (-0.4, 1e-4))]).method.member.trend.more[0]
     assert told.weight_prior[0] == -0.4 and told.weight_prior[1] * told.unit == pytest.approx(1e-4)
-    with pytest.raises(ValueError, match=r"Trees\.prior_db=3: say \[mean, deviation\]"):
-        gsparc.fit(**known, terms=[trees(GROVE, 3)])
+    refused(r"Trees\.prior_db=3: say \[mean, deviation\]", gsparc.fit, **known, terms=[trees(GROVE, 3)])
 
 
 def test_a_term_behind_which_all_rows_lie_was_surely_nothing():
@@ -142,8 +142,7 @@ def test_a_term_of_a_notebook_was_stored_without_a_word(trees, monkeypatch, capl
     monkeypatch.setattr(trees, "__module__", "__main__")
     assert own_terms.to_terms(trees(GROVE))
     assert "Trees is of a notebook or script" in caplog.text
-    with pytest.raises(ValueError, match=r"'__main__\.Gone' is of a notebook or script: define it here"):
-        stored.find_kind("__main__.Gone")
+    refused(r"'__main__\.Gone' is of a notebook or script: define it here", stored.find_kind, "__main__.Gone")
 
 
 def test_a_term_that_cannot_be_imported_was_an_empty_error():

@@ -10,10 +10,8 @@ from cities import city, deaf, fold, folder
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import baselines_for
-from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.peers.fire import Fire
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
@@ -116,27 +114,6 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
         assert error[sure].median() < factor * error[~sure].median()
 
 
-SEARCH = SearchSettings(rounds=2, picks=4, final=2)
-MAKES = {
-    "ridge": Ridge, "of all antennas": lambda: Ridge("all"), "fire": lambda: Fire(max_steps=5),
-    "uplink": lambda: UplinkField(SEARCH, teachers=60),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", MAKES)
-def test_methods_answer_and_keep(name, tmp_path) -> None:
-    make, data = MAKES[name], city("all" if name == "uplink" else 0)
-    method = make()
-    method.fit(data, fold(), FitContext(tmp_path))
-    batch = data.batch(fold().test)
-    before = method.predict(batch).mean
-    assert before.shape == batch.target.shape
-    checkpoint.save(tmp_path / "m.ckpt", method)
-    again, _ = loading.load(tmp_path / "m.ckpt")
-    assert torch.allclose(again.predict(batch).mean, before)
-
-
 @pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
 def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     """A Gram matrix of zeros ended in the library's sequences about singular matrices."""
@@ -149,15 +126,6 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     predicted = method.predict(replace(data.batch(fold().test), uplink=heard)).mean
     assert torch.isfinite(predicted).all() and predicted[:, 1:].abs().min() > 0
     assert inputs == "all" or (predicted[:, 0] == 0).all()
-
-
-def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
-    method, data = fitted
-    with pytest.raises(ValueError, match="has none"):
-        Ridge().fit(deaf(data), fold(), FitContext())
-    batch = data.batch(fold().test[:2])
-    with pytest.raises(ValueError, match="uplink= is needed"):
-        method.predict(replace(batch, uplink=None))
 
 
 def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:

@@ -9,6 +9,7 @@ import pytest
 import torch
 from closed import fitted_to
 from known_fields import known_field
+from refusals import refused
 from releases import real
 from scenes import fold_of
 
@@ -286,13 +287,10 @@ def test_what_it_refuses():
     data = town()
     with pytest.raises(ValueError, match="several stations"):
         fitted_to(JointPowerField(), replace(data, site=replace(data.site, stations=None)), np.arange(4))
-    with pytest.raises(ValueError, match="at least one row"):
-        fitted_to(JointPowerField(), data, np.arange(0))
-    with pytest.raises(ValueError, match="stations=each"):
-        choose(data, Gsparc(init=InitSettings(name="scene", file="walls.yaml")))
+    refused("at least one row", fitted_to, JointPowerField(), data, np.arange(0))
+    refused("stations=each", choose, data, Gsparc(init=InitSettings(name="scene", file="walls.yaml")))
     own, terms = prior_of(data)
-    with pytest.raises(ValueError, match="not fitted yet"):
-        known_field(data.site, POSTS, own, terms).left_out()
+    refused("not fitted yet", known_field(data.site, POSTS, own, terms).left_out)
 
 
 def test_gsparc_learns_stations_together(tmp_path):
