@@ -79,7 +79,8 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     if np.diff(different).max() > APART_DB and min(below, len(values) - below) >= few:
         parts = [f"{part[0]:.4g} to {part[-1]:.4g}" for part in np.split(np.sort(values), [below])]
         return [f"levels of {parts[0]}, {below}, and of {parts[1]}, {len(values) - below}: in two units?"]
-    if low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
+    whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
+    if low >= 0 and (high <= 1 or high > HIGHEST_DBM or whole):
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
         return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
     return []

@@ -72,8 +72,7 @@ class Campaign(DataModule):
             careful = isinstance(note, Caution)
             if careful or note not in self.told:
                 log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
-        hints = [Severe(f"units? {hint}") for hint in unit_warnings(reading.data)]
-        for warning in [*_implausible(reading.data, reading.file_row), *hints]:
+        for warning in find_implausible(reading.data, reading.file_row):
             log.warning("%s: %s", self.file, warning)
         return reading.data
 
@@ -81,15 +80,16 @@ class Campaign(DataModule):
 MOST_LINKS = 1_000_000  # of places and stations; all are held at once
 
 
-def _implausible(data: Measurements, file_row: np.ndarray | None) -> list[str]:
-    """What `gsparc check` warns of, where that takes seconds."""
+def find_implausible(data: Measurements, file_row: np.ndarray | None) -> list[str]:
+    """Return what `gsparc check` warns of, where that takes seconds; `file_row` (S,) as of a `Reading`."""
+    hints = [Severe(f"units? {hint}") for hint in unit_warnings(data)]
     stations = 1 if data.site.stations is None else len(data.site.stations)
     places = len(data) if data.place is None else len(np.unique(data.place))
     if places * stations > MOST_LINKS:
-        return ["too many links to be looked at for implausible levels here; gsparc check does"]
+        return [*hints, "too many links to be looked at for implausible levels here; gsparc check does"]
     levels = link_levels(data, file_row)
-    told = list[str](map(Severe, convention_warnings(data)))
-    return told if levels is None else [*told, *sanity_warnings(levels, find_level_steps(levels))]
+    hints += map(Severe, convention_warnings(data))
+    return [*hints, *([] if levels is None else sanity_warnings(levels, find_level_steps(levels)))]
 
 
 class StandIn(Protocol):
