@@ -24,7 +24,7 @@ PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by 
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS, FEW_APART = 3, 0.02
 NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
-HIGHEST_DBM = 60.0  # a kilowatt received
+HIGHEST_DBM, LOWEST_DBM = 60.0, -174.0  # a kilowatt received; thermal noise in a hertz
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
 NEIGHBOURS = 5  # rows on each side
@@ -71,6 +71,11 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         but = f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB," if others else ""
         return [f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"]
     low, high = float(values.min()), float(values.max())
+    if np.median(values) < LOWEST_DBM:
+        said = (
+            f"levels of {low:.4g} to {high:.4g}, most below the thermal noise of a hertz, {LOWEST_DBM:g} dBm"
+        )
+        return [f"{said}: is it the column of levels, in decibels?"]
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]

@@ -325,3 +325,23 @@ def test_carriers_that_no_link_has_are_named(factor):
     assert not unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9)}))
     (said,) = unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9 * factor)}))
     assert said.startswith("carriers of ") and said.endswith("MHz: another unit?")
+
+
+@pytest.mark.parametrize("factor, says", [(1e-2, "differ by"), (3.28, "thermal noise of a hertz")])
+def test_all_levels_in_another_unit_were_good(factor, says):
+    """-80 dBm as -.8, or as -262."""
+    place, level = room()
+    data = from_arrays({"rx_position": place, "tx_position": np.zeros(3), "rssi_db": (level - 40) * factor})
+    found = unit_warnings(data) + plausibility.level_warnings((level - 40) * factor)
+    assert any(says in line for line in found), found
+
+
+def test_rows_of_which_some_have_other_degrees_were_good():
+    """Half of the latitudes divided by ten: a box of 4,800 km, whose degrees nobody asked."""
+    rng = np.random.default_rng(0)
+    latitude, longitude = 48 + rng.uniform(0, 0.02, 80), 11 + rng.uniform(0, 0.02, 80)
+    arrays = {"longitude": longitude, "rssi_db": rng.normal(-80, 5, 80), "rx_height": np.array(1.5)}
+    assert not unit_warnings(from_arrays({**arrays, "latitude": latitude}))
+    half = np.where(np.arange(80) % 2, latitude, latitude / 10)
+    (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
+    assert said.startswith("two groups of places ") and "km apart" in said
