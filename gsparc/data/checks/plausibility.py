@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.data.checks.link_levels import UNNAMED, LinkLevels
+from gsparc.data.checks.misplaced import misplaced_warnings
 from gsparc.data.errors import Severe, list_first
 
 NAMED = 5  # wild rows that a station may have, however few its rows
@@ -43,7 +44,8 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    severe = map(Severe, [*level_warnings(levels.level_db), *floor_warnings(levels)])
+    told = [*level_warnings(levels.level_db), *floor_warnings(levels), *misplaced_warnings(levels)]
+    severe = map(Severe, told)
     warnings = [*severe, *twin_warnings(levels), *still_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
