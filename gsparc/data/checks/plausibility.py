@@ -24,6 +24,7 @@ SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS, FEW_APART = 3, 0.02
+DBW_DB, MODE_DB = 30.0, 5.0  # between dBW and dBm; noise of two rows, about either
 NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
 HIGHEST_DBM, LOWEST_DBM = 60.0, -174.0  # a kilowatt received; thermal noise in a hertz
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
@@ -44,8 +45,8 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    told = [*level_warnings(levels.level_db), *floor_warnings(levels), *misplaced_warnings(levels)]
-    severe = map(Severe, told)
+    told = [*level_warnings(levels.level_db), *two_unit_warnings(levels), *floor_warnings(levels)]
+    severe = map(Severe, [*told, *misplaced_warnings(levels)])
     warnings = [*severe, *twin_warnings(levels), *still_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
@@ -91,6 +92,23 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
         return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
     return []
+
+
+def two_unit_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of levels that differ from those of the nearest row by what dBW and dBm do, or hardly at all."""
+    apart = [np.zeros(0)]
+    for _, used in levels.heard():
+        place, level = levels.position[used], levels.level_db[used]
+        if len(used) > NEIGHBOURS:
+            apart.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
+    rows = np.concatenate(apart)
+    far, between = ((np.abs(rows - middle) < MODE_DB).sum() for middle in (DBW_DB, DBW_DB / 2))
+    if far <= max(REPEATS, FEW_APART * len(rows), between):
+        return []
+    said = (
+        f"{far} of {len(rows)} levels are about {DBW_DB:g} dB from that of the nearest row, {between} about"
+    )
+    return [f"{said} {DBW_DB / 2:g} dB: dBW and dBm in one column?"]
 
 
 def floor_warnings(levels: LinkLevels) -> list[str]:

@@ -1,7 +1,10 @@
 """Warnings about readable measurements: each is given where it should be, and nowhere else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from level_fields import flight
 from releases import real
 from scipy.spatial.distance import cdist
 
@@ -345,3 +348,14 @@ def test_rows_of_which_some_have_other_degrees_were_good():
     half = np.where(np.arange(80) % 2, latitude, latitude / 10)
     (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
     assert said.startswith("two groups of places ") and "km apart" in said
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1])
+def test_rows_in_dbw_beside_others_in_dbm_were_good(share):
+    """Levels spread over 60 dB: no gap between two units, but none between near rows is as wide."""
+    rng, arrays = np.random.default_rng(0), flight(0)
+    levels = link_levels(from_arrays(arrays))
+    assert not plausibility.two_unit_warnings(levels)
+    half = rng.random(len(levels.level_db)) < share
+    (said,) = plausibility.two_unit_warnings(replace(levels, level_db=levels.level_db - 30 * half))
+    assert said.endswith("dBW and dBm in one column?")
