@@ -174,13 +174,9 @@ class PerStation(Method):
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = combine_stations([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
-        assert data.site.stations is not None
-        lost = [t for t in range(len(data.site.stations)) if t not in numbers and UNHEARD not in numbers]
-        if lost:
-            who = list_first([self._station_name(number) for number in lost])
-            notes.append(
-                Caution(f"fewer than {LEAST_ROWS} rows to learn from, answers are NaN: station {who}")
-            )
+        lost = [t for t in range(len(data.site.stations or ())) if not {t, UNHEARD} & {*numbers}]
+        if who := list_first([self._station_name(number) for number in lost]):
+            notes.append(Caution(f"answers are NaN, of fewer than {LEAST_ROWS} rows: station {who}"))
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)

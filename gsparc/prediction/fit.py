@@ -79,7 +79,7 @@ def fit(
         raise DataError(said) from None
     none = np.zeros(0, np.int64)
     data, _ = order_rows(set_freedom(reading.data, align), Fold(none, none, none))
-    for note in [*reading.notes, *find_implausible(reading.data, reading.file_row)]:
+    for note in [*reading.notes, *find_implausible(reading.data, reading.file_row)[0]]:
         log.warning("%s", note)
     kind, own = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
     for name in own.keys() - accepted_arguments(kind):

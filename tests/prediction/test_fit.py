@@ -187,4 +187,4 @@ def test_nan_of_a_station_with_too_few_rows_left_without_a_word(caplog):
     ends = np.array([END, END + 1])
     found = gsparc.fit(rx=PLACES, station_position=ends, rssi=powers, model="gp")
     assert np.isnan(found.rssi(rx=PLACES[0])).tolist() == [False, True]
-    assert "answers are NaN: station 1" in caplog.text
+    assert "answers are NaN, of fewer than 4 rows: station 1" in caplog.text

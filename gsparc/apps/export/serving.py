@@ -29,7 +29,6 @@ from gsparc.prediction.query import read_places
 
 RAW = "application/octet-stream"
 PLACE, BYTES, MORE = 12, 64, 8192  # bytes of a place, raw and at most as JSON, and of what is around places
-ENCODING = b"content-encoding"  # a packed raw body of a length that fits would be read as places
 PIECE = 8192  # numbers that are written at once: a millisecond, in which nobody else is answered
 QUEUE = 2048  # connections that wait in the kernel
 KEEP_S, STOP_S = 5, 10  # that a connection without a request stays, that requests have when the server stops
@@ -285,10 +284,7 @@ def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
             fault = "Content-Length beside Transfer-Encoding"
         elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
             fault, status = "Authorization: Bearer TOKEN is needed", 401
-        elif {b"identity"} < {
-            b"identity",
-            *(v.lower() for k, v in scope.get("headers", ()) if k == ENCODING),
-        }:
+        elif any(k == b"content-encoding" and v.lower() != b"identity" for k, v in scope.get("headers", ())):
             fault, status = "Content-Encoding: bodies are read as they come; leave it out", 415
         elif scope.get("query_string"):
             fault, status = "nothing is read after ? in the address; leave it out", 422

@@ -24,7 +24,6 @@ SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS, FEW_APART = 3, 0.02
-DBW_DB, MODE_DB = 30.0, 5.0  # between dBW and dBm; noise of two rows, about either
 NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
 HIGHEST_DBM, LOWEST_DBM = 60.0, -174.0  # a kilowatt received; thermal noise in a hertz
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
@@ -74,19 +73,11 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         but = f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB," if others else ""
         return [f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"]
     low, high = float(values.min()), float(values.max())
-    if np.median(values) < LOWEST_DBM:
-        said = (
-            f"levels of {low:.4g} to {high:.4g}, most below the thermal noise of a hertz, {LOWEST_DBM:g} dBm"
-        )
-        return [f"{said}: is it the column of levels, in decibels?"]
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
-    below = int(np.searchsorted(np.sort(values), different[np.diff(different).argmax()], "right"))
-    few = max(REPEATS, FEW_APART * len(values))
-    if np.diff(different).max() > APART_DB and min(below, len(values) - below) >= few:
-        parts = [f"{part[0]:.4g} to {part[-1]:.4g}" for part in np.split(np.sort(values), [below])]
-        return [f"levels of {parts[0]}, {below}, and of {parts[1]}, {len(values) - below}: in two units?"]
+    if np.median(values) < LOWEST_DBM:
+        return [f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?"]
     whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
     if low >= 0 and (high <= 1 or high > HIGHEST_DBM or whole):
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
@@ -95,20 +86,20 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
 
 
 def two_unit_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of levels that differ from those of the nearest row by what dBW and dBm do, or hardly at all."""
+    """Warn of some levels in another unit, as dBW beside dBm: near rows agree, or are far apart."""
     apart = [np.zeros(0)]
     for _, used in levels.heard():
         place, level = levels.position[used], levels.level_db[used]
         if len(used) > NEIGHBOURS:
             apart.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
     rows = np.concatenate(apart)
-    far, between = ((np.abs(rows - middle) < MODE_DB).sum() for middle in (DBW_DB, DBW_DB / 2))
+    far, between = int((rows > APART_DB).sum()), int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum())
     if far <= max(REPEATS, FEW_APART * len(rows), between):
         return []
     said = (
-        f"{far} of {len(rows)} levels are about {DBW_DB:g} dB from that of the nearest row, {between} about"
+        f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row, {between} over"
     )
-    return [f"{said} {DBW_DB / 2:g} dB: dBW and dBm in one column?"]
+    return [f"{said} {APART_DB / 2:g}: in two units?"]
 
 
 def floor_warnings(levels: LinkLevels) -> list[str]:

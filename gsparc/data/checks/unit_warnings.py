@@ -24,9 +24,7 @@ def unit_warnings(data: Measurements) -> list[str]:
     if not np.ptp(data.moving, axis=0).any():
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is not None:  # degrees became metres: no unit to mistake
-        hints = _name_groups(
-            data.moving[:, :2], "zeros or digits too many in some, or two sites? look at them"
-        )
+        hints = _group_hints(data.moving)
     else:
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + site.origin
@@ -70,8 +68,7 @@ def _position_hints(positions: np.ndarray) -> list[str]:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
         how = "then give them as latitude and longitude (columns of a table: dataset.columns.lat=HEAD, .lon)"
         return [f"positions near {near} within {across:.2g}: degrees? {how}"]
-    zones = "zones of a projection, or two sites? give degrees, or a file for each"
-    if groups := _name_groups(positions[:, :2], zones):
+    if groups := _group_hints(positions):
         return groups
     # Heights 100 m apart, or a width of 10 km, are rarer than wrong units.
     if height > 100 or width > 1e4:
@@ -90,10 +87,11 @@ def _position_hints(positions: np.ndarray) -> list[str]:
     return []
 
 
-def _name_groups(places: np.ndarray, advice: str) -> list[str]:
-    """Name two groups of places (n, 2) [m] far apart, and what to do."""
-    groups = find_gap(places)
-    return [] if groups is None else [f"two groups of places {groups[1] / 1e3:.4g} km apart: {advice}"]
+def _group_hints(positions: np.ndarray) -> list[str]:
+    """A warning of two groups of positions (n, 3) far apart."""
+    said = "lost digits, zones of a projection (give degrees), or two sites (a file for each)?"
+    groups = find_gap(positions[:, :2])
+    return [] if groups is None else [f"two groups of places {groups[1] / 1e3:.4g} km apart: {said}"]
 
 
 def _find_other_unit(places: np.ndarray) -> str:

@@ -311,14 +311,16 @@ def test_places_of_stations_beside_rows_in_kilometres_are_named(axes, who):
     assert any(f"of {who} reach over" in line and "in kilometres?" in line for line in found), found
 
 
-@pytest.mark.parametrize("other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10)])
+@pytest.mark.parametrize(
+    "other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10), lambda v: v - 30]
+)
 @pytest.mark.parametrize("each", [2, 10])
 def test_some_levels_in_another_unit_are_named(other, each):
-    _, level, _ = walk(0)
-    assert not plausibility.level_warnings(level)
+    place, level, _ = walk(0)
+    assert not plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
     level[::each] = other(level[::each])
-    (said,) = plausibility.level_warnings(level)
-    assert said.startswith("levels of ") and said.endswith("in two units?"), said
+    (said,) = plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
+    assert said.endswith("in two units?"), said
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
@@ -358,4 +360,4 @@ def test_rows_in_dbw_beside_others_in_dbm_were_good(share):
     assert not plausibility.two_unit_warnings(levels)
     half = rng.random(len(levels.level_db)) < share
     (said,) = plausibility.two_unit_warnings(replace(levels, level_db=levels.level_db - 30 * half))
-    assert said.endswith("dBW and dBm in one column?")
+    assert said.endswith("in two units?")
