@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -36,12 +37,9 @@ def check(
     """
     # Here: they bring torch, which --help does not need.
     from gsparc.data.checks.array_layout import carrier_warnings, layout_warnings
-    from gsparc.data.checks.conventions import convention_warnings
     from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.link_levels import link_levels
     from gsparc.data.checks.outliers import outlier_warnings
-    from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
-    from gsparc.data.checks.unit_warnings import unit_warnings
+    from gsparc.data.datasets.campaign import find_implausible
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
 
@@ -52,13 +50,9 @@ def check(
         for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:
             _line(console, line)
         return False
-    levels = link_levels(reading.data, reading.file_row)
-    steps = [] if levels is None else find_level_steps(levels)
-    warnings = [f"units? {hint}" for hint in unit_warnings(reading.data)] + outlier_warnings(reading.data)
-    warnings += [note for note in reading.notes if isinstance(note, Caution)]
-    warnings += convention_warnings(reading.data)
-    warnings += layout_warnings(reading.data) + carrier_warnings(reading.data)
-    warnings += [] if levels is None else sanity_warnings(levels, steps)
+    implausible, levels, steps = find_implausible(reading.data, reading.file_row, most=math.inf)
+    warnings = outlier_warnings(reading.data) + [note for note in reading.notes if isinstance(note, Caution)]
+    warnings += layout_warnings(reading.data) + carrier_warnings(reading.data) + implausible
     topics = describe(reading.data)
     topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):

@@ -24,6 +24,7 @@ from gsparc.ops import SphereGrid
 
 VERSION = 2  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"
+PARTS = {"format", "version", "config", "method", "target", "site", "state", "extra", "sha256"}
 DEEPEST = 50  # of containers in containers
 MODEL = "model.ckpt"  # of a run's folder
 
@@ -111,7 +112,6 @@ def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     path = Path(path)
     content = _read_content(path)
     _stored_from_content(content, path)  # refuses what is incomplete
-    _refuse_changed(content, path)
     content["extra"] = {**content["extra"], **_to_plain(dict(extra), "extra")}
     _write(path, content)
 
@@ -136,16 +136,7 @@ def read(path: str | Path) -> StoredModel:
             that are NaN or infinite.
     """
     path = Path(path)
-    content = _read_content(path)
-    stored = _stored_from_content(content, path)
-    _refuse_changed(content, path)
-    return stored
-
-
-def _refuse_changed(content: Mapping[str, Any], path: Path) -> None:
-    """Refuse what is not as it was written: an archive's own sums are right of whatever was put in it."""
-    if content.get("sha256", "") not in ("", _content_digest(content)):  # older files have none
-        raise CheckpointError(f"{path}: damaged, or changed by another program; take another copy of it")
+    return _stored_from_content(_read_content(path), path)
 
 
 def _content_digest(content: Mapping[str, Any]) -> str:
@@ -198,10 +189,14 @@ def _read_content(path: Path) -> dict[str, Any]:
             f"{path}: of version {version}, this gsparc reads {VERSION}; train again with it"
         )
     if _exceeds_limits(content):  # what walks over it would not end
-        raise CheckpointError(f"{path}: damaged (a part of it is there many times, or too deep)")
+        raise CheckpointError(f"{path}: damaged (a part of it is there many times, too deep, or not there)")
+    # An archive's own sums are right of whatever was put in it. Older files have no sum of their own: where
+    # its name is damaged there is a part too many.
+    if content.keys() - PARTS or ("sha256" in content and content["sha256"] != _content_digest(content)):
+        raise CheckpointError(f"{path}: damaged, or changed by another program; take another copy of it")
     for part in ("site", "state"):
         where = find_non_finite(_drop_unknown_places(content.get(part)), part)
-        if where is not None:  # its checksum is right: it was written like this
+        if where is not None:  # its sum is right: it was written like this
             raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
     return content
 
@@ -254,12 +249,13 @@ def _tensors_to_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _exceeds_limits(content: Any) -> bool:
-    """Whether a container is in it twice or too deep, or a tensor has more numbers than are stored."""
+    """Whether a container is in it twice or too deep, or a tensor has not as many numbers as are stored."""
     left, seen = [(content, 0)], set[int]()
     while left:
         value, depth = left.pop()
         if isinstance(value, Tensor):
-            if value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
+            other = value.is_meta or value.is_quantized or value.is_nested
+            if other or value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
                 return True
         elif isinstance(value, (Mapping, list, tuple)) and value:
             if id(value) in seen or depth > DEEPEST:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.errors import list_first
+from gsparc.data.errors import Caution, list_first
 from gsparc.data.executor import run_all
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -174,6 +174,9 @@ class PerStation(Method):
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = combine_stations([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
+        lost = [t for t in range(len(data.site.stations or ())) if not {t, UNHEARD} & {*numbers}]
+        if who := list_first([self._station_name(number) for number in lost]):
+            notes.append(Caution(f"answers are NaN, of fewer than {LEAST_ROWS} rows: station {who}"))
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.checks.coherence import set_freedom
+from gsparc.data.datasets.campaign import find_implausible
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.own import interpret
@@ -78,7 +79,7 @@ def fit(
         raise DataError(said) from None
     none = np.zeros(0, np.int64)
     data, _ = order_rows(set_freedom(reading.data, align), Fold(none, none, none))
-    for note in reading.notes:
+    for note in [*reading.notes, *find_implausible(reading.data, reading.file_row)[0]]:
         log.warning("%s", note)
     kind, own = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
     for name in own.keys() - accepted_arguments(kind):

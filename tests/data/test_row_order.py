@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pytest
+from layouts import KINDS, POSTS, rows_of
 
 import gsparc
 from gsparc.data.checks.describe import describe
@@ -14,45 +15,10 @@ from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import group_channels
 
 NONE = np.zeros(0, np.int64)
-POSTS = np.array([[20.0, 3, 6], [-5, 30, 6], [40, 40, 9]])
-
-
-def rows_of(kind: str) -> dict[str, np.ndarray]:
-    """Arrays of 60 rows of a kind and layout; those named `_` belong to no row."""
-    rng = np.random.default_rng(3)
-    places = np.cumsum(rng.normal(size=(60, 3)), axis=0)
-    waves = rng.normal(size=(60, 2, 4)) + 1j * rng.normal(size=(60, 2, 4))
-    levels = np.round(
-        -60 - 0.5 * np.linalg.norm(places[:, None] - POSTS, axis=2) + rng.normal(size=(60, 3)), 1
-    )
-    one = {"rx_position": places, "_tx_position": POSTS[0]}
-    station = rng.permutation(np.arange(60) % 3)
-    return {
-        "powers": {**one, "rssi_db": levels[:, 0]},
-        "wide": {"rx_position": places, "_station_position": POSTS, "rssi_db": levels},
-        "long": {"rx_position": places, "_station_position": POSTS, "station": station,
-                 "rssi_db": levels[np.arange(60), station]},
-        "both": {"rx_position": places, "tx_position": places[::-1] + 9, "rssi_db": levels[:, 0]},
-        "channels": {**one, "csi": waves, "_frequency_hz": 5e9 + 1e6 * np.arange(4)},
-        "runs": {**one, "csi": waves, "_frequency_hz": 5e9 + 1e6 * np.arange(4), "run": station},
-        "the strongest": {"rx_position": places, "_station_position": POSTS,
-                          "rssi_db": np.where(levels < np.sort(levels, 1)[:, 1:2], np.nan, levels)},
-        "stations' channels": {"rx_position": places, "_station_position": POSTS,
-                               "csi": rng.normal(size=(60, 3, 2, 4)) + 0j,
-                               "_frequency_hz": 5e9 + np.arange(4)},
-        "spectra": {"_rx_position": POSTS[0], "tx_position": places,
-                    "spectrum": rng.uniform(size=(60, 12, 24))},
-    }[kind]  # fmt: skip
 
 
 def measurements(arrays: dict[str, np.ndarray], order: np.ndarray):
     return from_arrays({name.lstrip("_"): a if name[0] == "_" else a[order] for name, a in arrays.items()})
-
-
-KINDS = (
-    *("powers", "wide", "long", "the strongest", "both"),
-    *("channels", "runs", "stations' channels", "spectra"),
-)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -87,6 +87,12 @@ def test_channels_and_bands():
     assert np.isnan(band_hz(np.array([3000.0, 20e3, 0.003]))).all()  # bands by the thousand were believed
 
 
+def test_channels_by_the_thousand_were_carriers_of_13_ghz():
+    """1,300,000 is a channel number between the bands of NR."""
+    assert np.isnan(earfcn_hz(np.array([1300e3, 900e3, 81e3 + 500]))).all()
+    np.testing.assert_allclose(earfcn_hz(np.array([2079167.0])), [28e9], rtol=1e-3)
+
+
 def test_slots_of_neighbours_become_rows(tmp_path):
     """`Serving` and `N1` were taken for stations."""
     one = network(0)

@@ -164,3 +164,26 @@ def test_the_mask_of_an_array_was_thrown_away():
     one = gsparc.fit(rx=PLACES, tx=END, rssi=masked, model="gp")
     other = gsparc.fit(rx=PLACES[kept], tx=END, rssi=POWERS[kept], model="gp")
     assert np.allclose(one.rssi(rx=PLACES[:5]), other.rssi(rx=PLACES[:5]), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "rssi, says",
+    [
+        (np.full(60, -60.0), "all levels are -60 dB: is it the column of levels"),
+        (-np.round(POWERS), "is below 0: losses"),
+        (POWERS, "if these are kilometres"),
+    ],
+)
+def test_arrays_were_not_asked_what_files_are(rssi, says, caplog):
+    """`gsparc.fit` answered -60 +- 3e-9 dB, and losses as levels, without a word; runs of files say so."""
+    places = PLACES / (1e4 if "kilometres" in says else 1)
+    gsparc.fit(rx=places, tx=END / (1e4 if "kilometres" in says else 1), rssi=rssi, model="distance_law")
+    assert says in caplog.text
+
+
+def test_nan_of_a_station_with_too_few_rows_left_without_a_word(caplog):
+    powers = np.stack([POWERS, np.where(np.arange(60) == 3, POWERS, np.nan)], 1)
+    ends = np.array([END, END + 1])
+    found = gsparc.fit(rx=PLACES, station_position=ends, rssi=powers, model="gp")
+    assert np.isnan(found.rssi(rx=PLACES[0])).tolist() == [False, True]
+    assert "answers are NaN, of fewer than 4 rows: station 1" in caplog.text

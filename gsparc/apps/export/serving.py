@@ -284,6 +284,8 @@ def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
             fault = "Content-Length beside Transfer-Encoding"
         elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
             fault, status = "Authorization: Bearer TOKEN is needed", 401
+        elif any(k == b"content-encoding" and v.lower() != b"identity" for k, v in scope.get("headers", ())):
+            fault, status = "Content-Encoding: bodies are read as they come; leave it out", 415
         elif scope.get("query_string"):
             fault, status = "nothing is read after ? in the address; leave it out", 422
         refused = JSONResponse({"detail": fault}, status, {"connection": "close"})

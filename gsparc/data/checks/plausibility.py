@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.data.checks.link_levels import UNNAMED, LinkLevels
+from gsparc.data.checks.misplaced import misplaced_warnings
 from gsparc.data.errors import Severe, list_first
 
 NAMED = 5  # wild rows that a station may have, however few its rows
@@ -24,7 +25,7 @@ PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by 
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS, FEW_APART = 3, 0.02
 NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
-HIGHEST_DBM = 60.0  # a kilowatt received
+HIGHEST_DBM, LOWEST_DBM = 60.0, -174.0  # a kilowatt received; thermal noise in a hertz
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
 NEIGHBOURS = 5  # rows on each side
@@ -43,7 +44,8 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    severe = map(Severe, [*level_warnings(levels.level_db), *floor_warnings(levels)])
+    told = [*level_warnings(levels.level_db), *two_unit_warnings(levels), *floor_warnings(levels)]
+    severe = map(Severe, [*told, *misplaced_warnings(levels)])
     warnings = [*severe, *twin_warnings(levels), *still_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
@@ -74,15 +76,30 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
-    below = int(np.searchsorted(np.sort(values), different[np.diff(different).argmax()], "right"))
-    few = max(REPEATS, FEW_APART * len(values))
-    if np.diff(different).max() > APART_DB and min(below, len(values) - below) >= few:
-        parts = [f"{part[0]:.4g} to {part[-1]:.4g}" for part in np.split(np.sort(values), [below])]
-        return [f"levels of {parts[0]}, {below}, and of {parts[1]}, {len(values) - below}: in two units?"]
-    if low >= 0 and (high <= 1 or high > HIGHEST_DBM or (values % 1 == 0).all()):
+    if np.median(values) < LOWEST_DBM:
+        return [f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?"]
+    whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
+    if low >= 0 and (high <= 1 or high > HIGHEST_DBM or whole):
         said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
         return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
     return []
+
+
+def two_unit_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of some levels in another unit, as dBW beside dBm: near rows agree, or are far apart."""
+    apart = [np.zeros(0)]
+    for _, used in levels.heard():
+        place, level = levels.position[used], levels.level_db[used]
+        if len(used) > NEIGHBOURS:
+            apart.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
+    rows = np.concatenate(apart)
+    far, between = int((rows > APART_DB).sum()), int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum())
+    if far <= max(REPEATS, FEW_APART * len(rows), between):
+        return []
+    said = (
+        f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row, {between} over"
+    )
+    return [f"{said} {APART_DB / 2:g}: in two units?"]
 
 
 def floor_warnings(levels: LinkLevels) -> list[str]:

@@ -13,6 +13,7 @@ LEAST, FEW = 3, 0.02  # places, and their share of all, that tell a unit of thei
 SPOT = 100  # of a box's width, what places in kilometres take among metres
 NEAR = 3  # widths of a box, about it
 DEGREE_M = 111e3
+NARROW_DB = 1.0  # between all levels of a site there is more
 HERTZ = 3e6, 1e12  # of carriers that links are measured at
 
 
@@ -22,7 +23,9 @@ def unit_warnings(data: Measurements) -> list[str]:
     hints = []
     if not np.ptp(data.moving, axis=0).any():
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
-    elif site.georeference is None:  # degrees became metres: no unit to mistake
+    elif site.georeference is not None:  # degrees became metres: no unit to mistake
+        hints = _group_hints(data.moving)
+    else:
         # Both ends first; then the moving one alone, as a static end elsewhere widens the box.
         places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + site.origin
         hints = next(filter(None, map(_position_hints, places)), [])
@@ -48,8 +51,8 @@ def unit_warnings(data: Measurements) -> list[str]:
             hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
-        # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1.
-        if 0 < spread < 0.1:
+        # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1; so are hundredths of decibels.
+        if 0 < spread < NARROW_DB and len(np.unique(data.target)) >= LEAST:
             hints.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
     return hints
 
@@ -65,10 +68,8 @@ def _position_hints(positions: np.ndarray) -> list[str]:
         near = f"({positions[0, 0]:.6g}, {positions[0, 1]:.6g})"
         how = "then give them as latitude and longitude (columns of a table: dataset.columns.lat=HEAD, .lon)"
         return [f"positions near {near} within {across:.2g}: degrees? {how}"]
-    groups = find_gap(positions[:, :2])
-    if groups is not None:
-        said = f"two groups of places {groups[1] / 1e3:.4g} km apart"
-        return [f"{said}: zones of a projection, or two sites? give degrees, or a file for each"]
+    if groups := _group_hints(positions):
+        return groups
     # Heights 100 m apart, or a width of 10 km, are rarer than wrong units.
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
@@ -84,6 +85,13 @@ def _position_hints(positions: np.ndarray) -> list[str]:
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []
+
+
+def _group_hints(positions: np.ndarray) -> list[str]:
+    """A warning of two groups of positions (n, 3) far apart."""
+    said = "lost digits, zones of a projection (give degrees), or two sites (a file for each)?"
+    groups = find_gap(positions[:, :2])
+    return [] if groups is None else [f"two groups of places {groups[1] / 1e3:.4g} km apart: {said}"]
 
 
 def _find_other_unit(places: np.ndarray) -> str:

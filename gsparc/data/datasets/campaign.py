@@ -12,7 +12,8 @@ import numpy as np
 
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.conventions import convention_warnings
-from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.link_levels import LinkLevels, link_levels
 from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
@@ -72,8 +73,7 @@ class Campaign(DataModule):
             careful = isinstance(note, Caution)
             if careful or note not in self.told:
                 log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
-        hints = [Severe(f"units? {hint}") for hint in unit_warnings(reading.data)]
-        for warning in [*_implausible(reading.data, reading.file_row), *hints]:
+        for warning in find_implausible(reading.data, reading.file_row)[0]:
             log.warning("%s: %s", self.file, warning)
         return reading.data
 
@@ -81,15 +81,21 @@ class Campaign(DataModule):
 MOST_LINKS = 1_000_000  # of places and stations; all are held at once
 
 
-def _implausible(data: Measurements, file_row: np.ndarray | None) -> list[str]:
-    """What `gsparc check` warns of, where that takes seconds."""
+def find_implausible(
+    data: Measurements, file_row: np.ndarray | None, most: float = MOST_LINKS
+) -> tuple[list[str], LinkLevels | None, list[tuple[int, LevelStep]]]:
+    """Return warnings of units, conventions and levels, and the levels and their steps, of `most` links."""
+    hints: list[str] = [Severe(f"units? {hint}") for hint in unit_warnings(data)]
     stations = 1 if data.site.stations is None else len(data.site.stations)
     places = len(data) if data.place is None else len(np.unique(data.place))
-    if places * stations > MOST_LINKS:
-        return ["too many links to be looked at for implausible levels here; gsparc check does"]
-    levels = link_levels(data, file_row)
-    told = list[str](map(Severe, convention_warnings(data)))
-    return told if levels is None else [*told, *sanity_warnings(levels, find_level_steps(levels))]
+    if places * stations > most:
+        said = "too many links to be looked at for implausible levels here; gsparc check does"
+        return [*hints, said], None, []
+    hints += map(Severe, convention_warnings(data))
+    if (levels := link_levels(data, file_row)) is None:
+        return hints, None, []
+    steps = find_level_steps(levels)
+    return [*hints, *sanity_warnings(levels, steps)], levels, steps
 
 
 class StandIn(Protocol):

@@ -35,6 +35,8 @@ CELL = re.compile(r"(?i)^\s*[bn]?([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*
 FIRST_NR = (
     100_000  # channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1)
 )
+WIDEST = 2000  # channels of a band of LTE, at most
+NR_MHZ = np.array([[410, 7125], [24250, 71000]])  # where NR has bands (3GPP TS 38.104, 5.1)
 MOST_BAND = 90  # numbers beyond are frequencies [MHz]
 NEAR_BAND = 0.05  # share by which 700, 1800 or 3500 MHz miss the lowest of the band that they name
 MHZ = 1e6
@@ -50,11 +52,13 @@ def earfcn_hz(channel: np.ndarray) -> np.ndarray:
     """Return downlink frequencies [Hz] of LTE or NR channel numbers (n,), NaN of none (TS 36.101, 5.7.3)."""
     lowest, first = BANDS.sort_values("first_earfcn").to_numpy().T
     at = np.searchsorted(first, np.nan_to_num(channel, nan=-1), side="right") - 1
-    lte = np.where(at >= 0, lowest[at] + 0.1 * (channel - first[at]), np.nan)
+    own = channel - first[at]
+    lte = np.where((at >= 0) & (own < WIDEST), lowest[at] + 0.1 * own, np.nan)
     nr = np.where(channel < 600_000, 0.005 * channel, 3000 + 0.015 * (channel - 600_000))
     nr = np.where(channel < 2_016_667, nr, 24250.08 + 0.06 * (channel - 2_016_667))
-    lte = np.where((channel % 1 == 0) & (channel <= 3_279_165), lte, np.nan)
-    return np.where((channel < FIRST_NR) | np.isnan(lte), lte, nr) * MHZ
+    held = np.abs(nr[:, None] - NR_MHZ.mean(axis=1)) <= np.ptp(NR_MHZ, axis=1) / 2
+    named = np.where(channel < FIRST_NR, lte, np.where(held.any(axis=1), nr, np.nan))
+    return np.where(channel % 1 == 0, named, np.nan) * MHZ
 
 
 def band_hz(band: np.ndarray) -> np.ndarray:

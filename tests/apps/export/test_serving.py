@@ -445,6 +445,14 @@ def test_what_stands_after_a_question_mark_was_read_nowhere(served, path):
     assert status == 422 and b"nothing is read after ?" in answer
 
 
+@pytest.mark.parametrize("coding, status", [("gzip", 415), ("identity, br", 415), ("Identity", 200)])
+def test_bodies_that_said_they_are_packed_were_read_as_places(served, coding, status):
+    """Twelve bytes of a packed raw body are some place on Earth."""
+    heads = {"Content-Type": RAW, "Content-Encoding": coding}
+    answer = ask_http(served.port, "POST", "/predict", np.zeros((1, 3), "<f4").tobytes(), heads)
+    assert answer[0] == status and (status == 200 or b"Content-Encoding" in answer[1])
+
+
 def test_raw_places_are_of_one_media_type_alone(served):
     """`application/octet-streamx` was taken for raw, and of two types the first counted."""
     assert served.post(np.zeros((1, 3), "<f4").tobytes(), RAW + "x")[0] == 422

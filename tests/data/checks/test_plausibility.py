@@ -1,7 +1,10 @@
 """Warnings about readable measurements: each is given where it should be, and nowhere else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from level_fields import flight
 from releases import real
 from scipy.spatial.distance import cdist
 
@@ -308,14 +311,16 @@ def test_places_of_stations_beside_rows_in_kilometres_are_named(axes, who):
     assert any(f"of {who} reach over" in line and "in kilometres?" in line for line in found), found
 
 
-@pytest.mark.parametrize("other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10)])
+@pytest.mark.parametrize(
+    "other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10), lambda v: v - 30]
+)
 @pytest.mark.parametrize("each", [2, 10])
 def test_some_levels_in_another_unit_are_named(other, each):
-    _, level, _ = walk(0)
-    assert not plausibility.level_warnings(level)
+    place, level, _ = walk(0)
+    assert not plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
     level[::each] = other(level[::each])
-    (said,) = plausibility.level_warnings(level)
-    assert said.startswith("levels of ") and said.endswith("in two units?"), said
+    (said,) = plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
+    assert said.endswith("in two units?"), said
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
@@ -325,3 +330,34 @@ def test_carriers_that_no_link_has_are_named(factor):
     assert not unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9)}))
     (said,) = unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9 * factor)}))
     assert said.startswith("carriers of ") and said.endswith("MHz: another unit?")
+
+
+@pytest.mark.parametrize("factor, says", [(1e-2, "differ by"), (3.28, "thermal noise of a hertz")])
+def test_all_levels_in_another_unit_were_good(factor, says):
+    """-80 dBm as -.8, or as -262."""
+    place, level = room()
+    data = from_arrays({"rx_position": place, "tx_position": np.zeros(3), "rssi_db": (level - 40) * factor})
+    found = unit_warnings(data) + plausibility.level_warnings((level - 40) * factor)
+    assert any(says in line for line in found), found
+
+
+def test_rows_of_which_some_have_other_degrees_were_good():
+    """Half of the latitudes divided by ten: a box of 4,800 km, whose degrees nobody asked."""
+    rng = np.random.default_rng(0)
+    latitude, longitude = 48 + rng.uniform(0, 0.02, 80), 11 + rng.uniform(0, 0.02, 80)
+    arrays = {"longitude": longitude, "rssi_db": rng.normal(-80, 5, 80), "rx_height": np.array(1.5)}
+    assert not unit_warnings(from_arrays({**arrays, "latitude": latitude}))
+    half = np.where(np.arange(80) % 2, latitude, latitude / 10)
+    (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
+    assert said.startswith("two groups of places ") and "km apart" in said
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1])
+def test_rows_in_dbw_beside_others_in_dbm_were_good(share):
+    """Levels spread over 60 dB: no gap between two units, but none between near rows is as wide."""
+    rng, arrays = np.random.default_rng(0), flight(0)
+    levels = link_levels(from_arrays(arrays))
+    assert not plausibility.two_unit_warnings(levels)
+    half = rng.random(len(levels.level_db)) < share
+    (said,) = plausibility.two_unit_warnings(replace(levels, level_db=levels.level_db - 30 * half))
+    assert said.endswith("in two units?")

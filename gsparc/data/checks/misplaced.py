@@ -1,0 +1,73 @@
+"""Sites whose levels fall with distance from another place than the one that is stated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from gsparc.data.checks.link_levels import LinkLevels
+from gsparc.data.errors import list_first
+from gsparc.processes.level_field import fit_level_field
+
+LEAST, MOST, SITES = 20, 100, 100  # places where a site was heard, that tell; those, and sites, looked at
+CLEAR = math.log(1e12)  # ratio of likelihoods: shadowing is not Gaussian
+LIKELY = math.log(30)  # the same of kilometres: few sites stand within a thousandth of the reach of 0, 0
+FEW = 3  # sites at places of others: of two a hill may be the reason
+SLOPES = -60.0, -10.0  # of levels over the logarithm of the distance [dB]
+
+
+def misplaced_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of sites whose levels tell other places: each other's, or their own in kilometres.
+
+    Of the sectors of a site the strongest counts, so that no beam makes up for a distance.
+    """
+    if levels.station_position is None:
+        return []
+    where, first, site = np.unique(levels.station_position, axis=0, return_index=True, return_inverse=True)
+    site, known = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
+    gains, thousandfold = np.full((len(where),) * 2, -np.inf), where * [1e3, 1e3, 1]
+    names, kilometres = [levels.names[t] for t in first], list[str]()
+    for one in np.flatnonzero(known)[:SITES]:
+        rows = np.flatnonzero((site == one) & np.isfinite(levels.level_db))
+        rows = rows[np.argsort(-levels.level_db[rows], kind="stable")]
+        rows = rows[np.unique(levels.position[rows], axis=0, return_index=True)[1]]
+        if len(rows) >= LEAST:
+            some = np.random.default_rng(0).permutation(rows)[:MOST]
+            places = np.vstack([where[one], thousandfold[one], where[known]])
+            gain = _gains(levels.position[some], levels.level_db[some], places)
+            kilometres += [names[one]] * bool(gain[0] > LIKELY)
+            gains[one, known] = gain[1:] - math.log(len(where))  # each that is tried may fit by chance
+    gains[np.diag_indices(len(where))] = 0
+    who = list_first(kilometres)
+    said = f"levels of {who} fall with distance from a place a thousand times as far: is it in kilometres?"
+    stated, likely = linear_sum_assignment(gains, maximize=True)
+    warnings, moved = [said] * bool(kilometres), np.flatnonzero(stated != likely)
+    if len(moved) >= FEW and gains[stated, likely].sum() > CLEAR:
+        pairs = list_first([f"{names[i]} from that of {names[likely[i]]}" for i in moved])
+        said = f"levels fall with distance from places of other stations, {pairs}"
+        warnings.append(f"{said}: are names or places exchanged?")
+    return warnings
+
+
+def _gains(place: np.ndarray, level: np.ndarray, rivals: np.ndarray) -> np.ndarray:
+    """Logarithms of likelihoods (k,) of levels (n,) by distances from rivals (k + 1, 3), less the first's.
+
+    Beside one field for all, which fits best with the first or the likeliest of the others.
+    """
+    nearest = max(float(np.ptp(place[:, :2], axis=0).max()), 1.0) / 300
+    away = np.log10(np.maximum(cdist(place, rivals), nearest))
+    with np.errstate(divide="ignore", invalid="ignore"):  # of levels that are all alike
+        likeliest = 1 + int(np.nan_to_num(np.corrcoef(level, away[:, 1:].T)[0, 1:]).argmin())
+        fields = [fit_level_field(place, level, np.zeros(len(level)), [away[:, k]]) for k in (0, likeliest)]
+        precision = max(fields, key=lambda one: one.score).precision(place)
+        table = np.column_stack([level, away])
+        table -= precision.sum(axis=0) @ table / precision.sum()
+        gram = table.T @ precision @ table
+        slope = gram[0, 1:] / gram.diagonal()[1:]
+        rest = gram[0, 0] - slope * gram[0, 1:]
+        gain = 0.5 * len(level) * np.log(rest[0] / rest[1:])
+    possible = (SLOPES[0] < slope[1:]) & (slope[1:] < SLOPES[1]) & np.isfinite(gain)
+    return np.where(possible, gain, -np.inf)
