@@ -63,7 +63,7 @@ class ClosedForm(Method):
 
     held: LeftOutRows | None = None
     forgets = asks_visibility = False
-    no_gradient = None
+    no_gradient: str | None = None
 
     @property
     def count_gaussians(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -25,8 +25,8 @@ class InverseDistance(Interpolator):
     """
 
     name = "idw"
-    no_gradient = "its nearest samples change in jumps"
-    stored = ("positions", "targets")
+    no_gradient: str | None = "its nearest samples change in jumps"
+    stored: ClassVar[tuple[str, ...]] = ("positions", "targets")
     NEAR = 1e-6  # [m]; a query on a sample repeats it instead of dividing by zero
 
     def __init__(self, neighbours: int = 8, power: float = 2.0) -> None:

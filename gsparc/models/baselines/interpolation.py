@@ -125,7 +125,7 @@ class Interpolator(Method):
 class Differentiable(Interpolator):
     """One whose `_answered` is followed by autograd, in the precision that it is given."""
 
-    no_gradient = None
+    no_gradient: str | None = None
 
     @abstractmethod
     def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.processes.averages import MeanVariance
+from gsparc.processes.kernel import Kernel
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
@@ -40,7 +41,7 @@ class CarriersAlone(Stored):
             count: of carriers.
             entries: pixels.
         """
-        kernels = []
+        kernels: list[Kernel | None] = []
         for number in range(count):
             own = values[station == number]
             if len(own) < LEAST_ROWS:
