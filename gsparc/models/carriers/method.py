@@ -140,7 +140,9 @@ class CarrierField(OneArray):
         assert carrier is not None
         rows = torch.cat([at, torch.from_numpy(np.log2(carrier))[station][:, None]], 1)
         cross, one = self.covariance.between(rows, self.rows), self.covariance
-        value = self.weight * self._expected_values(places)[which] + cross @ self.left
+        value = cross @ self.left
+        if self.weight:  # else the paths, which are most of a query, explain nothing
+            value = value + self.weight * self._expected_values(places)[which]
         if self._inverse is None:
             self._inverse = Factor.from_gram(one.gram(self.rows)).inverse
         variance = (one.prior - (cross @ self._inverse * cross).sum(1)).clamp(0, one.prior)

@@ -63,9 +63,9 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
 
     @property
     def _tones(self) -> np.ndarray:
-        tones = self.fitted_site.subcarriers_hz
-        assert tones is not None
-        return np.asarray(tones)
+        """Frequencies (K,) [Hz]; alike where they are unknown, as then no delay can be told."""
+        tones, count = self.fitted_site.subcarriers_hz, self.shape[1]
+        return np.zeros(count) if tones is None or len(tones) != count else np.asarray(tones)
 
     @property
     def _freedom(self) -> Freedom:

@@ -64,6 +64,14 @@ def test_neighbours_are_told_whatever_phases_their_rows_have():
     assert 0.3 < float(squared.mean() / said.variance.mean()) < 3
 
 
+@pytest.mark.parametrize("tones", [1, 16])
+def test_rows_of_unknown_tones_are_turned_by_their_phase(tones):
+    data, test = line(), np.arange(0, 60, 7)
+    one = replace(data, target=data.target[..., :tones], site=replace(data.site, subcarriers_hz=None))
+    method = fit(TurnedNeighbours(), one, np.setdiff1d(np.arange(60), test), test)
+    assert method.predict(one.batch(test)).mean.shape == (len(test), 1, tones)
+
+
 def test_a_stored_method_answers_the_same(tmp_path):
     data, test = line(), np.arange(0, 60, 7)
     method = fit(TurnedNeighbours(), data, np.setdiff1d(np.arange(60), test), test)
