@@ -15,6 +15,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Predict at places of a table; return the facts written to `summary.json` in the run directory."""
     run_dir, settings = begin_run(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
+    if config.frequency_hz is not None:
+        predictor = predictor.select_carrier(config.frequency_hz)
     station = None if config.station is None else str(config.station)
     how: dict[str, Any] = {"columns": settings["columns"], "overwrite": bool(config.overwrite)}
     facts = predict_file(predictor, config.places, config.out, station=station, **how)

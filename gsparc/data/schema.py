@@ -82,6 +82,24 @@ class Stations:
         label = None if self.label is None else tuple(self.label[i] for i in numbers)
         return Stations(self.position[numbers], called, rotation, carrier, sector, label, array)
 
+    def add_carrier(self, frequency_hz: float) -> Stations:
+        """Return these and, last, that of the nearest carrier at another [Hz], arrays alike in wavelengths.
+
+        >>> one = Stations(np.zeros((1, 3)), ("2.4 GHz",), carrier_hz=np.array([2.4e9]))
+        >>> one.add_carrier(5e9).name
+        ('2.4 GHz', '5 GHz')
+        """
+        assert self.carrier_hz is not None
+        near = int(np.abs(np.log(self.carrier_hz / frequency_hz)).argmin())
+        name = f"{frequency_hz / 1e9:.9g} GHz"
+        both = self.subset(np.r_[: len(self), near], (*self.name, name))
+        array = both.array
+        if array is not None:
+            array[-1] *= self.carrier_hz[near] / frequency_hz
+        label = None if both.label is None else (*both.label[:-1], name)
+        carrier = np.r_[self.carrier_hz, frequency_hz]
+        return replace(both, carrier_hz=carrier, label=label, array=array)
+
 
 @dataclass(frozen=True)
 class Links:

@@ -398,6 +398,18 @@ class HasJoint(Protocol):
         ...
 
 
+@runtime_checkable
+class AddsCarriers(Protocol):
+    """It answers at carriers that nobody measured."""
+
+    def add_carrier(self, frequency_hz: float) -> Any:
+        """Return the same method whose site has one station more; see `Stations.add_carrier`.
+
+        Raises:
+            ValueError: what was fitted here knows its own carriers alone.
+        """
+
+
 class QueryPaths(NamedTuple):
     """Paths to B places and A antennas of the moving end.
 

@@ -31,7 +31,7 @@ from gsparc.models import checkpoint, fitting
 from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
-from gsparc.models.method import HasJoint, Method, MethodFactory, Prediction, Reconditions
+from gsparc.models.method import AddsCarriers, HasJoint, Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.powers.own_terms import combine_stations
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard_rows
@@ -278,6 +278,16 @@ class PerStation(Method):
         """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
         stations = None if self.site is None else self.site.stations
         return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
+
+    def add_carrier(self, frequency_hz: float) -> PerStation:
+        """See `AddsCarriers`."""
+        copy, site = self._copies.get(UNHEARD), self.fitted_site
+        if not self._shared or not isinstance(copy, AddsCarriers) or site.stations is None:
+            raise ValueError(f"{self.name} learned each carrier alone; model=carriers answers at others")
+        result = PerStation(self.factory)
+        result._copies, result._shared = {UNHEARD: copy.add_carrier(frequency_hz)}, True
+        result.site = replace(site, stations=site.stations.add_carrier(frequency_hz))
+        return result
 
     def _site_of_copy(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""

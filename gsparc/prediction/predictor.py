@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -19,7 +19,14 @@ from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint
 from gsparc.models.device_offsets import find_device
-from gsparc.models.method import MEAN_DEVICE, HasGaussians, Method, Prediction, predict_with_threads
+from gsparc.models.method import (
+    MEAN_DEVICE,
+    AddsCarriers,
+    HasGaussians,
+    Method,
+    Prediction,
+    predict_with_threads,
+)
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.physics.row_factors import describe_freedom
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
@@ -128,6 +135,28 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         copy = self._copy_with(method, whole, station_site(self.site, number), self._unit)
         copy.queries = Queries(copy.site, None if isinstance(self.method, PerStation) else number)
         return copy
+
+    def select_carrier(self, frequency_hz: float) -> Predictor:
+        """Return the same model asked about one carrier [Hz], also one that nobody measured if it can.
+
+        >>> wideband.select_carrier(28e9).spectrum(tx=[2.0, 1.0, 1.5]).shape
+        (90, 360)
+
+        Raises:
+            ValueError: the model knows one carrier, or its own carriers alone.
+        """
+        known = None if self.site.stations is None else self.site.stations.carrier_hz
+        if known is None:
+            raise ValueError(f"frequency_hz={frequency_hz:g}: {self.site.name} has one carrier alone")
+        if not (np.isfinite(frequency_hz) and frequency_hz > 0):
+            raise ValueError(f"frequency_hz={frequency_hz}: expected a frequency above 0 [Hz]")
+        if len(here := np.flatnonzero(np.isclose(known, frequency_hz, rtol=1e-6))) == 1:
+            return self.select_station(int(here[0]))
+        both = self.method, self._whole
+        if not all(isinstance(one, AddsCarriers) for one in both):
+            raise ValueError(f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers")
+        method, whole = (cast(AddsCarriers, one).add_carrier(frequency_hz) for one in both)
+        return self._copy_with(method, whole, method.fitted_site, self._unit).select_station(len(known))
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
         copy = Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
@@ -268,7 +297,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         world = places.reshape(len(places), -1, 3) + self.site.origin
         return lambda number: ask(**dict(zip(ends, world[number % len(world)], strict=True)))
 
-    def spectrum(self, tx: Any = None, rx: Any = None, *, grad: bool = False) -> Any:
+    def spectrum(
+        self, tx: Any = None, rx: Any = None, *, frequency_hz: float | None = None, grad: bool = False
+    ) -> Any:
         """Return amplitudes by direction at the receiver, (B, H, W) float32 in [0, 1], as they were measured.
 
         Their square is the power; 1 is the largest of all stored ones or
@@ -277,6 +308,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
 
         Args:
             tx, rx: positions [m, world]; `rx` may be a world `Pose`, of a receiver that is turned.
+            frequency_hz: carrier, of a model of several; see `select_carrier`.
             grad: as in `predict`.
 
         >>> predictor.spectrum(rx=[2.0, 1.0, 1.5])  # of a model of powers
@@ -288,7 +320,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
             ValueError: the model predicts something else, a position is missing or not finite, or `grad` as
                 in `predict`.
         """
-        return self._predict_mean("spectrum", tx, rx, grad)
+        asked = self if frequency_hz is None else self.select_carrier(frequency_hz)
+        return asked._predict_mean("spectrum", tx, rx, grad)
 
     def csi(
         self, tx: Any = None, rx: Any = None, *, uplink: Any = None, frequency_hz: Any = None,

@@ -63,6 +63,11 @@ class CarriersAlone(Stored):
                 processes[number] = Exact.from_values(one.prior, places[here], values[here] - means[number])
         return replace(self, means=means, processes=tuple(processes))
 
+    def add_unknown(self) -> Self:
+        """Return these and, last, a carrier without rows."""
+        means = torch.cat([self.means, torch.zeros_like(self.means[:1])])
+        return replace(self, means=means, processes=(*self.processes, None))
+
     def left_out(self, station: Tensor) -> Tensor:
         """Return what other rows miss of each that it was conditioned on (n, P); NaN without a process."""
         result = torch.full((len(station), self.means.shape[1]), torch.nan, dtype=torch.float64)

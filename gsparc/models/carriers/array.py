@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from copy import copy
+from dataclasses import replace
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -99,6 +101,12 @@ class OneArray(Method):
         self.site, self._spectra = site, None
         for name in self.stored:
             setattr(self, name, from_plain(state[name]))
+
+    def add_carrier(self, frequency_hz: float) -> Self:
+        """See `AddsCarriers`."""
+        result = copy(self)
+        result.site = replace(self.fitted_site, stations=self._stations.add_carrier(frequency_hz))
+        return result
 
     @property
     def _stations(self) -> Stations:

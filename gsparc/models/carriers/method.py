@@ -8,6 +8,8 @@ the strongest principal components of the images.
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -157,6 +159,12 @@ class CarrierField(OneArray):
         image = Separable(*self.pixels).images(torch.addmm(self.middle, value.float(), self.axes))
         image = self.answer_images(image.flatten(1), query)
         return Prediction(image, (error + self.lost).to(image.dtype), unknown.to(image.dtype))
+
+    def add_carrier(self, frequency_hz: float) -> Self:
+        """See `AddsCarriers`."""
+        result = super().add_carrier(frequency_hz)
+        result.alone = self.alone.add_unknown()
+        return result
 
     def count_components(self) -> int:
         """Return the number of mirror planes."""

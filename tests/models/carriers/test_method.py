@@ -22,6 +22,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.lags import SpectrumLags
+from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 
 
@@ -143,3 +144,33 @@ def test_carriers_that_share_nothing_were_smoothed_over_all(room):
     field = fit(CarrierField(), alone, LAST)
     assert field.shares[0] > 0.9
     assert error(field, alone, LAST) < 1.05 * error(gp, alone, LAST)
+
+
+@pytest.mark.slow
+def test_a_carrier_is_asked_for_by_its_frequency(room):
+    """As one held out is answered, another that no station has is: by geometry and nearby carriers."""
+    test = np.flatnonzero(room.station == 2)
+    learned = fit(wrap_per_station(Gsparc(), room), room, test)
+    predictor = Predictor(learned, room.site)
+    known = float(room.site.stations.carrier_hz[2])
+    at = room.tx[test[:3]] + room.site.origin
+    named = predictor.select_station(2).spectrum(tx=at)
+    assert np.array_equal(predictor.spectrum(tx=at, frequency_hz=known), named)
+    beside = predictor.spectrum(tx=at, frequency_hz=known * 1.001)
+    assert np.abs(beside - named).max() < 0.02  # held out as the one beside it
+    assert (
+        np.abs(beside - room.target[test[:3]]).mean()
+        < np.abs(room.target[test[3:6]] - room.target[test[:3]]).mean()
+    )
+    assert (predictor.select_carrier(known * 8).std(tx=at) >= predictor.select_station(2).std(tx=at)).all()
+    assert len(predictor.stations) == CARRIERS  # asking adds none
+
+
+def test_a_carrier_of_a_model_that_has_none_is_refused(room):
+    few = np.arange(0, len(room), 3)
+    plain = fit(wrap_per_station(GaussianProcess(), room), room, np.setdiff1d(np.arange(len(room)), few))
+    with pytest.raises(ValueError, match="learned each carrier alone; model=carriers answers at others"):
+        Predictor(plain, room.site).select_carrier(7e9)
+    for wrong in (0.0, np.nan, -1e9):
+        with pytest.raises(ValueError, match="a frequency above 0"):
+            Predictor(plain, room.site).select_carrier(wrong)
