@@ -12,6 +12,8 @@ import torch
 
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
+from gsparc.evaluation.drawing import save
+from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.field.schedule import INTERVAL, to_steps
 from gsparc.training.tracking import log_picture
@@ -54,6 +56,8 @@ class Pictures(Checked, L.Callback):
             title = f"validation, step {step}"
             title += "" if ledger is None else f", {ledger.elapsed():.0f} s of training"
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
-            true, result = batch.target.cpu().numpy(), predicted.cpu().numpy()
-            draw_spectra(true, result, rows, module.site.grid.edges(), title, path)
+            true, own = batch.target.cpu().numpy(), {"predicted": predicted.cpu().numpy()}
+            unknown = np.full(len(rows), np.nan)
+            shown = Examples(rows, np.array(module.site.grid.edges()), true, unknown, own)
+            save(draw_spectra(shown, title), path, 100)
             log_picture(trainer.loggers, "predictions", path, step)

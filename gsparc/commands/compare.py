@@ -15,11 +15,13 @@ from gsparc.commands.shared.output import begin_run, show_result
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.train import train_job
 from gsparc.data.files import platform_cache
-from gsparc.evaluation.drawing import PRINTED
+from gsparc.evaluation.drawing import PRINTED, save
+from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.experiment.cells import plan_jobs
 from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
 from gsparc.evaluation.experiment.table import (
     CELL,
+    PROBLEM,
     average_cells,
     columns_of_csv,
     markdown,
@@ -28,7 +30,8 @@ from gsparc.evaluation.experiment.table import (
     table_of,
     title_of,
 )
-from gsparc.evaluation.plots import draw_efforts, draw_splits
+from gsparc.evaluation.pictures import draw_spectra
+from gsparc.evaluation.plots import draw_efforts, draw_splits, draw_sweep
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
@@ -61,7 +64,8 @@ def write_comparison(
 
     `figures` are formats beside PNG, see `drawing.save`.
 
-    Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`.
+    Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`;
+    each has the distributions of its methods' errors, and of spectra the same rows as all predict them.
     """
     rows = average_cells(filled, timed)
     blocks = split_by_problem(rows)
@@ -72,6 +76,15 @@ def write_comparison(
         draw_splits(here, run_dir / f"{dataset}.png", figures)
     if not rows.draws.all():
         draw_efforts(rows[~rows.draws], run_dir / "compare.png", ours, figures)
+    # Of a method's efforts the largest.
+    most = filled.sort_values("effort", kind="stable").drop_duplicates(
+        [*PROBLEM, "method", "seed"], keep="last"
+    )
+    for (dataset, split), here in most.assign(setting=most.method).groupby(PROBLEM, sort=False):
+        title, stem = f"{dataset}, split {split}", f"{dataset}-{split}"
+        draw_sweep(here, title, run_dir / f"{stem}-distributions.png", figures)
+        if (examples := join_examples(here)) is not None:
+            save(draw_spectra(examples, title), run_dir / f"{stem}-rows.png", 100, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}
     write_summary(run_dir / "summary.json", {"cells": len(filled), **best, **provenance()})
     shown: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]

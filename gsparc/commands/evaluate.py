@@ -13,8 +13,11 @@ from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
+from gsparc.evaluation.confidence_pictures import PICTURES, draw_confidences
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.plots import draw_sweep
+from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models import checkpoint
 
@@ -71,6 +74,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     seed = checkpoint.read(paths[0]).configuration.get("seed")
     facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
     evaluation.write(run_dir)
+    rows = frame_of_runs([Run(run_dir, facts)])
+    if evaluation.columns:
+        draw_sweep(rows, f"{data.site.name}, {config.eval_on} rows", run_dir / "distributions.png")
+        draw_confidences(PICTURES, rows, f"{data.site.name}, {config.eval_on} rows", run_dir)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.title}, {config.eval_on}"
     results = results_table(facts, facts["model/label"], title, config.eval_on)

@@ -54,7 +54,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     errors, surest = {}, {}
     rates, own = study.rates()
     facts |= own | {"time/mcs_s": time.perf_counter() - started}
-    draw_rates(rates, study.score, title, run_dir / "mcs.png")
+    draw_rates(rates, study.confidence, study.least, title, run_dir / "mcs.png")
     write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
     for modulation, ebno_db in points.items():
         log.info("PUSCH, %s", modulation)
@@ -65,7 +65,23 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_errors(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
-    return finish_run(run_dir, facts, *tables(facts, title, list(points), settings["mcs"]["snr_db"]))
+    parts = tables(facts, title, list(points), settings["mcs"]["snr_db"])
+    return finish_run(run_dir, facts, *parts, lines=flat_curves(facts, points))
+
+
+def flat_curves(facts: Mapping[str, Any], points: Mapping[str, list[float]]) -> list[str]:
+    """Say of modulations that no curve of theirs crosses 10 % of failed blocks at the Eb/N0 sent."""
+    return [
+        f"{name}: no curve crosses 10 % failed blocks from {min(sent):g} to {max(sent):g} dB, see bler.png; "
+        f"pusch.ebno_db.{name}=[...] sends at other Eb/N0"
+        for name, sent in points.items()
+        if not _crosses(facts, name)
+    ]
+
+
+def _crosses(facts: Mapping[str, Any], modulation: str) -> bool:
+    keys = (f"pusch/{modulation}/{name}/ebno_at_bler_0.1" for name in STYLES)
+    return any(facts.get(key) is not None for key in keys)
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
@@ -73,8 +89,8 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
     kind = facts["confidence/kind"]
     accepted = f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {kind}"
     rates = [{"level": level, **facts_under(facts, f"mcs/{level:g}dB")} for level in levels]
-    sections = [Table.from_rows(f"{title}: throughput, {accepted}", RATES, rates)]
-    if modulations:
+    sections = [Table.from_rows(f"{title}: throughput of one layer, {accepted}", RATES, rates)]
+    if modulations := [name for name in modulations if _crosses(facts, name)]:
         heads = {"ebno_at_bler_0.1": "{}", "behind_perfect_db": "behind"}
         places = [(m, key) for m in modulations for key in heads]
         columns = [Column(heads[key].format(m), ".2f") for m, key in places]
@@ -83,7 +99,8 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
             for name, (label, _, _) in STYLES.items()
             if f"pusch/{modulations[0]}/{name}/behind_perfect_db" in facts
         ]
-        heading = f"Eb/N0 (dB) at 10 % failed blocks, and dB behind perfect; truth: {facts['pusch/truth']}"
+        heading = "Eb/N0 (dB) at 10 % failed blocks of one layer, and dB behind perfect; truth: "
+        heading += facts["pusch/truth"]
         sections.append(Table(heading, [Column("receiver", ""), *columns], receivers))
     # As numbers: as text 16 comes before 4.
     antennas = sorted(int(key.split("/")[1]) for key in facts if re.fullmatch(r"beams/\d+/gain_db", key))

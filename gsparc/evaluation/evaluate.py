@@ -16,6 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, hash_indices
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
 from gsparc.evaluation.by_station import station_columns
+from gsparc.evaluation.examples import FILE, Examples
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import judged_by
 from gsparc.evaluation.metrics import paired_values
@@ -43,19 +44,26 @@ class Evaluation:
         facts: flat keys as in `summary.json`.
         columns: per-sample columns of `per_sample.csv`.
         stations: columns of `by_station.csv`, of powers of several stations.
+        examples: a few test spectra as every method predicts them.
     """
 
     facts: dict[str, Any]
     columns: dict[str, Any]
     stations: dict[str, Any] = field(default_factory=dict)
+    examples: Examples | None = None
 
     def write(self, folder: Path, **shared: Any) -> None:
-        """Write what there is of `per_sample.csv` and `by_station.csv`, `shared` cells in every row."""
+        """Write what there is of `per_sample.csv`, `by_station.csv` and `predictions.npz`.
+
+        `shared` are cells of every row.
+        """
         for name, columns in (("per_sample.csv", self.columns), ("by_station.csv", self.stations)):
             if columns:
                 write_samples(folder / name, columns | shared)
             else:
                 (folder / name).unlink(missing_ok=True)  # of an earlier run, of other data
+        if self.examples is not None:
+            self.examples.write(folder / FILE)
 
 
 @dataclass(frozen=True)
@@ -152,7 +160,11 @@ def evaluate(
     columns = _columns(scores, data)
     for stem, one in beside.items():
         columns |= {f"{stem}{name}": values for name, values in paired_values(one.samples).items()}
-    return Evaluation(facts, columns, station_columns({"": scores, **beside}, data))
+    beside_it = {name: fit.methods[0] for name, fit in fits.items() if fit is not same}
+    shown = beside_it | {methods[0].name: methods[0]}
+    rows = rows_to_score(split.folds[0], eval_on)
+    examples = Examples.of_methods(shown, data, rows) if data.site.kind == "spectrum" else None
+    return Evaluation(facts, columns, station_columns({"": scores, **beside}, data), examples)
 
 
 def _about(

@@ -39,7 +39,7 @@ OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
-    *("test.png", "found.png"),
+    *("predictions.npz", "test.png", "found.png"),
     *(f"{fold}{name}" for fold in ("", "fold*/") for name in (MODEL, "learning_curve.csv")),
 )
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not

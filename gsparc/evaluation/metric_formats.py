@@ -46,6 +46,11 @@ FIGURES = {
     "error_db": Figure("error dB", ".2f", "smaller"),
     "best_server": Figure("strongest told", ".1%"),
     "skill": Figure("skill", ".3f"),
+    "psnr_db_median": Figure("median PSNR dB", ".2f"),
+    "ssim_gauss_median": Figure("median SSIM"),
+    "mse_median": Figure("median MSE", ".3g", "ratio"),
+    "snr_db_p50": Figure("median SNR dB", ".2f"),
+    "mae_db_median": Figure("median error dB", ".2f", "smaller"),
     "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
@@ -64,24 +69,30 @@ class KindFigures:
         second: beside the score in comparisons.
         of_sample: of a single sample, in decibels.
         distributions: over samples, drawn after a sweep.
+        medians: shown beside the columns, which are means, where there is room.
     """
 
     columns: tuple[str, ...]
     second: str
     of_sample: str
     distributions: tuple[str, ...]
+    medians: tuple[str, ...]
 
 
 OF_KIND: dict[Scored, KindFigures] = {
     "spectrum": KindFigures(
-        ("psnr_db", "ssim_gauss", "ssim", "mse"), "ssim", "psnr_db", ("ssim_gauss", "psnr_db", "mse")
+        ("psnr_db", "ssim_gauss", "ssim", "mse"), "ssim", "psnr_db", ("ssim_gauss", "psnr_db", "mse"),
+        ("psnr_db_median", "ssim_gauss_median", "mse_median"),
     ),
-    "csi": KindFigures(("nmse", "nmse_scalar", "snr_db"), "snr_db", "snr_db", ("snr_db", "error_power")),
+    "csi": KindFigures(
+        ("nmse", "nmse_scalar", "snr_db"), "snr_db", "snr_db", ("snr_db", "nmse"), ("snr_db_p50",)
+    ),
     "aligned csi": KindFigures(
-        ("nmse_aligned", "tone_rmse_db", "snr_db"), "tone_rmse_db", "snr_db", ("snr_db", "error_power")
+        ("nmse_aligned", "tone_rmse_db", "snr_db"), "tone_rmse_db", "snr_db", ("snr_db", "nmse"),
+        ("snr_db_p50",),
     ),
-    "rssi": KindFigures(("rmse_db", "mae_db"), "mae_db", "error_db", ("error_db",)),
-}
+    "rssi": KindFigures(("rmse_db", "mae_db"), "mae_db", "error_db", ("error_db",), ("mae_db_median",)),
+}  # fmt: skip
 DECIDING: dict[Scored, str] = {kind: figures.columns[0] for kind, figures in OF_KIND.items()}
 
 

@@ -28,6 +28,7 @@ SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
 C1, C2 = 0.01**2, 0.03**2  # of data range 1, Wang et al. 2004
 MEANS = "ssim_gauss", "ssim_padded", "psnr_db", "mse", "mae"
+MEDIANS = "ssim", "ssim_gauss", "psnr_db", "mse"  # beside means, as the paper has them
 
 
 class SampleMetric:
@@ -107,8 +108,8 @@ class SpectrumMetrics(SampleMetric):
         """See the base class."""
         return {
             "ssim": _statistic(samples["ssim"]),
-            "ssim_median": _statistic(samples["ssim"], np.nanmedian),
             **{name: _statistic(samples[name]) for name in MEANS},
+            **{f"{name}_median": _statistic(samples[name], np.nanmedian) for name in MEDIANS},
             "nmse": _ratio(samples["mse"], samples["target_power"]),
             "samples": len(samples["mse"]),
         }
@@ -225,6 +226,7 @@ class PowerMetrics(SampleMetric):
         return {
             "rmse_db": None if squared is None else float(np.sqrt(squared)),
             "mae_db": _statistic(np.abs(samples["error_db"])),
+            "mae_db_median": _statistic(np.abs(samples["error_db"]), np.nanmedian),
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "mse": _statistic(samples["mse"]),
             "silent_samples": silent,

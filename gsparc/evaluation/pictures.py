@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import PALETTE, panels, save
+from gsparc.evaluation.examples import Examples
+from gsparc.evaluation.metrics import SpectrumMetrics
 from gsparc.evaluation.site_plan import draw_found
 from gsparc.evaluation.summary import results_table
 from gsparc.models.method import Method
@@ -24,12 +28,10 @@ from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, ris
 from gsparc.processes.sectors import NO_AZIMUTH
 from gsparc.training import tracking
 
-SPECTRA = 4  # test rows drawn
-
 
 def draw_run(
     method: Method, data: Measurements, split: Split, walls: SceneWalls | None, facts: Mapping[str, Any],
-    eval_on: str, run_dir: Path, loggers: Sequence[Any],
+    examples: Examples | None, eval_on: str, run_dir: Path, loggers: Sequence[Any],
 ) -> None:  # fmt: skip
     """Draw predictions and what was found; give loggers the pictures, figures and the table of a run."""
     # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
@@ -40,7 +42,7 @@ def draw_run(
     draw_sector_levels(method, data, fold, run_dir / "sectors.png")
     if len(fold.test):
         title = f"{data.site.name}: test rows of {method.label}"
-        draw_predictions(method, data, fold, title, run_dir / "test.png")
+        draw_predictions(method, data, fold.test, examples, title, run_dir / "test.png")
         tracking.log_picture(loggers, "test rows", run_dir / "test.png")
     table = results_table(facts, str(facts["model/label"]), prefix=eval_on)
     tracking.log_table(loggers, "results", *table.texts())
@@ -50,22 +52,17 @@ def draw_run(
         tracking.log_picture(loggers, "found", run_dir / "found.png")
 
 
-def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str, path: Path) -> None:
-    """Draw test rows of a fold, which the method was fitted on: `SPECTRA` spectra, else points."""
-    spectra = data.site.kind == "spectrum"
-    # Spread over the fold: rows beside each other in a file were measured beside each other.
-    few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
-    rows = fold.test[few] if spectra else fold.test
-    said, true = predict_rows(method, data, rows), data.targets(rows).numpy()
-    predicted = said.mean.numpy()
-    if not spectra:
-        scale = data.site.target_scale
-        unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
-        measured = data.censored_side(rows) == 0  # of a silent row the target is its level
-        return draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
-    assert data.site.grid is not None
-    confidence = None if said.confidence is None else said.confidence.numpy()
-    return draw_spectra(true, predicted, rows, data.site.grid.edges(), title, path, confidence)
+def draw_predictions(
+    method: Method, data: Measurements, rows: np.ndarray, examples: Examples | None, title: str, path: Path
+) -> None:
+    """Draw test rows (n,) as a fitted method predicts them: `examples` where there are some, else points."""
+    if examples is not None:
+        return save(draw_spectra(examples, title), path, 100)
+    predicted, true = predict_rows(method, data, rows).mean.numpy(), data.targets(rows).numpy()
+    scale = data.site.target_scale
+    unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
+    measured = data.censored_side(rows) == 0  # of a silent row the target is its level
+    draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
 
 
 def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
@@ -99,45 +96,44 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
     save(figure, path)
 
 
-def draw_spectra(
-    target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, edges: Sequence[float], title: str,
-    path: Path, confidence: np.ndarray | None = None,
-) -> None:  # fmt: skip
-    """Save a line per sample as PNG: measured, predicted and difference beside each other.
+def draw_spectra(examples: Examples, title: str) -> Figure:
+    """Return a line per row: measured, predicted by each method on one scale, and what the last one misses.
 
-    Args:
-        target, predicted: (B, H, W) in [0, 1].
-        rows: (B,) dataset rows, for the labels.
-        edges: least and largest azimuth, least and largest elevation [degrees].
-        title, path: of the figure.
-        confidence: (B,) in [0, 1], written into the predictions.
+    Under each prediction stand its PSNR and SSIM, and the confidence of the last one.
     """
+    every, edges = examples.predicted, examples.edges
     how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
-    figure, axes = panels(8.5, 1.35 * len(target) + 1.2, len(target), 3, **how)
+    count, across = len(examples.rows), len(every) + 2
+    figure, axes = panels(max(1.75 * across, 8.5), 1.55 * count + 1.2, count, across, **how)
     options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}
-    for number, (line, true, guess, row) in enumerate(zip(axes, target, predicted, rows, strict=True)):
-        power = line[0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
-        line[1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
+    metric = SpectrumMetrics()
+    for values in every.values():
+        metric.update(torch.from_numpy(values), torch.from_numpy(examples.truth))
+    figures = {name: values.reshape(len(every), count) for name, values in metric.compute().items()}
+    for number, (line, true, row) in enumerate(zip(axes, examples.truth, examples.rows, strict=True)):
+        for axis, image in zip(line, (true, *(values[number] for values in every.values())), strict=False):
+            power = axis.imshow(image, vmin=0, vmax=1, cmap="inferno", **options)
+        for place, axis in enumerate(line[1:-1]):
+            psnr, ssim = (figures[name][place, number] for name in ("psnr_db", "ssim_gauss"))
+            axis.set_xlabel(f"{psnr:.1f} dB" + f", SSIM {ssim:.3f}" * bool(np.isfinite(ssim)), fontsize=8)
         # Half of full scale, saturating: at +-1 usual errors of a few hundredths would be white.
-        error = line[2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
+        error = line[-1].imshow(image - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
+        if np.isfinite(examples.confidence[number]):
+            line[-1].set_xlabel(f"confidence {examples.confidence[number]:.2f}", fontsize=8)
         line[0].set_yticks(np.arange(30 * np.ceil(edges[2] / 30), edges[3] + 1, 30))
-        line[0].set_ylabel(f"row {row}\nelevation [°]")
-        corner = {"x": 0.99, "y": 0.95, "ha": "right", "va": "top", "fontsize": "small"}
-        if confidence is not None:
-            note = f"confidence {confidence[number]:.2f}"
-            line[1].text(s=note, color="white", transform=line[1].transAxes, **corner)
-        rms = np.sqrt(np.mean((guess - true) ** 2))
-        line[2].text(s=f"rms {rms:.3f}", transform=line[2].transAxes, **corner)
-    for axis, name in zip(axes[0], ("measured", "predicted", "predicted - measured"), strict=True):
-        axis.set_title(name)
+        line[0].set_ylabel(f"row {row}", fontsize=9)
+    for axis, name in zip(axes[0], ("measured", *every, f"{[*every][-1]} - measured"), strict=True):
+        axis.set_title("\n".join(wrap(name, 22)), fontsize=9)
     for axis in axes[-1]:
-        axis.set_xlabel("azimuth [°]")
         axis.set_xticks(np.arange(90 * np.ceil(edges[0] / 90), edges[1] + 1, 90))
+        axis.tick_params(labelsize=7)
+    figure.supylabel("elevation [°]", fontsize=9)
     below: dict[str, Any] = {"location": "bottom", "shrink": 0.8, "aspect": 40}
-    figure.colorbar(power, ax=axes[:, :2], label="relative strength", **below)
-    figure.colorbar(error, ax=axes[:, 2], label="difference", **{**below, "aspect": 20})
+    figure.colorbar(power, ax=axes[:, :-1], label="relative strength over azimuth [°]", **below)
+    figure.colorbar(error, ax=axes[:, -1], label="difference", **{**below, "aspect": 10})
     figure.suptitle(title)
-    save(figure, path, 100)
+    figure.set_label("The same test rows, measured and predicted")
+    return figure
 
 
 NAMES = {

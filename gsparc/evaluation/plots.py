@@ -84,8 +84,9 @@ def draw_distributions(
 ) -> Figure:
     """Draw the shares of test samples that are at most so good, per setting over its seeds, a panel a figure.
 
-    With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart): seeds
-    share their test samples, whose number counts once. `TIMES` among `names` are single queries.
+    Dashed lines are medians. With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and
+    Wolfowitz 1956; Massart): seeds share their test samples, whose number counts once. `TIMES` among `names`
+    are single queries.
     """
     figure, ((*line,),) = panels(max(4.2 * len(names), WIDE), TALL, 1, len(names))
     for axes, name in zip(line, names, strict=True):
@@ -99,21 +100,23 @@ def draw_distributions(
             axes.step(values, share, where="post", lw=1.2, label=labels.get(setting, setting), **style)
             low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
             axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
-        beside = [base["run"].samples for base in _rivals(rows) if base["method"] == "gp"]
-        if known := [own[f"baseline/gp/{name}"] for own in beside if f"baseline/gp/{name}" in own]:
-            axes.step(*_shares(known), lw=0.8, label="gp", **style_of("gp").line)  # of all draws
+            axes.axvline(np.median(values) if len(values) else np.nan, lw=0.8, ls="--", color=style["color"])
+        for method, values in _samples_of_rivals(rows, name).items():
+            line_of = style_of(method).line
+            axes.step(*_shares(values), lw=0.8, label=method, **line_of)  # of all draws
+            axes.axvline(np.median(np.concatenate(values)), lw=0.6, ls="--", color=line_of["color"])
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
-        if name in (TIMES, "mse", "error_power"):
+        if name in (TIMES, "mse", "nmse"):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)
     line[0].set_ylabel("share of samples")
     handles, shown = line[0].get_legend_handles_labels()
     figure.legend(handles, [shorten_setting(one, 90) for one in shown], loc="outside lower center", ncols=2)
-    figure.set_label("How the accuracy is distributed (95 % bands)")
+    figure.set_label("How the accuracy is distributed (95 % bands, dashed: medians)")
     return figure
 
 
-def draw_sweep(rows: pd.DataFrame, title: str, path: Path) -> None:
-    """Save the figure that ends a sweep: distributions over test samples and of single queries, as PNG.
+def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] = ()) -> None:
+    """Save the figure that ends a sweep: distributions over test samples and of single queries, see `save`.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
@@ -125,10 +128,11 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path) -> None:
     labels = {}
     for setting, group in groups_of(own).items():
         seconds, ms = group.train_s.mean(), group.query_ms.dropna().mean()
-        labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s, one query {ms:.3g} ms"
+        labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
+        labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
     figure = draw_distributions(rows, names, labels)
     figure.suptitle(title, fontsize=9)
-    save(figure, path, 100)
+    save(figure, path, 100, also)
 
 
 def _shares(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -141,6 +145,16 @@ def _values_of(run: Run, name: str) -> np.ndarray:
     """A per-sample figure (n,) of a run, empty where it has none; an error by its size."""
     values = run.render_ms if name == TIMES else run.samples.get(name, np.zeros(0))
     return np.abs(values) if name == "error_db" else values
+
+
+def _samples_of_rivals(rows: pd.DataFrame, name: str) -> dict[str, list[np.ndarray]]:
+    """Per-sample figures of baselines by their names, an array for each draw."""
+    column, found = "mae_db" if name == "error_db" else name, dict[str, list[np.ndarray]]()
+    for base in _rivals(rows):
+        values = base["run"].samples.get(f"baseline/{base['method']}/{column}", np.zeros(0))
+        if np.isfinite(values).any():
+            found.setdefault(base["method"], []).append(values[np.isfinite(values)])
+    return found
 
 
 def _rivals(rows: pd.DataFrame) -> list[Row]:

@@ -6,6 +6,8 @@ from PIL import Image
 
 from gsparc.callbacks import Pictures
 from gsparc.callbacks.pictures import draw_spectra
+from gsparc.evaluation.drawing import save
+from gsparc.evaluation.examples import Examples
 
 
 def stage(data, fold, run_dir, step):
@@ -46,7 +48,9 @@ def test_the_worst_prediction_is_the_most_colourful(tmp_path):
     target = np.linspace(0, 1, 12 * 24).reshape(1, 12, 24)
     colours = []
     for name, predicted in (("good", target), ("bad", 1 - target)):
-        draw_spectra(target, predicted, np.array([3]), (0, 360, 0, 90), "title", tmp_path / f"{name}.png")
+        own, edges = {"predicted": predicted}, np.array([0, 360, 0, 90])
+        shown = Examples(np.array([3]), edges, target, np.array([np.nan]), own)
+        save(draw_spectra(shown, "title"), tmp_path / f"{name}.png")
         with Image.open(tmp_path / f"{name}.png") as image:
             pixels = np.asarray(image.convert("RGB")).astype(int)
         third = pixels[: pixels.shape[0] // 2, 2 * pixels.shape[1] // 3 :]  # above the colour bar

@@ -188,12 +188,12 @@ def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     answer, last = knock(main, "train.py", begun), tmp_path / "run" / "last.ckpt"
     assert answer.status == 130 and answer.err[-1].endswith(f"go on with ckpt_path={last}"), answer
     assert not any("Traceback" in line for line in answer.err)
-    on = f"ckpt_path={tmp_path / 'run'}", f"hydra.run.dir={tmp_path / 'on'}"
+    on = (f"ckpt_path={tmp_path / 'run'}",)
     others = [f"model.emission.{name}=0.5" for name in ("init_scale", "init_bias")] + ["seed=3"]
     others += [f"model.effects.{name}=auto" for name in ("array", "phase", "power", "residual")]
     answer = knock(main, "train.py", [*on, *others, "+callbacks.stop=null"])
     assert_refused(answer, r"trained with seed=0 \(here 3\)(, \S+ \(here \S+\)){4} and 2 more: go on with")
     assert knock(main, "train.py", [*on, "+callbacks.stop=null"]).status == 0
-    resumed = checkpoint.read(tmp_path / "on" / "model.ckpt").configuration
+    resumed = checkpoint.read(tmp_path / "run" / "model.ckpt").configuration
     assert resumed["dataset"]["file"] == str(spectra_file) and resumed["model"]["field"]["count"] == 40
     assert resumed["seed"] == 0 and resumed["trainer"]["max_steps"] == 20

@@ -39,6 +39,7 @@ def test_every_figure_has_an_entry(kind):
 def test_every_figure_knows_which_way_is_better():
     """The validation error of channels did not: the report called the worst moment of a training its best."""
     larger = {"psnr_db", "snr_db", "ssim", "ssim_gauss", "ssim_padded", "skill"} | OF_ANOTHER
+    larger |= {"psnr_db_median", "ssim_gauss_median"}
     for name in {"skill", *(name for kind in DECIDING for name in figure_names(kind))}:
         assert lower_is_better(name) == (name not in larger), name
         assert (score_of(name, 0.2) > score_of(name, 0.1)) == (name in larger), name

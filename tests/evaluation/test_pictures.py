@@ -8,6 +8,7 @@ from PIL import Image
 
 from gsparc.data.splits import Fold
 from gsparc.evaluation import pictures
+from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.pictures import draw_points, draw_predictions
 from gsparc.models.baselines.mean import Mean
 from gsparc.training.context import FitContext
@@ -20,7 +21,8 @@ def test_test_rows_are_drawn(campaign, tmp_path, kind):
     fold = Fold(rows[::2], rows[:0], rows[1::2])
     method = Mean()
     method.fit(data, fold, FitContext(tmp_path))
-    draw_predictions(method, data, fold, "title", tmp_path / "deep" / "test.png")
+    shown = Examples.of_methods({"mean": method}, data, fold.test) if kind == "spectrum" else None
+    draw_predictions(method, data, fold.test, shown, "title", tmp_path / "deep" / "test.png")
     with Image.open(tmp_path / "deep" / "test.png") as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20
 
@@ -32,7 +34,7 @@ def test_levels_of_silent_rows_were_drawn_as_measured(campaign, tmp_path, monkey
     monkeypatch.setattr(pictures, "draw_points", lambda target, *rest: drawn.append(target))
     fold, method = Fold(rows[::2], rows[:0], rows[1::2]), Mean()
     method.fit(data, fold, FitContext(tmp_path))
-    draw_predictions(method, data, fold, "title", tmp_path / "test.png")
+    draw_predictions(method, data, fold.test, None, "title", tmp_path / "test.png")
     assert len(drawn[0]) == len(rows[3::4])
 
 

@@ -162,7 +162,7 @@ class Tiny:
         dropped = [word for word in given if word.startswith("~")]
         words = {key: value for key, value in given.items() if key not in dropped}
         if "dataset" in words or name in ("train", "study"):
-            chosen = words.get("dataset") or ("sionna" if words.get("experiment") == "sionna" else "rfid")
+            chosen = words.get("dataset") or OF_EXPERIMENT.get(words.get("experiment", ""), "rfid")
             kind = chosen.removesuffix("_sim")
             if chosen in ("rfid", "argos"):
                 words["dataset.root"] = self.data(kind)
@@ -217,12 +217,18 @@ class Tiny:
         gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"
         if name in ("train", "study") and gsparc:
             words |= FIELD
+        if name == "train" and "experiment" in words:
+            words["hydra.mode"] = "RUN"  # of its sweep one job
         words["hydra.run.dir"] = str(run)
         return [*dropped, *(f"{key}={value}" for key, value in words.items())]
 
 
 # Commands about a model.
 ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate", "export")
+OF_EXPERIMENT = {  # datasets that an experiment is of, where it is not rfid
+    "sionna": "sionna", "paper/coverage": "argos_sim", "paper/snr_brackets": "argos_sim",
+    "paper/argos": "argos", "paper/sionna_room": "sionna",
+}  # fmt: skip
 ALIKE = {
     "city": "powder", "exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble",
     "hall_2": "ble",

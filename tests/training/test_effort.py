@@ -56,5 +56,5 @@ def test_a_run_that_seconds_ended_goes_on_without_them(tmp_path):
     (tmp_path / ".hydra").mkdir()
     for name, told in notes.items():
         (tmp_path / ".hydra" / name).write_text(yaml.safe_dump(told))
-    words = [f"ckpt_path={tmp_path}"]
+    words = [f"ckpt_path={tmp_path}", "hydra.run.dir=x"]
     assert add_settings_of_run(words) == ["seed=3", "hydra.mode=RUN", *words]

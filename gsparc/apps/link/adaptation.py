@@ -9,10 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import choice
+
 # 14 symbols of a slot less two of pilots.
 SYMBOLS = 12  # of a slot that carry data
 # 256 positions x 28 MCS x tones are held by Sionna at once.
 CHUNK = 256
+RULES = choice("carries_most", "target")  # how an MCS is chosen from a prediction
 OUTAGE = 0.5  # a transport block that fails more often than this carries nothing worth having
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(9)  # of a normal law
 # d(10 log10 |h|^2) = 20 / ln 10 times the relative error, whose real part has half of its power.
@@ -30,7 +33,7 @@ class Rates:
         best_bps: (n,) of the MCS that carries most, were the channel known [bit/s].
         fails: (n,) block error rate of the chosen MCS.
         outage: (n,) bool, the oracle's transport blocks mostly fail.
-        care: share of `SLOW_DECIBEL` that the choice allowed for.
+        care: share of `SLOW_DECIBEL` that the choice allowed for; None where it was not asked.
     """
 
     snr_db: float
@@ -41,7 +44,7 @@ class Rates:
     best_bps: np.ndarray
     fails: np.ndarray
     outage: np.ndarray
-    care: float
+    care: float | None
 
 
 @dataclass(frozen=True)
@@ -73,9 +76,9 @@ class Band:
 class Adaptation:
     """MCS by effective SINR (EESM) and Sionna's block error tables, PUSCH, MCS table 1.
 
-    The oracle takes the highest MCS whose blocks fail in at most `bler_target`. From a prediction the MCS is
-    taken that is expected to carry most, the effective SINR being normal in dB with a spread that grows with
-    the expected error.
+    The oracle takes the highest MCS whose blocks fail in at most `bler_target`; so does a prediction by the
+    rule `target` (the paper). By `carries_most` it takes the MCS that is expected to carry most, the
+    effective SINR being normal in dB with a spread that grows with the expected error.
 
     Args:
         bler_target: of a transport block.
@@ -95,16 +98,22 @@ class Adaptation:
         efficiency = (order.double() * rate.double()).cpu()
         self.full_bps = efficiency * subcarriers * symbols_per_s
 
-    def rates(self, band: Band, noise: float, care: float) -> Rates:
-        """Choose on the prediction, live with the truth; `noise` is the noise power, `care` as in `Rates`."""
+    def rates(self, band: Band, noise: float, care: float | None) -> Rates:
+        """Choose on the prediction, live with the truth; `noise` is the noise power, `care` as in `Rates`.
+
+        Without care the rule is `target`.
+        """
         there = self._effective_db(band.true.abs().square() / noise)
         guess = self._effective_db(band.expected_power / noise)
         fails = self._fails(there)
         oracle = self._highest(fails)
-        # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
-        loud = band.expected_power.mean(1).clamp_min(1e-30)
-        doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
-        chosen = self._carries_most(guess, care * doubt)
+        if care is None:
+            chosen = self._highest(self._fails(guess))
+        else:
+            # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
+            loud = band.expected_power.mean(1).clamp_min(1e-30)
+            doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
+            chosen = self._carries_most(guess, care * doubt)
         # Infinite where there is no such MCS: it carries nothing, as one that always fails.
         delivered = self.full_bps * (1 - fails.clamp_max(1))
 

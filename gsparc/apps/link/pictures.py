@@ -14,14 +14,16 @@ from gsparc.prediction.risk import binomial_interval
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),
+    "ls@accepted": ("LS from pilots, accepted", PALETTE[3], "-"),
     "lmmse@accepted": ("LMMSE pilots, accepted", PALETTE[2], "-"),
     "predicted@accepted": ("predicted, accepted", PALETTE[0], "-"),
     "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", PALETTE[6], "-"),
     "perfect": ("perfect, all", "black", ":"),
+    "ls": ("LS from pilots, all", PALETTE[3], ":"),
     "lmmse": ("LMMSE pilots, all", PALETTE[2], ":"),
     "predicted": ("predicted, all", PALETTE[1], ":"),
     "predicted_pilots": ("prediction corrected by pilots, all", PALETTE[6], ":"),
-    "fallback": ("predicted, else LMMSE pilots, all", PALETTE[4], "--"),
+    "fallback": ("predicted, else pilots, all", PALETTE[4], "--"),
 }
 RATES = {
     "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
@@ -47,7 +49,7 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
             axes[0, column].errorbar(curve.index, bler, reach, **style_above)
             axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
-        axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
+        axes[0, column].set_title(f"{modulation.upper()}, one layer, {title}", fontsize=10)
         # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
         for row, what in enumerate(("block error rate", "bit error rate")):
@@ -57,21 +59,29 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
     save(figure, path)
 
 
-def draw_rates(rates: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
-    """Draw throughput over noise, and the confidence of right and wrong choices."""
+def draw_rates(
+    rates: list[Rates], confidence: np.ndarray, least: float, title: str, path: Path
+) -> None:  # fmt: skip
+    """Draw throughput over noise, and the confidence of right and wrong choices, `least` of it accepted."""
     figure, ((left, right),) = panels(11, 4, 1, 2)
     for name, (style, label) in RATES.items():
         mean = [getattr(one, name).mean() / 1e6 for one in rates]
         left.plot([one.snr_db for one in rates], mean, style, label=label)
-    left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
+    left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]")
+    left.set_title(title)
     left.legend()
     middle = rates[len(rates) // 2]
     # Misses of three and more are rare: one box for them.
     miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
-    groups = {name: score[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
+    groups = {name: confidence[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
     present = {f"{name}\n(n={len(group)})": group for name, group in groups.items() if len(group)}
     right.boxplot(list(present.values()), tick_labels=list(present))
     right.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
+    if np.isfinite(least):
+        right.axhline(least, color="grey", linestyle="--", label=f"accepted from {least:.2g} on")
+        right.legend()
+    share = middle.chosen_bps.mean(), middle.oracle_bps.mean()
+    right.set_title("{:.1f} of {:.1f} Mbit/s".format(*(value / 1e6 for value in share)))
     save(figure, path)
 
 
@@ -84,7 +94,7 @@ def draw_acceptance(acceptance: Mapping[str, tuple[float, pd.DataFrame]], share:
         for name in rates:
             label, colour, _ = STYLES[f"{name}@accepted"]
             axis.plot(rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted"))
-        axis.axvline(share, color="grey", linestyle=":", label="accepted under the promise")
+        axis.axvline(share, color="grey", linestyle=":", label="accepted")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")
         axis.legend(fontsize=8)

@@ -1,8 +1,8 @@
-"""5G NR PUSCH with four kinds of channel knowledge, every block the same for all of them."""
+"""5G NR PUSCH with several kinds of channel knowledge, every block the same for all of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -12,10 +12,13 @@ from scipy.linalg import toeplitz
 from torch import Tensor
 
 from gsparc.apps.link.adaptation import Band
+from gsparc.data.limits import choice
 
 Prior = Callable[[], tuple[Tensor, Tensor] | None]
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 LEAST_VARIANCE = 1e-6  # of a channel's power: pilots always correct a little
+NEEDED = "perfect", "predicted"  # receivers that the others are judged beside
+RECEIVERS = choice(*NEEDED, "ls", "lmmse", "predicted_pilots")
 MODULATIONS = {"qpsk": 5, "qam16": 14}  # MCS of table 1: rates 0.37 and 0.54
 
 
@@ -29,12 +32,12 @@ class Pusch:
         correlation: frequency correlation at multiples of the subcarrier spacing (12 blocks,) complex, from
             training channels; the LMMSE estimator's knowledge.
         iterations: of the LDPC decoder.
-        with_pilots: whether the prediction is also corrected by pilots, for which it needs a variance.
+        names: of the receivers, see `RECEIVERS`.
     """
 
     def __init__(
         self, modulation: str, blocks: int, spacing_khz: int, correlation: np.ndarray, iterations: int = 20,
-        with_pilots: bool = True,
+        names: Sequence[str] = ("perfect", "lmmse", "predicted", "predicted_pilots"),
     ) -> None:  # fmt: skip
         from sionna.phy import nr
 
@@ -50,16 +53,17 @@ class Pusch:
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
         self._prior: tuple[Tensor, Tensor] | None = None
+        dmrs = config.dmrs.length, config.dmrs.additional_position, config.dmrs.num_cdm_groups_without_data
         estimators: dict[str, Estimator] = {
-            "perfect": lambda y, no: self._known["perfect"], "lmmse": _Wiener(self.grid, correlation),
-            "predicted": lambda y, no: self._known["predicted"],
+            "perfect": lambda y, no: self._known["perfect"],
+            "ls": nr.PUSCHLSChannelEstimator(self.grid, *dmrs, interpolation_type="lin"),
+            "lmmse": _Wiener(self.grid, correlation), "predicted": lambda y, no: self._known["predicted"],
+            "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
         }  # fmt: skip
-        if with_pilots:
-            estimators["predicted_pilots"] = _Wiener(self.grid, correlation, lambda: self._prior)
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
         made = partial(nr.PUSCHReceiver, self.transmitter, **how)
-        self.receivers = {name: made(channel_estimator=one) for name, one in estimators.items()}
+        self.receivers = {name: made(channel_estimator=estimators[name]) for name in names}
 
     @property
     def pilot_share(self) -> float:

@@ -11,11 +11,13 @@ import numpy as np
 import pandas as pd
 
 from gsparc.apps.link import study
-from gsparc.apps.link.adaptation import Rates
+from gsparc.apps.link.adaptation import RULES, Rates
 from gsparc.apps.link.channels import band_evidence, predict_channels
-from gsparc.apps.link.pusch import Pusch, frequency_correlation
+from gsparc.apps.link.pusch import NEEDED, RECEIVERS, Pusch, frequency_correlation
+from gsparc.data.limits import SHARE, or_null
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid
+from gsparc.prediction.confidence import as_confidence, confidence_threshold
 from gsparc.prediction.risk import Guarantee, calibrate_threshold
 
 log = logging.getLogger(__name__)
@@ -42,9 +44,15 @@ class LinkStudy:
         if site.kind != "csi" or site.subcarriers_hz is None:
             raise ValueError(f"gsparc link needs complex channels with their frequencies, not {site.kind}")
         site.need_phase("gsparc link")
+        RULES.check("rule", settings["rule"])
+        for name in (receivers := list(settings["receivers"])):
+            RECEIVERS.check("receivers", name)
+        if missing := [name for name in NEEDED if name not in receivers]:
+            raise ValueError(f"receivers={receivers}: {' and '.join(missing)} must be among them")
+        or_null(SHARE).check("threshold", settings["threshold"])
         if not 0 <= self.antenna < (antennas := run.data.target.shape[1]):
             raise ValueError(f"antenna={self.antenna}: the channels have {antennas}, numbered from 0")
-        self.tones, self.mcs = site.subcarriers_hz, settings["mcs"]
+        self.tones, self.mcs, self.rule = site.subcarriers_hz, settings["mcs"], settings["rule"]
         self.count = SUBCARRIERS_PER_BLOCK * self.shape["blocks"]
         self.spacing_hz = 1e3 * self.shape["spacing_khz"]
         self.one = slice(self.antenna, self.antenna + 1)
@@ -55,25 +63,31 @@ class LinkStudy:
         promise = Guarantee(**settings["promise"])
         how = settings["confidence"], settings["spatial"], int(settings["seed"])
         kind, threshold, self.test, aside = calibrate_threshold(evidence, promise, *how)
-        scores = evidence.scores[kind]
-        self.score = scores[self.test]
-        self.accepted = self.score >= threshold.value
+        every, given = as_confidence(kind, evidence.scores[kind]), settings["threshold"]
+        self.least = confidence_threshold(kind, threshold) if given is None else float(given)
+        self.confidence = every[self.test]
+        self.accepted = self.confidence >= self.least
         # Rates are tuned on rows set aside from the test, and on those that would be accepted.
-        rows = aside[scores[aside] >= threshold.value]
+        rows = aside[every[aside] >= self.least]
         self.aside = rows if len(rows) else aside
-        self.states_variance = bool(grid.variance.isfinite().all())
-        if not self.states_variance:
+        states_variance = bool(grid.variance.isfinite().all())
+        if not states_variance:
             text = "%s states no error variance: rates are chosen as if it were exact, pilots do not mend it"
             log.warning(text, self.method.name)
+        self.receivers = [name for name in receivers if name != "predicted_pilots" or states_variance]
         self.grid, bad = grid.select_positions(self.test), promise.is_bad(evidence.error[self.test])
         self.facts: dict[str, Any] = {
             "seed": int(settings["seed"]), "positions": len(self.test), "confidence/kind": kind,
-            "accepted": float(self.accepted.mean()), "promise/alpha": promise.alpha,
-            "promise/delta": promise.delta, "promise/limit_db": promise.limit_db,
+            "accepted": float(self.accepted.mean()), "promise/limit_db": promise.limit_db,
             "promise/bad_among_accepted": float(bad[self.accepted].mean()) if self.accepted.any() else None,
-            "promise/calibrated_on": threshold.accepted, "promise/bound": threshold.bound(promise.delta),
-            "model/states_variance": self.states_variance,
+            "threshold": self.least if np.isfinite(self.least) else None,
+            "model/states_variance": states_variance,
         }  # fmt: skip
+        if given is None:  # a threshold by hand promises nothing
+            self.facts |= {
+                "promise/alpha": promise.alpha, "promise/delta": promise.delta,
+                "promise/calibrated_on": threshold.accepted, "promise/bound": threshold.bound(promise.delta),
+            }  # fmt: skip
 
     def beams(self) -> dict[str, Any]:
         """Return `beams/*` of all test positions, as nothing of a beam was chosen on any.
@@ -93,7 +107,7 @@ class LinkStudy:
             predict_channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = study.adapt_rates(own, other, self.mcs)
+        rates = study.adapt_rates(own, other, self.mcs, self.rule)
         return rates, study.rate_facts(rates, self.accepted)
 
     def send(
@@ -105,12 +119,12 @@ class LinkStudy:
         heard = self.data.targets(self.fold.train)[:, self.antenna]
         known = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
         shape = self.shape
-        how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], self.states_variance
+        how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], self.receivers
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = study.send_blocks(pusch, self.grid.band(), levels, sizes)
         rates = study.error_curves(blocks, self.accepted)
-        surest = study.errors_by_acceptance(blocks, self.score, SHARES)
+        surest = study.errors_by_acceptance(blocks, self.confidence, SHARES)
         facts = study.pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()

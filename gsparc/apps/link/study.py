@@ -17,7 +17,7 @@ from gsparc.data.executor import run_all
 from gsparc.prediction.risk import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
-FALLBACK = "lmmse"
+FALLBACK = "lmmse", "ls"  # the first that is sent
 LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 dB off, not infinitely
 
 
@@ -84,13 +84,14 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
     return facts
 
 
-def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Rates]:
+def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any], rule: str) -> list[Rates]:
     """Return rates at noise levels that put the median position at `snr_db` of the settings.
 
     Args:
         band: of the positions to be judged.
         aside: of others, on which the care is chosen.
         settings: `mcs` of conf/link.yaml.
+        rule: one of `RULES`.
 
     Raises:
         ValueError: every position is silent.
@@ -102,8 +103,9 @@ def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any]) -> list[Ra
         raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
     noises = [median / 10 ** (level / 10) for level in settings["snr_db"]]
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
-    delivered = {c: sum(loop.rates(aside, n, c).chosen_bps.mean() for n in noises) for c in settings["care"]}
-    care = max(delivered, key=lambda c: delivered[c])
+    cares = settings["care"] if rule == "carries_most" else []
+    delivered = {c: sum(loop.rates(aside, n, c).chosen_bps.mean() for n in noises) for c in cares}
+    care = max(delivered, key=lambda c: delivered[c], default=None)
     return run_all(lambda noise: loop.rates(band, noise, care), noises, "noise levels")
 
 
@@ -170,8 +172,9 @@ def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.Dat
     parts: dict[str, pd.DataFrame] = {}
     for name, own in blocks.groupby("receiver", sort=False):
         parts[str(name)], parts[f"{name}@accepted"] = own, own[accepted[own.position]]
-    pilots = parts[FALLBACK]
-    parts["fallback"] = pd.concat([parts["predicted@accepted"], pilots[~accepted[pilots.position]]])
+    if pilot := next((name for name in FALLBACK if name in parts), None):
+        others = parts[pilot][~accepted[parts[pilot].position]]
+        parts["fallback"] = pd.concat([parts["predicted@accepted"], others])
     levels, counts = blocks.ebno_db.unique(), {"errors": 0, "blocks": 0}
     columns = {
         "bler": ("failed", "mean"), "ber": ("wrong", "mean"), "errors": ("failed", "sum"),

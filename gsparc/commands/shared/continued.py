@@ -7,6 +7,7 @@ from pathlib import Path
 
 import yaml
 
+from gsparc.data.files import SUMMARY
 from gsparc.training.effort import GONE
 
 PATHS = ("init_from", "known_walls")  # settings that may be files, beside those of groups
@@ -18,7 +19,7 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
 
     Args:
         words: overrides and options. A group chosen among them, as `model=gp`, leaves out what the run was
-            told of that group.
+            told of that group. A run that was interrupted finishes in its folder, unless another is given.
     """
     said = {_key(word): word.partition("=")[2].strip("'\"") for word in words if not word.startswith("-")}
     if said.get("ckpt_path", "") in ("", "null"):
@@ -33,8 +34,13 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
     own = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & said.keys()]
     own = [one for one in own if _key(one).rpartition(".")[2] not in GONE]  # of runs that seconds ended
     own = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in own]
-    once_only = [] if {"-m", "--multirun"} & {*words} else ["hydra.mode=RUN"]  # it may be a job of a multirun
-    return [*own, *once_only, *words]
+    if {"-m", "--multirun"} & {*words}:
+        return [*own, *words]
+    own.append("hydra.mode=RUN")  # it may be a job of a multirun
+    # What a finished run has left stays as it is, and so do the settings that an interrupted one began with.
+    if "hydra.run.dir" not in said and not (told.parent / SUMMARY).exists():
+        own += [f"hydra.run.dir='{told.parent}'", "hydra.output_subdir=null"]
+    return [*own, *words]
 
 
 def _key(override: str) -> str:

@@ -33,6 +33,10 @@ BESIDE = {  # figures beside the score, and their headings, by their columns
         "rmse_db_after_constant", Column("after a constant, dB", ".2f", of="after_constant"),
     ),
     "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
+    **{
+        name: (name, Column(heading_of(name), number_format(name), of=name))
+        for name in ("psnr_db_median", "ssim_gauss_median", "snr_db_p50", "mae_db_median")
+    },
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
@@ -75,6 +79,7 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
         `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
         `behind_db`: how much the best over draws has more, and its standard error, see `lead_over_runs`.
+        `psnr_db_median` and the like: medians over test rows.
         `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier score of
         predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB]; `chi2`: of
         `reduced_chi_squared`.

@@ -18,7 +18,9 @@ from PIL import Image
 
 from gsparc.evaluation import plots, summary
 from gsparc.evaluation.drawing import save
+from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
+from gsparc.evaluation.pictures import draw_spectra
 from gsparc.evaluation.report import tables
 from gsparc.evaluation.results import STUDY, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
@@ -74,15 +76,18 @@ def make_sections(
         several = [tables.table_of_seeds] * (len(firsts) < len(own))
         kinds = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
         swept = [columns for name, columns in fronts if name == dataset]
-        of_sample = [OF_KIND[own.kind.iloc[0]].of_sample]
+        drawn = OF_KIND[own.kind.iloc[0]].distributions
+        examples = join_examples(study)
+        named = [] if examples else [("test.png", "")]
         pictures = [
             (f"{setting}{what}", _png(run.folder / name))
             for setting, run in zip(firsts.setting[:MOST_PICTURES], firsts.run, strict=False)
-            for name, what in (("test.png", ""), ("sectors.png", ": sectors"))
+            for name, what in (*named, ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
         ]
         shown = [table for table in (kind(study) for kind in kinds) if table.rows]
-        figures = [plots.draw_pareto(study, swept), plots.draw_distributions(study, of_sample)]
+        figures = [plots.draw_pareto(study, swept), plots.draw_distributions(study, drawn)]
+        figures += [] if examples is None else [draw_spectra(examples, title)]
         sections.append(Section(title, study, warnings(study), shown, figures, pictures))
     return sections
 

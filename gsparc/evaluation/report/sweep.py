@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SCORED = ("test/", "val/", "train/")  # figures that settings are compared by
-WIDE = ("SSIM (uniform 7)", "MSE", "p95")  # left to the files
+WIDE = ("SSIM (uniform 7)", "MSE", "p95", "median PSNR dB", "median MSE")  # left to the files
 
 
 class SweepReport(Callback):
@@ -36,10 +37,13 @@ class SweepReport(Callback):
         retime: time the models of the sweep when all jobs are done, in turns, with nothing beside them.
         rounds: visits to each model by the clock.
         rounds_s: no new round after this [s].
+        pictures: drawn beside `sweep.png`, names of `confidence_pictures.PICTURES`.
     """
 
-    def __init__(self, retime: bool = True, rounds: int = 40, rounds_s: float = 60.0) -> None:
-        self.retime, self.rounds, self.rounds_s = retime, rounds, rounds_s
+    def __init__(
+        self, retime: bool = True, rounds: int = 40, rounds_s: float = 60.0, pictures: Sequence[str] = ()
+    ) -> None:
+        self.retime, self.rounds, self.rounds_s, self.pictures = retime, rounds, rounds_s, pictures
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **unused: Any) -> None:
         """Report a failure when it happens; the sweep goes on, and ends with exit status 1."""
@@ -77,6 +81,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     """
     # Here, as they take half a second, and a mistyped option is to be named at once.
     from gsparc.evaluation import plots
+    from gsparc.evaluation.confidence_pictures import draw_confidences
     from gsparc.evaluation.experiment.runner import time_again
     from gsparc.evaluation.report.page import write_report
     from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
@@ -91,6 +96,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         plots.draw_sweep(group, f"{title}: {section.title}", folder / f"{stem}.png")
+        draw_confidences(settings.pictures, group, section.title, folder, stem.removeprefix("sweep"))
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
         seeds = {run.config.get("split.seed") for run in own.run}
         if own.split.iloc[0] == "random" and len(seeds) > 1 == own.draw.nunique():

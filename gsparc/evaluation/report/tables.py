@@ -107,8 +107,13 @@ def accuracy_column(figure: str, note: str = "") -> Column:
 
 
 def _figures(rows: pd.DataFrame) -> list[str]:
-    """Figures of these data, first the one that decides: with silent rows it is none of the usual ones."""
-    return list(dict.fromkeys([rows.figure.iloc[0], *OF_KIND[rows.kind.iloc[0]].columns]))
+    """Figures of these data, first the one that decides: with silent rows it is none of the usual ones.
+
+    Medians that no run has, as of older ones, are left out.
+    """
+    kind = OF_KIND[rows.kind.iloc[0]]
+    medians = [name for name in kind.medians if name in rows and rows[name].notna().any()]
+    return list(dict.fromkeys([rows.figure.iloc[0], *kind.columns, *medians]))
 
 
 def groups_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:

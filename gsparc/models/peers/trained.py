@@ -106,6 +106,7 @@ class TrainedPeer(Method):
     """Learns from `fold.train` and `fold.val` together in counted steps; nothing is chosen on `val`.
 
     Args:
+        learn_val: false: validation rows are not learned from, but watched, and their figures logged.
         max_steps: of the learning-rate schedule. None takes `usual_steps`, times the effort.
         batch_size: samples per step.
         rate: Adam's learning rate where `rates` names no other.
@@ -121,6 +122,7 @@ class TrainedPeer(Method):
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
+    learn_val: bool = True
     max_steps: int | None = None
     batch_size: int = 8
     rate: float = 2e-3
@@ -159,7 +161,8 @@ class TrainedPeer(Method):
             RuntimeError: the loss became NaN or infinite.
         """
         kinds, kind = tuple(self.usual_steps), data.site.kind
-        rows = np.sort(np.concatenate([fold.train, fold.val]))
+        own = replace(fold, train=np.r_[fold.train, fold.val], val=fold.val[:0]) if self.learn_val else fold
+        rows = np.sort(own.train)
         if kind not in kinds:
             raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
         if not len(rows):
@@ -175,8 +178,7 @@ class TrainedPeer(Method):
             origin.require_same(read_interrupted(context.resume))
         module = self.module(self._count_steps(kind, context.counts, asked), context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
-        all_rows = Fold(rows, rows[:0], fold.test)
-        trainer, batches = make_trainer(module, data, all_rows, context, files, watch)
+        trainer, batches = make_trainer(module, data, replace(own, train=rows), context, files, watch)
         with interruptible(trainer, batches):
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
         result = read_trainer_result(trainer, watch)

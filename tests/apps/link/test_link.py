@@ -179,6 +179,8 @@ def test_without_doubt_the_choice_carries_most() -> None:
     true = draw(40, 26)
     known = Band(true, true, torch.zeros(40))
     loop = Adaptation()
+    same = loop.rates(known, 0.03, None)  # the paper's rule
+    assert (same.chosen == same.oracle).all()
     found = loop.rates(known, 0.03, 1.0)
     assert np.allclose(found.chosen_bps, found.best_bps)
     assert found.oracle_bps.mean() > 5e6 and (found.best_bps >= found.oracle_bps).all()
@@ -242,6 +244,35 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     assert facts["pusch/qpsk/perfect/4dB/bler"] <= facts["pusch/qpsk/perfect/3dB/bler"]
     assert facts["pusch/truth"] == "rays" and 0 <= facts["tradeoff/qpsk/predicted/100%"] <= 1
     assert find_unexplained(tmp_path) == []
+    assert not any(line.startswith("qpsk: no curve") for line in answer.out)
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_a_threshold_by_hand_the_paper_s_rule_and_receivers(trained, tmp_path, monkeypatch) -> None:
+    """Where no curve crosses 10 % a table without columns stood there."""
+    monkeypatch.setattr(
+        "gsparc.evaluation.open_runs.datamodule",
+        lambda settings, trusted: SimpleNamespace(measurements=trained[0]),
+    )
+    monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
+    words = [
+        f"ckpt={trained[1]}", "pusch.ebno_db.qpsk=[9.0]", "pusch.ebno_db.qam16=[]", "pusch.coarse=16",
+        "pusch.fine=16", "pusch.iterations=4", "mcs.snr_db=[15]", "threshold=0.59", "rule=target",
+        "receivers=[perfect,ls,lmmse,predicted]", "dataset.name=x", "split.name=y",
+        f"hydra.run.dir={tmp_path}",
+    ]  # fmt: skip
+    answer = knock(COMMANDS["link"].run, "link", words)
+    assert answer.status == 0, answer
+    facts = json.loads((tmp_path / "summary.json").read_text())
+    assert facts["threshold"] == 0.59 and "promise/bound" not in facts and facts["mcs/15dB/care"] is None
+    assert {"ls", "lmmse"} < {key.split("/")[2] for key in facts if key.startswith("pusch/qpsk/")}
+    assert any(line.startswith("qpsk: no curve crosses 10 %") for line in answer.out)
+    assert not any("behind" in line for line in answer.out)
+    assert find_unexplained(tmp_path) == []
+    for wrong, message in (("receivers=[perfect]", "predicted must be among"), ("rule=best", "rule='best'")):
+        refused = knock(COMMANDS["link"].run, "link", [*words, wrong, f"hydra.run.dir={tmp_path / 'no'}"])
+        assert refused.status == 1 and message in refused.err[-1]
 
 
 def _split():

@@ -33,7 +33,12 @@ def test_a_run_to_go_on_from_brings_its_settings(tmp_path, of, words, kept):
     (notes / "overrides.yaml").write_text(told)
     (notes / "hydra.yaml").write_text(HYDRA.replace("WHERE", str(tmp_path)))  # where the run was started
     line = [f"ckpt_path={tmp_path / of}", *words]
-    assert add_settings_of_run(line) == [*(one.replace("DATA", str(data)) for one in kept), *line]
+    kept = [one.replace("DATA", str(data)) for one in kept]
+    here = [f"hydra.run.dir='{tmp_path / 'run'}'", "hydra.output_subdir=null"] * ("-m" not in words)
+    assert add_settings_of_run(line) == [*kept, *here, *line]  # it finished in a folder of its own
+    assert add_settings_of_run([*line, "hydra.run.dir=x"]) == [*kept, *line, "hydra.run.dir=x"]
+    (tmp_path / "run" / "summary.json").touch()
+    assert add_settings_of_run(line) == [*kept, *line]  # a finished one stays
 
 
 def test_no_run_to_go_on_from_was_one_called_null(tmp_path, monkeypatch):

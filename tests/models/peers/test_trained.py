@@ -1,6 +1,7 @@
 """What every peer trained by gradient keeps to: its steps, its kinds, its checkpoint, the test rows."""
 
 import signal
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -93,6 +94,21 @@ def test_peers_had_loops_of_their_own(tmp_path):
         assert torch.equal(value, goes_on.fitted().state_dict()[name]), name
     other = Fold(fold.train[1:], fold.val, fold.test)
     refused("was trained with other rows", brief("nerf2").fit, data, other, FitContext(tmp_path, resume=last))
+
+
+def test_a_published_method_may_watch_validation_rows(tmp_path):
+    """It learned from them all, and no curve of its training showed what it does on others."""
+    data, fold = lobes(tmp_path)
+    logger, method = CSVLogger(tmp_path, "log"), brief("nerf2", max_steps=4, learn_val=False)
+    method.fit(data, fold, FitContext(tmp_path / "run", loggers=[logger]))
+    logger.save()
+    assert "val/psnr_db" in (Path(logger.log_dir) / "metrics.csv").read_text()
+    poisoned = replace(data, target=data.target.copy())
+    poisoned.target[fold.val] = 0
+    again = brief("nerf2", max_steps=4, learn_val=False)
+    again.fit(poisoned, fold, FitContext(tmp_path / "again"))
+    for name, value in method.fitted().state_dict().items():
+        assert torch.equal(value, again.fitted().state_dict()[name]), name
 
 
 def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory(tmp_path, monkeypatch):

@@ -1,0 +1,131 @@
+"""What a confidence is worth, drawn from per-sample figures: over losses, what it accepts, by brackets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import spearmanr
+
+from gsparc.evaluation.drawing import GREY, PALETTE, numbered_style, panels, save, style_of
+from gsparc.evaluation.metric_formats import OF_KIND, axis_of
+from gsparc.evaluation.results import own_rows
+from gsparc.evaluation.table import Row
+from gsparc.prediction.risk import bounded_loss
+
+PAPER_TAU = 0.59  # of confidences between their least and largest over the test rows
+SSIM_WEIGHT = 0.2  # of 1 - SSIM in the loss of a spectrum, the rest absolute error (the paper)
+BRACKET_DB = 5.0
+OUTER = 0.02, 0.98  # quantiles of the rows: brackets beyond them are those of these
+WIDE, TALL = 3.6, 3.2  # inches of a panel
+
+
+def draw_confidences(
+    names: Iterable[str], rows: pd.DataFrame, title: str, folder: Path, end: str = ""
+) -> None:  # fmt: skip
+    """Save pictures of `PICTURES` by name, of the runs of a frame that state a confidence, if any."""
+    runs = [row for row in own_rows(rows).to_dict("records") if _states(row)]
+    for name in names if runs else ():
+        if name != "snr_brackets" or runs[0]["kind"] != "rssi":  # powers have no ratio to an error
+            figure = PICTURES[name](runs)
+            figure.suptitle(title, fontsize=9)
+            save(figure, folder / f"{name}{end}.png")
+
+
+def _states(row: Row) -> bool:
+    return bool(np.isfinite(row["run"].samples.get("confidence", np.zeros(1) * np.nan)).all())
+
+
+def _label(row: Row) -> str:
+    return f"{row['setting']}, seed {row['seed']}"
+
+
+def _loss(row: Row) -> np.ndarray:
+    """What a test row costs (n,): the paper's of spectra, |e|^2 / |h|^2 of channels, |decibels| of powers."""
+    own = row["run"].samples
+    if "error_db" in own:
+        return np.abs(own["error_db"])
+    if row["kind"] != "spectrum":
+        return bounded_loss(own["error_power"] / np.maximum(own["target_power"], 1e-300))
+    return (1 - SSIM_WEIGHT) * own["mae"] + SSIM_WEIGHT * (1 - np.nan_to_num(own["ssim_gauss"], nan=1.0))
+
+
+def _draw_over_loss(runs: list[Row]) -> Figure:
+    """Confidence of low and high losses, over quintiles of loss, and against the absolute error."""
+    figure, grid = panels(3 * WIDE, TALL * len(runs) + 0.3, len(runs), 3)
+    for (both, fifths, scatter), row in zip(grid, runs, strict=True):
+        sure, loss = row["run"].samples["confidence"], _loss(row)
+        high = loss > np.median(loss)
+        bins = np.linspace(sure.min(), sure.max(), 25)
+        for name, part, colour in (("low", ~high, PALETTE[2]), ("high", high, PALETTE[1])):
+            both.hist(sure[part], bins, density=True, alpha=0.6, color=colour, label=f"{name} loss")
+        both.set(xlabel="confidence C", ylabel="density of test rows", title=_label(row))
+        both.legend()
+        part = np.searchsorted(np.quantile(loss, (0.2, 0.4, 0.6, 0.8)), loss)
+        names = ["lowest", "2", "3", "4", "highest"]
+        fifths.boxplot([sure[part == number] for number in range(5)], tick_labels=names, showfliers=False)
+        fifths.set(xlabel="fifth of the loss", ylabel="confidence C")
+        spectra = row["kind"] == "spectrum"
+        error = row["run"].samples["mae"] if spectra else loss
+        scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
+        scatter.set(xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C")
+        scatter.set_title(f"rank correlation {spearmanr(sure, error).statistic:.2f}")
+    return figure
+
+
+def _draw_coverage(runs: list[Row]) -> Figure:
+    """Which test rows the paper's threshold accepts, and the share accepted over all thresholds."""
+    figure, ((places, curve),) = panels(2.4 * WIDE, TALL + 0.6, 1, 2)
+    taus = np.linspace(0, 1, 201)
+    for number, row in enumerate(runs):
+        own = row["run"].samples
+        sure, style = own["confidence"], numbered_style(number)
+        # The paper's normalisation is relative to the rows that are tested: nowhere else is it used.
+        relative = (sure - sure.min()) / max(np.ptp(sure), 1e-30)
+        for values, line, end in ((sure, "-", ""), (relative, "--", " (paper: min-max over the test rows)")):
+            share = (values[:, None] >= taus).mean(0)
+            curve.plot(taus, share, **{**style, "linestyle": line}, label=_label(row) + end)
+        if number == 0:
+            above = relative >= PAPER_TAU
+            for part, colour, what in ((above, PALETTE[2], "above"), (~above, GREY, "below")):
+                label = f"{what} {PAPER_TAU} (paper), {part.mean():.0%}"
+                places.plot(own["x_m"][part], own["y_m"][part], ".", color=colour, markersize=4, label=label)
+    places.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="test rows")
+    places.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18))
+    curve.axvline(PAPER_TAU, color=GREY, linestyle=":", label=f"threshold {PAPER_TAU}")
+    curve.set(xlabel="threshold τ", ylabel="share of test rows with C ≥ τ", xlim=(0, 1), ylim=(0, 1.02))
+    curve.legend()
+    return figure
+
+
+def _draw_brackets(runs: list[Row]) -> Figure:
+    """Boxes of rows' ratios to their error, methods beside each other, and the confidence by bracket."""
+    figure, grid = panels(2.2 * WIDE, TALL * len(runs) + 0.3, len(runs), 2)
+    for (left, right), row in zip(grid, runs, strict=True):
+        own, name = row["run"].samples, OF_KIND[row["kind"]].of_sample
+        stem, end = "baseline/", f"/{name}"
+        beside = {k[len(stem) : -len(end)]: own[k] for k in own if k.startswith(stem) and k.endswith(end)}
+        every = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): own[name]}.items()}
+        how = {"tick_labels": list(every), "showfliers": False, "patch_artist": True}
+        boxes = left.boxplot(list(every.values()), **how)
+        for box, method in zip(boxes["boxes"], [*beside, row["method"]], strict=True):
+            box.set(facecolor=style_of(method).colour, alpha=0.5)
+        left.tick_params(axis="x", labelrotation=30)
+        left.set(ylabel=f"{axis_of(name)} of a test row")
+        known = np.isfinite(own[name])
+        low, high = np.quantile(own[name][known], OUTER)
+        begin = np.floor(np.clip(own[name][known], low, high) / BRACKET_DB)  # the outermost are open
+        groups = pd.Series(own["confidence"][known]).groupby(begin * BRACKET_DB)
+        names = [f"{start:.0f}–{start + BRACKET_DB:.0f}\n{len(group)}" for start, group in groups]
+        right.tick_params(axis="x", labelsize=7)
+        right.bar(names, groups.mean(), color=PALETTE[0], alpha=0.7)
+        right.axhline(PAPER_TAU, color=GREY, linestyle="--", label=f"threshold {PAPER_TAU}")
+        right.set(xlabel=f"{axis_of(name)}, and the number of rows", ylabel="mean confidence", ylim=(0, 1.15))
+        right.legend(loc="upper left")
+    return figure
+
+
+PICTURES = {"confidence": _draw_over_loss, "coverage": _draw_coverage, "snr_brackets": _draw_brackets}

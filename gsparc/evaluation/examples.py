@@ -1,0 +1,80 @@
+"""A few test rows as every method predicts them: kept beside a run's figures, drawn side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from gsparc.data.files import whole_file
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.results import distinct_baselines
+from gsparc.models.method import Method
+from gsparc.prediction.confidence import predict_rows
+
+FILE = "predictions.npz"
+MOST = 4  # rows kept: spread over the tested ones, as rows beside each other were measured beside each other
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Spectra of B test rows, measured and predicted.
+
+    Attributes:
+        rows: (B,) of the dataset.
+        edges: (4,) least and largest azimuth, least and largest elevation [degrees].
+        truth: (B, H, W) in [0, 1].
+        confidence: (B,) of the run's own method; NaN where it states none.
+        predicted: by name of a method (B, H, W), the run's own last.
+    """
+
+    rows: np.ndarray
+    edges: np.ndarray
+    truth: np.ndarray
+    confidence: np.ndarray
+    predicted: dict[str, np.ndarray]
+
+    @classmethod
+    def of_methods(cls, methods: Mapping[str, Method], data: Measurements, rows: np.ndarray) -> Examples:
+        """Ask fitted methods, the run's own last, about a few of `rows` (n,)."""
+        assert data.site.grid is not None
+        few = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(int)]
+        said = {name: predict_rows(method, data, few) for name, method in methods.items()}
+        own = [*said.values()][-1].confidence
+        sure = np.full(len(few), np.nan) if own is None else own.numpy()
+        means = {name: one.mean.numpy() for name, one in said.items()}
+        return cls(few, np.array(data.site.grid.edges()), data.targets(few).numpy(), sure, means)
+
+    def write(self, path: Path) -> None:
+        """Write them, atomically; values to three digits, which is what is seen of them."""
+        own = {f"of {name}": values.astype(np.float16) for name, values in self.predicted.items()}
+        arrays = {name: value for name, value in vars(self).items() if name != "predicted"}
+        with whole_file(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays | {"truth": self.truth.astype(np.float16)}, **own)
+
+    @classmethod
+    def read(cls, path: Path) -> Examples | None:
+        """Return what was written; None where there is none."""
+        if not path.is_file():
+            return None
+        with np.load(path) as stored:
+            arrays = {name: stored[name].astype(float) for name in stored.files}
+        own = {name[3:]: arrays.pop(name) for name in list(arrays) if name.startswith("of ")}
+        return cls(arrays.pop("rows").astype(int), predicted=own, **arrays)
+
+
+def join_examples(rows: pd.DataFrame) -> Examples | None:
+    """Return what all runs of a frame kept of the rows that the first kept, baselines first; None without."""
+    own = rows[~rows.baseline].drop_duplicates("setting")
+    kept = [(name, Examples.read(run.folder / FILE)) for name, run in zip(own.setting, own.run, strict=True)]
+    there = [(name, one) for name, one in kept if one is not None]
+    same = [(name, one) for name, one in there if np.array_equal(one.rows, there[0][1].rows)]
+    if not same:
+        return None
+    beside = set(distinct_baselines(rows).method) - set(own.method)
+    plain = {m: v for _, one in reversed(same) for m, v in one.predicted.items() if m in beside}
+    runs = {name: [*one.predicted.values()][-1] for name, one in same}
+    return replace(same[-1][1], predicted=plain | runs)
