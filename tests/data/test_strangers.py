@@ -7,11 +7,15 @@ from doors import said
 from scipy.io import savemat
 from strangers import (
     ALONG,
+    AT,
     CASES,
     DEAF,
+    EAST,
     FLOOR,
     LEVELS,
+    NORTH,
     OF_THREE,
+    ONE_CELL,
     PLACES,
     RNG,
     ROWS,
@@ -32,6 +36,21 @@ def test_a_table_of_a_stranger(write, name):
     content, settings, says, silent = CASES[name]
     found = said(write(content), **settings)
     assert says in found and (not silent or silent not in found), found
+
+
+@pytest.mark.parametrize("name", ONE_CELL)
+@pytest.mark.parametrize("head", ["spot", "gps"])
+def test_a_place_in_one_cell_was_no_place(write, name, head):
+    data = read_any(write(table(f"{head},rssi", ONE_CELL[name], LEVELS[:, 0]))).data
+    at = data.site.georeference.from_degrees(NORTH.round(6), EAST.round(6))
+    np.testing.assert_allclose(data.moving[:, :2] + data.site.origin[:2], at, atol=1e-6)
+
+
+def test_a_list_of_stations_has_places_in_one_cell(write, tmp_path):
+    sites = [f"POINT({16.37 + x / 7.4e4:.6f} {48.2 + y / 1.1e5:.6f})" for x, y in AT]
+    (tmp_path / "sites.csv").write_text(table("name,geometry", ["AP1", "AP2", "AP3"], sites))
+    levels = table("lat,lon,AP1,AP2,AP3", NORTH, EAST, *LEVELS.T)
+    assert "3 stations in a box of" in said(write(levels), stations_file=tmp_path / "sites.csv")
 
 
 def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):

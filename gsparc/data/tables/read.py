@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gsparc.data.amplitudes import join_polar
 from gsparc.data.errors import Caution, list_first, suggest_name
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
@@ -20,10 +21,8 @@ from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.tables.cells import unfold_cells
 from gsparc.data.tables.columns import (
-    CHANNELS,
     JOINED,
     LEVELS,
-    POLAR,
     Chosen,
     Column,
     choose_columns,
@@ -31,7 +30,7 @@ from gsparc.data.tables.columns import (
     schema_unit,
     used_heads,
 )
-from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
+from gsparc.data.tables.heads import AXES, CHANNELS, LISTS, PERCENT, POLAR, station_in_head, words_of
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
@@ -72,7 +71,7 @@ def parse_table(
     listed = None
     if stations_file is not None:
         second, _ = read_sheet(stations_file, sheet.problems)
-        listed, list_notes = read_stations(second)
+        listed, list_notes = read_stations(unfold_cells(second)[0])
         notes += list_notes
         sheet.problems.raise_if_any()
     # The list of stations comes before the columns: heads that hold its names are levels of stations.
@@ -99,7 +98,6 @@ def parse_table(
 
 
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
-TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
 
 
 class Builder:
@@ -117,7 +115,7 @@ class Builder:
         measured = self._measurement()
         # Ends after the measurement: columns of several stations decide whether a station's column is needed.
         self._ends(measured)
-        for role in ("sensitivity_db", "frequency_hz"):
+        for role in ("sensitivity_db", "frequency_hz", "spacing_hz"):
             if role in self.chosen and len(self.chosen[role][0].value) < 2:
                 values = self._of_rows(role)
                 self.arrays |= {} if values is None else {role: values}
@@ -191,16 +189,10 @@ class Builder:
                 self.refuse("amplitudes below 0: levels? say dataset.columns.rssi_db='NAME_*'", head)
             return
         first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
-        if names == POLAR:
-            # A unit in the head has turned values into degrees by now; without one, over a turn is no radian.
-            degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
-            if pairs[1][self.tones[0]].unit is None:
-                self.notes.append(f"phases are taken as {'degrees' if degrees else 'radians'}")
-            unit = pairs[0][self.tones[0]].unit
-            first = 10 ** (first / 20) if unit is not None and unit.kind == "level" else first
-            turn = np.exp(1j * (np.radians(second) if degrees else second))
-            first, second = first * turn.real, first * turn.imag
         csi = first + 1j * second
+        if names == POLAR:
+            csi, said = join_polar(first, second, [pair[self.tones[0]].unit for pair in pairs])
+            self.notes += said
         csi = csi[:, 0] if csi.shape[1] == 1 else csi
         self.arrays["csi"] = csi
         if np.isnan(csi).any():
@@ -454,6 +446,9 @@ class Builder:
             self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], ends)
             if np.ptp(np.diff(self.tones)):
                 self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
+        if channels and "spacing_hz" in self.arrays:
+            middle = 0 if self.tones.min() < 0 else self.tones[len(self.tones) // 2]
+            self.arrays["frequency_hz"] = (self.tones - middle) * self.arrays.pop("spacing_hz")
         if "carrier_hz" not in self.chosen:
             return
         column = self.chosen["carrier_hz"][0]
