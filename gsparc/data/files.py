@@ -63,7 +63,7 @@ def check_line_length(path: str | Path, number: int, line: str) -> str:
 
 def check_fetched(path: Path) -> None:
     """Raise `DataError` of a file that only says where Git keeps its content."""
-    with path.open("rb") as file:
+    with suppress(OSError), path.open("rb") as file:  # said where it is read
         if file.read(len(POINTER)) == POINTER:
             raise DataError(f"{path}: not the file but a Git LFS pointer to it; git lfs pull fetches it")
 

@@ -8,6 +8,7 @@ from scipy.io import savemat
 from strangers import (
     ALONG,
     AT,
+    BAND,
     CASES,
     DEAF,
     EAST,
@@ -161,3 +162,18 @@ def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
         found, data = said(path), read_any(path).data
         assert "as well as weak ones: no value, left out" in found and data.censored is None, found
         assert len(data) == (~some).sum()
+
+
+def test_cells_without_their_name_were_refused_without_the_columns_that_name_them(write):
+    eci = np.where(BAND == 0, "", (500 + FLOOR).astype(str))
+    path = write(long("cell_id,psc,arfcn", eci, 101 + FLOOR, 1300 + 0 * FLOOR))
+    assert "no station; expected its name, or dataset.columns.station=psc+arfcn, which no row lacks" in said(
+        path
+    )
+
+
+def test_levels_in_hundredths_of_a_decibel_were_refused_row_by_row(write):
+    path = write(table("x,y,PeakRSSI", *PLACES.T, LEVELS[:, 0] * 100))
+    assert "in parts of a dB? say dataset.columns.rssi_db=PeakRSSI*0.01" in said(
+        path, columns={"rssi_db": "PeakRSSI"}
+    )

@@ -15,6 +15,7 @@ import pandas as pd
 
 from gsparc.data.amplitudes import join_polar
 from gsparc.data.errors import Caution, list_first, suggest_name
+from gsparc.data.links.hearing import MOST_DB
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Raw
@@ -30,7 +31,16 @@ from gsparc.data.tables.columns import (
     schema_unit,
     used_heads,
 )
-from gsparc.data.tables.heads import AXES, CHANNELS, LISTS, PERCENT, POLAR, station_in_head, words_of
+from gsparc.data.tables.heads import (
+    AXES,
+    CHANNELS,
+    LISTS,
+    PERCENT,
+    POLAR,
+    TOGETHER,
+    station_in_head,
+    words_of,
+)
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
@@ -97,6 +107,7 @@ def parse_table(
     return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes), explain=explain)
 
 
+UNKNOWN_ASU, MOST_GSM = 99, 31  # arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
 
 
@@ -137,8 +148,10 @@ class Builder:
                     how = say_column("rssi_db", f"{head}*-1")
                     return self.refuse(f"{fault}; {how} takes losses for levels")
                 if "asu" in words_of(head):
-                    ways = [say_column("rssi_db", f"{head}{turn}") for turn in ("-140", "*2-113")]
-                    return self.refuse(f"{fault}; {head!r} is ASU: {ways[0]} of LTE, {ways[1]} of GSM")
+                    asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
+                    coarse = (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all()
+                    how = say_column("rssi_db", f"{head}{'*2-113' if coarse else '-140'}")
+                    return self.refuse(f"{fault}; {head!r} is ASU, of {'GSM' if coarse else 'LTE'}: {how}")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
@@ -166,6 +179,10 @@ class Builder:
             choices = " or ".join(say_column(name, first.head or "") for name in LEVELS)
             fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
             self.refuse(f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or "")
+        size = np.median(np.abs(np.unique(values[np.isfinite(values)])))  # a mark counts once
+        if role == "rssi_db" and size > MOST_DB and first.head and first.unit is None:
+            how = say_column(role, f"{first.head}*{10.0 ** -np.ceil(np.log10(size / MOST_DB)):g}")
+            self.refuse(f"most of it is beyond {MOST_DB} dB: in parts of a dB? say {how}", first.head)
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
@@ -306,7 +323,8 @@ class Builder:
             # What other columns add to a listed name stands where that does: antennas, carriers, devices.
             apart = known and not set(words) <= set(joined.names)
             self.listed = listed.part_by(plain, words) if apart else listed if words is plain else joined
-        self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
+        nameless = f"no station; expected its name{self._complete_names()}"
+        self.sheet.refuse_rows(head, np.flatnonzero(words == ""), nameless)
         if self.listed is not None:
             self._all_listed(words, head)
             return None if self.sheet.problems else self._by_list(words)
@@ -333,6 +351,16 @@ class Builder:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
+
+    def _complete_names(self) -> str:
+        """The setting of columns that name a station in every row, for messages; empty without any."""
+        full = [head for head in self.sheet.heads if (self.sheet.words(head) != "").all()]
+        for head in full:
+            for parts in [TOGETHER[word] for word in words_of(head) if word in TOGETHER]:
+                names = [head, *[other for other in full if parts & {*words_of(other)}]]
+                if len(names) > 1:
+                    return f", or {say_column('station', '+'.join(names))}, which no row lacks"
+        return ""
 
     def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
         """Stations at places that nobody gave."""
