@@ -196,7 +196,7 @@ class Checker:
         """Return (K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` (None without csi)."""
         frequency = self.read_real("frequency_hz", (), (None,) if count is None else (count,))
         carrier, spacing = (self.read_real(name, ()) for name in ("carrier_hz", "spacing_hz"))
-        if count is not None and frequency is None and None not in (carrier, spacing):
+        if count is not None and frequency is None and carrier is not None and spacing is not None:
             frequency = (np.arange(count) - count // 2) * spacing
         elif count is not None and "frequency_hz" not in self.raw.arrays:
             fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"

@@ -47,6 +47,15 @@ def test_a_place_in_one_cell_was_no_place(write, name, head):
     np.testing.assert_allclose(data.moving[:, :2] + data.site.origin[:2], at, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "cell", ['"POINT (16,37 48,2)"', '"{""coordinates"": [[[1, 2], [3, 4]]]}"', "{16.37: [}"]
+)
+def test_a_cell_that_is_no_place_is_refused_in_a_line(write, cell):
+    assert "no coordinates among 'geometry'" in said(
+        write(table("geometry,rssi", [cell] * ROWS, LEVELS[:, 0]))
+    )
+
+
 def test_a_list_of_stations_has_places_in_one_cell(write, tmp_path):
     sites = [f"POINT({16.37 + x / 7.4e4:.6f} {48.2 + y / 1.1e5:.6f})" for x, y in AT]
     (tmp_path / "sites.csv").write_text(table("name,geometry", ["AP1", "AP2", "AP3"], sites))

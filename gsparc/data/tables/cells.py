@@ -13,16 +13,18 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import list_first
-from gsparc.data.tables.heads import AXIS_WORDS, LISTS, parse_head, words_of
+from gsparc.data.tables.heads import AXIS_WORDS, LISTS, SHEET, parse_head, words_of
 from gsparc.data.tables.records import unfold_places
 from gsparc.data.tables.sheet import Sheet
 
 LIST = re.compile(r"\s*\[(.+)\]\s*", re.DOTALL)
-POINT = re.compile(r"(?i)\s*(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\((.+)\)|EMPTY)\s*")  # well-known text
 PLACES = LISTS["place"] | LISTS["vector"] | set(AXIS_WORDS)
 LOGGED = "CSI_DATA"  # begins the rows of an ESP32, whose lists hold imaginary parts before real ones
 NUMBER = r"[-+]?\d*\.?\d+(?:e[-+]?\d+)?"
 PAIR = re.compile(rf"(?i)\s*[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?\s*")
+POINT = re.compile(
+    rf"(?i)\s*(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)\s*"
+)
 FINE = re.compile(r"\.\d{4}")  # digits of degrees that tell streets apart
 
 
@@ -57,20 +59,18 @@ def unfold_cells(sheet: Sheet) -> tuple[Sheet, list[str]]:
 
 def _records(sheet: Sheet, head: str) -> pd.DataFrame | None:
     """Columns of what a column's cells hold by names or as places; None where one of them holds neither."""
-    cells = sheet.words(head) if sheet.frame[head].dtype == object else np.zeros(0, str)
-    filled = np.flatnonzero(cells != "")
     named = bool(PLACES & {*words_of(head)}) and parse_head(head).role is None
-    read = [_record(cell, named) for cell in cells[filled[:1]]]
-    read += [_record(cell, named) for cell in cells[filled[1:]]] if all(read) else []
-    if not read or None in read:
+    texts = (cell.strip() for cell in sheet.frame[head] if isinstance(cell, str))
+    first = next((text for text in texts if text.lower() not in SHEET["missing"]), "")
+    if _record(first, named) is None:  # before all cells of wide tables are looked at
         return None
-    records = [{head: {}} for _ in cells]
-    for row, record in zip(filled, read, strict=True):
-        records[row] = {head: record}
-    frame = unfold_places(pd.json_normalize(records))
+    read = [_record(cell, named) if cell else {} for cell in sheet.words(head)]
+    if None in read:
+        return None
+    frame = unfold_places(pd.json_normalize([{head: record} for record in read]))
     short = {name: name.removeprefix(f"{head}.") for name in frame}
     plain = [n for n, bare in short.items() if parse_head(n).role is None and bare not in sheet.heads]
-    return frame.rename(columns={name: short[name] for name in plain})
+    return None if frame.empty else frame.rename(columns={name: short[name] for name in plain})
 
 
 def _record(cell: str, named: bool) -> dict[str, Any] | None:

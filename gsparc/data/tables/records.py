@@ -48,7 +48,7 @@ def unfold_places(frame: pd.DataFrame) -> pd.DataFrame:
     for name in [name for name in frame if name.rpartition(".")[2] in PLACES]:
         before, dot, how = name.rpartition(".")
         padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
-        places = pd.DataFrame([one[:3] for one in padded], dtype=float)
+        places = pd.DataFrame([one[:3] for one in padded]).apply(pd.to_numeric, errors="coerce")
         (turned, most), across = PLACES[how], places[[0, 1]]
         degrees = (across.abs().max() <= 360).all() and (np.ptp(across.dropna(), axis=0) < most).all()
         heads = DEGREES if degrees else METRES
