@@ -30,6 +30,7 @@ from strangers import (
 from gsparc.commands.check import main
 from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.own import write_own
+from gsparc.data.query_places import read_query_places
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -45,6 +46,12 @@ def test_a_place_in_one_cell_was_no_place(write, name, head):
     data = read_any(write(table(f"{head},rssi", ONE_CELL[name], LEVELS[:, 0]))).data
     at = data.site.georeference.from_degrees(NORTH.round(6), EAST.round(6))
     np.testing.assert_allclose(data.moving[:, :2] + data.site.origin[:2], at, atol=1e-6)
+
+
+def test_places_to_predict_may_stand_in_one_cell(write):
+    path = write(table("n,spot", range(ROWS), ONE_CELL["well-known text"]))
+    places = read_query_places(path, ["rx"])
+    np.testing.assert_allclose(places.ends["rx"].across, np.c_[NORTH, EAST], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, re
 from gsparc.data.files import check_content, check_fetched, check_line_length
 from gsparc.data.raw import ARRAY_SUFFIXES
 from gsparc.data.tables import is_table
+from gsparc.data.tables.cells import unfold_cells
 from gsparc.data.tables.heads import SHEET, parse_head
 from gsparc.data.tables.records import read_records
 from gsparc.data.tables.sheet import Sheet
@@ -334,7 +335,7 @@ def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[
 
 
 def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
-    """Read the cells of a table, with notes on what was recognised.
+    """Read the cells of a table, a column for each number of one, with notes on what was recognised.
 
     Args:
         path: of the table.
@@ -356,4 +357,5 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
     if kind == RECORDS and path.stat().st_size > MOST_BYTES:
         raise DataError(f"{path}: records of more than {MOST_BYTES:,} bytes; write them as Parquet")
     sheet, notes = read_text(path) if kind is None else (read_frame(path, kind), [])
-    return replace(sheet, problems=Problems(path) if problems is None else problems), notes
+    sheet, of_cells = unfold_cells(sheet)
+    return replace(sheet, problems=Problems(path) if problems is None else problems), [*notes, *of_cells]

@@ -20,7 +20,6 @@ from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
-from gsparc.data.tables.cells import unfold_cells
 from gsparc.data.tables.columns import (
     JOINED,
     LEVELS,
@@ -74,14 +73,13 @@ def parse_table(
         DataError: all problems, with row and column.
     """
     sheet, notes = read_sheet(path)
-    sheet, of_cells = unfold_cells(sheet)
     sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
     sheet, of_tones = unfold_tones(sheet)
-    notes = [*notes, *of_cells, *of_slots, *of_tones]
+    notes = [*notes, *of_slots, *of_tones]
     listed = None
     if stations_file is not None:
         second, _ = read_sheet(stations_file, sheet.problems)
-        listed, list_notes = read_stations(unfold_cells(second)[0])
+        listed, list_notes = read_stations(second)
         notes += list_notes
         sheet.problems.raise_if_any()
     # The list of stations comes before the columns: heads that hold its names are levels of stations.
