@@ -1,14 +1,34 @@
-"""Amplitudes of channels whose phases nobody logged: levels of as many stations as there are entries."""
+"""Amplitudes of channels: complex with phases, else levels of as many stations as there are entries."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gsparc.data.raw import Raw
+from gsparc.data.units import Unit
 
 PHASED = ("csi", "frequency_hz", "mask", "noise_variance", "array_position")  # what powers do not have
+
+
+TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
+
+
+def join_polar(
+    amplitude: np.ndarray, phase: np.ndarray, units: Sequence[Unit | None]
+) -> tuple[np.ndarray, list[str]]:
+    """Return complex channels of amplitudes and phases in the schema's units, and a note where it is a guess.
+
+    Args:
+        amplitude, phase: of one shape; phases of a unit are in degrees.
+        units: of both, as they were written; None: linear, and radians unless one is over a turn.
+    """
+    degrees = units[1] is not None or np.nanmax(np.abs(phase)) > TURN
+    notes = [] if units[1] else [f"phases are taken as {'degrees' if degrees else 'radians'}"]
+    size = 10 ** (amplitude / 20) if units[0] is not None and units[0].kind == "level" else amplitude
+    return size * np.exp(1j * (np.radians(phase) if degrees else phase)), notes
 
 
 def amplitudes_to_levels(raw: Raw) -> Raw:

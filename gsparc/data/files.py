@@ -22,6 +22,7 @@ from gsparc.data.errors import DataError, readable
 
 SUMMARY = "summary.json"  # of a finished run, written last
 LEAST_CONTENT = 5  # characters for each line, tag or bracket of a large file
+POINTER = b"version https://git-lfs"
 LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
 MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
 LEAST_NODES = 10_000  # of YAML that are not counted
@@ -58,6 +59,13 @@ def check_line_length(path: str | Path, number: int, line: str) -> str:
         fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
         raise DataError(f"{path}, line {number}: {fault}")
     return line
+
+
+def check_fetched(path: Path) -> None:
+    """Raise `DataError` of a file that only says where Git keeps its content."""
+    with suppress(OSError), path.open("rb") as file:  # said where it is read
+        if file.read(len(POINTER)) == POINTER:
+            raise DataError(f"{path}: not the file but a Git LFS pointer to it; git lfs pull fetches it")
 
 
 def check_content(path: str | Path, text: str | bytes, marks: str) -> None:

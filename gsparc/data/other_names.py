@@ -7,9 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.data.amplitudes import join_polar
 from gsparc.data.errors import Caution
 from gsparc.data.raw import Raw, rename_arrays
 from gsparc.data.schema import FIELDS
+from gsparc.data.tables.heads import CHANNELS, LISTS, PARTS, POLAR, words_of
+from gsparc.data.units import UNITS
 
 MOST_AXES = 3  # of channels of one static end
 
@@ -21,13 +24,36 @@ def _plain(name: str) -> str:
 FIELD_OF = {_plain(other): field.name for field in FIELDS.values() for other in field.also.split()}
 
 
+def _joined(raw: Raw) -> Raw:
+    """The same with real and imaginary parts, or amplitudes and phases, of channels as one complex array."""
+    parts = dict[str, str]()
+    for name in raw.arrays:
+        words = words_of(name)
+        roles = {PARTS[word] for word in words if word in PARTS}
+        if len(roles) == 1 and {*words} <= {*PARTS, *LISTS["channel"], *UNITS}:
+            parts.setdefault(roles.pop(), name)
+    for pair in (CHANNELS, POLAR):
+        names = [parts[part] for part in pair if part in parts]
+        if len(names) < 2 or raw.arrays[names[0]].shape != raw.arrays[names[1]].shape or "csi" in raw.arrays:
+            continue
+        units = [UNITS.get(words_of(name)[-1]) for name in names]
+        first, second = (raw.arrays[name].astype(np.float64) for name in names)
+        second = second if units[1] is None else units[1].convert(second)
+        polar = pair == POLAR
+        csi, notes = join_polar(first, second, units) if polar else (first + 1j * second, list[str]())
+        notes = [f"{' and '.join(names)}: taken as {' and '.join(pair)} of csi", *notes]
+        arrays = {name: array for name, array in raw.arrays.items() if name not in names}
+        return replace(raw, arrays={**arrays, "csi": csi}, notes=(*raw.notes, *notes))
+    return raw
+
+
 def name_arrays(raw: Raw) -> Raw:
     """Return `raw` with `fields.csv`'s other names of arrays replaced, and channels as complex (S, ...).
 
     Real numbers with an axis of two become real and imaginary parts; axes of length 1 go where there are
     more than `MOST_AXES`, or where one place is written (1, 3).
     """
-    names: dict[str, str] = {}
+    raw, names = _joined(raw), dict[str, str]()
     for name, array in raw.arrays.items():
         field = FIELD_OF.get(_plain(name), name)
         taken = {*raw.arrays, *names.values()}

@@ -195,10 +195,12 @@ class Checker:
     def read_frequencies(self, count: int | None) -> tuple[np.ndarray | None, float | None]:
         """Return (K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` (None without csi)."""
         frequency = self.read_real("frequency_hz", (), (None,) if count is None else (count,))
-        if count is not None and "frequency_hz" not in self.raw.arrays:
+        carrier, spacing = (self.read_real(name, ()) for name in ("carrier_hz", "spacing_hz"))
+        if count is not None and frequency is None and carrier is not None and spacing is not None:
+            frequency = (np.arange(count) - count // 2) * spacing
+        elif count is not None and "frequency_hz" not in self.raw.arrays:
             fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"
-            self.refuse("frequency_hz", fault)
-        carrier = self.read_real("carrier_hz", ())
+            self.refuse("frequency_hz", f"{fault}, or dataset.carrier_hz=HZ dataset.spacing_hz=HZ")
         if frequency is not None and carrier is not None and frequency.size:
             away = np.abs(frequency)
             if 2 * away.max() < carrier and away.min() <= np.ptp(frequency):  # values in MHz are far from 0

@@ -32,7 +32,7 @@ from scipy.io import loadmat, netcdf_file
 
 from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
 from gsparc.data.errors import DataError, explain_error, readable
-from gsparc.data.files import whole_file
+from gsparc.data.files import check_fetched, whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
@@ -81,6 +81,7 @@ def read_raw(path: str | Path) -> Raw:
     if path.suffix.lower() not in readers:
         suffix, known = path.suffix or "no ending", ", ".join(readers)
         raise DataError(f"{path}: expected a name ending in one of {known}; found {suffix}")
+    check_fetched(path)
     return readers[path.suffix.lower()](path)
 
 

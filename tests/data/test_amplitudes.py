@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gsparc.data.amplitudes import amplitudes_to_levels
+from gsparc.data.datasets.own import apply_settings
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 from gsparc.data.tables.read import parse_table
@@ -34,6 +35,30 @@ def test_amplitudes_without_phases_were_refused():
 def test_names_of_amplitudes_were_unknown(name):
     reading = interpret(Raw({"rx_position": PLACES, name: AMPLITUDE[:, 0]}), "file")
     assert len(reading.data.site.stations) == 4 and "absolute values, no phases" in " ".join(reading.notes)
+
+
+PHASE = RNG.uniform(-3, 3, AMPLITUDE.shape)
+
+
+@pytest.mark.parametrize("held", [
+    {"amplitude": AMPLITUDE, "phase": PHASE}, {"csi_mag": AMPLITUDE, "csi_phase_deg": np.degrees(PHASE)},
+    {"amplitude_db": 20 * np.log10(AMPLITUDE), "phase_rad": PHASE},
+    {"csi_real": AMPLITUDE * np.cos(PHASE), "csi_imag": AMPLITUDE * np.sin(PHASE)},
+])  # fmt: skip
+def test_phases_beside_amplitudes_were_ignored(held):
+    arrays = {"rx_position": PLACES, "tx_position": END, "frequency_hz": TONES, **held}
+    data = interpret(Raw(arrays), "file").data
+    np.testing.assert_allclose(
+        data.target * data.site.target_scale, AMPLITUDE * np.exp(1j * PHASE), atol=1e-5
+    )
+
+
+def test_a_carrier_and_a_spacing_say_what_a_list_of_tones_does():
+    arrays = {"rx_position": PLACES, "tx_position": END, "csi": AMPLITUDE * np.exp(1j * PHASE)}
+    middle = {"center_frequency": np.array(TONES[2]), "subcarrier_spacing": np.array(312.5e3)}
+    np.testing.assert_allclose(interpret(Raw(arrays | middle), "file").data.site.subcarriers_hz, TONES)
+    raw = apply_settings(Raw(arrays), carrier_hz=TONES[2], spacing_hz=312.5e3)
+    np.testing.assert_allclose(interpret(raw, "file").data.site.subcarriers_hz, TONES)
 
 
 def test_one_amplitude_is_one_power():

@@ -87,7 +87,7 @@ CSI = {
     "transposed": (_set("rx_position", np.ones((3, 12))), r"found \(3, 12\); transposed"),
     "quaternions transposed": (_set("rx_orientation", np.ones((4, 12))), r"found \(4, 12\); transposed"),
     "two coordinates": (_set("rx_position", np.ones((12, 2))), "rx_position: two coordinates.* rx_height"),
-    "position nan": (_entry("rx_position", (5, 1), np.nan), "rx_position, row 5 = .*three finite coordinates"),
+    "positions nan": (_entry("rx_position", slice(3, 6), np.nan), "rx_position, row 5 = .*three finite coord"),
     "nothing moves": (_set("rx_position", np.ones(3)), "neither end moves"),
     "GHz": (_set("frequency_hz", np.array([2.40, 2.41, 2.42])), r"expected Hz \(not MHz or GHz\)"),
     "frequency twice": (_set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])), "same frequency twice"),

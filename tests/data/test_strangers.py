@@ -7,11 +7,16 @@ from doors import said
 from scipy.io import savemat
 from strangers import (
     ALONG,
+    AT,
+    BAND,
     CASES,
     DEAF,
+    EAST,
     FLOOR,
     LEVELS,
+    NORTH,
     OF_THREE,
+    ONE_CELL,
     PLACES,
     RNG,
     ROWS,
@@ -25,6 +30,7 @@ from strangers import (
 from gsparc.commands.check import main
 from gsparc.data.datasets.own import Own, read_any
 from gsparc.data.own import write_own
+from gsparc.data.query_places import read_query_places
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -32,6 +38,36 @@ def test_a_table_of_a_stranger(write, name):
     content, settings, says, silent = CASES[name]
     found = said(write(content), **settings)
     assert says in found and (not silent or silent not in found), found
+
+
+@pytest.mark.parametrize("name", ONE_CELL)
+@pytest.mark.parametrize("head", ["spot", "gps"])
+def test_a_place_in_one_cell_was_no_place(write, name, head):
+    data = read_any(write(table(f"{head},rssi", ONE_CELL[name], LEVELS[:, 0]))).data
+    at = data.site.georeference.from_degrees(NORTH.round(6), EAST.round(6))
+    np.testing.assert_allclose(data.moving[:, :2] + data.site.origin[:2], at, atol=1e-6)
+
+
+def test_places_to_predict_may_stand_in_one_cell(write):
+    path = write(table("n,spot", range(ROWS), ONE_CELL["well-known text"]))
+    places = read_query_places(path, ["rx"])
+    np.testing.assert_allclose(places.ends["rx"].across, np.c_[NORTH, EAST], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "cell", ['"POINT (16,37 48,2)"', '"{""coordinates"": [[[1, 2], [3, 4]]]}"', "{16.37: [}"]
+)
+def test_a_cell_that_is_no_place_is_refused_in_a_line(write, cell):
+    assert "no coordinates among 'geometry'" in said(
+        write(table("geometry,rssi", [cell] * ROWS, LEVELS[:, 0]))
+    )
+
+
+def test_a_list_of_stations_has_places_in_one_cell(write, tmp_path):
+    sites = [f"POINT({16.37 + x / 7.4e4:.6f} {48.2 + y / 1.1e5:.6f})" for x, y in AT]
+    (tmp_path / "sites.csv").write_text(table("name,geometry", ["AP1", "AP2", "AP3"], sites))
+    levels = table("lat,lon,AP1,AP2,AP3", NORTH, EAST, *LEVELS.T)
+    assert "3 stations in a box of" in said(write(levels), stations_file=tmp_path / "sites.csv")
 
 
 def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
@@ -142,3 +178,18 @@ def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
         found, data = said(path), read_any(path).data
         assert "as well as weak ones: no value, left out" in found and data.censored is None, found
         assert len(data) == (~some).sum()
+
+
+def test_cells_without_their_name_were_refused_without_the_columns_that_name_them(write):
+    eci = np.where(BAND == 0, "", (500 + FLOOR).astype(str))
+    path = write(long("cell_id,psc,arfcn", eci, 101 + FLOOR, 1300 + 0 * FLOOR))
+    assert "no station; expected its name, or dataset.columns.station=psc+arfcn, which no row lacks" in said(
+        path
+    )
+
+
+def test_levels_in_hundredths_of_a_decibel_were_refused_row_by_row(write):
+    path = write(table("x,y,PeakRSSI", *PLACES.T, LEVELS[:, 0] * 100))
+    assert "in parts of a dB? say dataset.columns.rssi_db=PeakRSSI*0.01" in said(
+        path, columns={"rssi_db": "PeakRSSI"}
+    )

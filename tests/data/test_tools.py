@@ -92,6 +92,7 @@ FILES = {
     "ttn.jsonl": "\n".join(map(json.dumps, UPLINKS)),
     "track.gpx": TRACK,
     "marks.kml": MARKS,
+    **{f"{way}.json": pd.DataFrame(RECORDS).to_json(orient=way) for way in ("columns", "index", "split")},
     "drive.log": pd.DataFrame(RECORDS).to_csv(index=False),
 }
 
@@ -164,12 +165,17 @@ def test_feather_and_gzip_were_unknown_endings(tmp_path, refused):
 
 @pytest.mark.parametrize("start, way", [
     (b"\x93NUMPY", "savez it beside rx_position"), (b"! VNA\n# Hz S MA R 50\n", r"Touchstone"),
-    (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
     (b"\x80\x05", "a pickle; write Parquet"), (b"PK\x03\x04", "save it as CSV"),
 ])  # fmt: skip
 def test_files_that_no_reader_takes_show_the_way_out(tmp_path, start, way, refused):
     (tmp_path / "mine.dat").write_bytes(start + b"1 2 3")
     refused(way, parse_table, tmp_path / "mine.dat")
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.mat", "a.parquet", "a.csv"])
+def test_a_pointer_of_git_was_a_damaged_file(tmp_path, name, refused):
+    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    refused("not the file but a Git LFS pointer to it; git lfs pull", read_any, tmp_path / name)
 
 
 OTHERS = {

@@ -50,6 +50,17 @@ OF_THREE = [
 
 DROPS = [-50 - np.arange(ROWS) % 3 - 40 * (np.arange(ROWS) == 100 + i) for i in range(12)]
 
+# Places in one cell each, as databases, maps and notebooks write them.
+ONE_CELL = {
+    "well-known text": [f"POINT Z ({e:.6f} {n:.6f} 3)" for n, e in zip(NORTH, EAST, strict=True)],
+    "a GeoJSON text": [
+        f'"{{""type"": ""Point"", ""coordinates"": [{e:.6f}, {n:.6f}]}}"'
+        for n, e in zip(NORTH, EAST, strict=True)
+    ],
+    "a pair": [f'"{n:.6f}, {e:.6f}"' for n, e in zip(NORTH, EAST, strict=True)],
+    "a record": [f"\"{{'lat': {n:.6f}, 'lng': {e:.6f}}}\"" for n, e in zip(NORTH, EAST, strict=True)],
+}
+
 # name: content, settings, what `check` must say, what it must not.
 CASES = {
     "a mark far below": (wide(-999), {}, "exactly -999, apart from all others: taken as not heard", ""),
@@ -60,6 +71,8 @@ CASES = {
     "no fix": (table("lat,lon,rssi", *ZERO.T, LEVELS[:, 0]), {},
         "lines 2 to 13: latitude and longitude are 0", ""),
     "a place beyond the pole": (table("lat,lon,rssi", np.where(FIFTH, 95, NORTH), EAST, LEVELS[:, 0]), {},
+        "line 6: no such place on Earth", "refused"),
+    "a place beyond all": (table("x,y,rssi", np.where(FIFTH, 1e30, EAST), NORTH, LEVELS[:, 0]), {},
         "line 6: no such place on Earth", "refused"),
     "a mark for no fix": (table("lat,lon,rssi", *np.where(NINTH, [[91], [181]], [NORTH, EAST]), LEVELS[:, 0]),
         {}, "no such place on Earth", "refused"),
@@ -107,10 +120,16 @@ CASES = {
         "2.412 GHz",
         "refused",
     ),
+    "a title above repeated heads": (wide("") + "Table 2\n" + wide(""), {},
+        "lines 242 to 243: the heads again", "refused"),
+    "heads of another table": (wide("") + long("BSSID", BAND), {},
+        "line 242: heads of another table than that of line 1", "more rows"),
     "a quality": (table("x,y,quality", *PLACES.T, LEVELS[:, 0] + 110), {},
         "'quality' is a quality, not a level", ""),
     "arbitrary strength units": (table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140), {},
-        "dataset.columns.rssi_db=asu-140 of LTE, dataset.columns.rssi_db=asu*2-113 of GSM", ""),
+        "'asu' is ASU, of LTE: dataset.columns.rssi_db=asu-140", "GSM"),
+    "strength units of GSM": (table("x,y,asu", *PLACES.T, np.where(NINTH, 99, (LEVELS[:, 0] + 98) // 2)), {},
+        "'asu' is ASU, of GSM: dataset.columns.rssi_db=asu*2-113", "LTE"),
     "units that are said": (table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140),
         {"columns": {"rssi_db": "asu-140"}}, "good", "warning"),
     "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),

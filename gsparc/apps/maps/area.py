@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.path import Path as Outline
 
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.geojson import SUFFIXES, read_shapes
+from gsparc.apps.maps.geojson import is_drawn, read_shapes
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import machine_memory
 from gsparc.data.errors import DataError
@@ -106,7 +105,7 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
     """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
     box = None if site is None else site.moving_box
     width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
-    if isinstance(area, str | Path) and Path(area).suffix.lower() in SUFFIXES:
+    if is_drawn(area):
         origin = None if site is None else site.georeference
         drawn, _ = read_shapes(area, "area", origin, site_m=width)
         from shapely import contains_xy

@@ -1,26 +1,34 @@
-"""Polygons and lines of a GeoJSON file (RFC 7946) in world metres."""
+"""Polygons and lines of GeoJSON (RFC 7946) or well-known text in world metres."""
 
 from __future__ import annotations
 
 import json
+import logging
+import re
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pyproj import Transformer
 
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError, explain_error
 from gsparc.data.files import write_whole
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
 
 if TYPE_CHECKING:
     from shapely import LineString
     from shapely.geometry.base import BaseGeometry
 
+log = logging.getLogger(__name__)
+
 SPECK = 1e-3  # of a site's width, that nobody draws: in degrees a site is 1e-5 as wide as in metres
 UNREADABLE = OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError
-SUFFIXES = (".geojson", ".json")
+SUFFIXES = (".geojson", ".json", ".wkt")
+TEXT = re.compile(r"(?i)\s*(?:MULTI)?POLYGON\s*Z?\s*\(")  # well-known, in place of a file
+FAR_M = 1e5  # from the site, where another reading of coordinates lies nearer: this one is wrong
 LINE, POLYGON = 1, 3  # of shapely's types; larger numbers are collections
 
 
@@ -34,10 +42,48 @@ def draws_shapes(path: str | Path) -> bool:
         return False
 
 
+def is_drawn(area: Any) -> bool:
+    """Tell whether an area is a file of shapes, or a polygon in well-known text."""
+    held = isinstance(area, str | Path)
+    return held and (Path(area).suffix.lower() in SUFFIXES or TEXT.match(str(area)) is not None)
+
+
 def _geometries(path: str | Path) -> list[Any]:
     """Those of a file, undecoded; None where a feature has none."""
-    content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    text = str(path) if TEXT.match(str(path)) else Path(path).read_text(encoding="utf-8-sig")
+    if TEXT.match(text):
+        from shapely import from_wkt
+
+        return [from_wkt(line).__geo_interface__ for line in text.splitlines() if line.strip()]
+    content = json.loads(text)
     return [one.get("geometry", one) for one in content.get("features", [content])]
+
+
+def _in_degrees(places: np.ndarray, origin: Georeference) -> Iterator[tuple[str, np.ndarray]]:
+    """Longitudes and latitudes (n, 2) of places (n, 2) by each way to write them, the standard's first."""
+    yield "", places
+    yield "latitude, longitude", places[:, ::-1]
+    zone = f"EPSG:{326 if origin.latitude >= 0 else 327}{int((origin.longitude + 180) // 6) % 60 + 1:02d}"
+    for name in (zone, "EPSG:3857"):  # of the site, and of maps on the web
+        yield (
+            f"metres of {name}",
+            np.stack(Transformer.from_crs(name, 4326, always_xy=True).transform(*places.T), 1),
+        )
+
+
+def _to_metres(places: np.ndarray, origin: Georeference, where: str) -> np.ndarray:
+    """Metres (n, 2) of places (n, 2), as the standard has them unless that is far and another way near."""
+    read = {}
+    for name, degrees in _in_degrees(places, origin):
+        if find_invalid_coordinate(degrees[:, 1], degrees[:, 0]) is None:
+            read[name] = origin.from_degrees(degrees[:, 1], degrees[:, 0])
+    near = [name for name, metres in read.items() if np.abs(np.median(metres, axis=0)).max() < FAR_M]
+    if near and near[0]:
+        log.warning("%s: read as %s, as the site is there", where, near[0])
+    if not near and "" not in read:
+        _, fault = find_invalid_coordinate(places[:, 1], places[:, 0]) or (0, "")
+        raise DataError(f"{where}: {fault} (longitude first, then latitude)")
+    return read[near[0] if near else ""]
 
 
 def read_shapes(
@@ -45,10 +91,10 @@ def read_shapes(
 ) -> tuple[BaseGeometry, list[LineString]]:
     """Return the union of a file's polygons, and its lines, in metres.
 
-    Coordinates are degrees where the model knows its place on Earth.
+    Coordinates are degrees where the model knows its place on Earth, or metres of the site's UTM zone.
 
     Args:
-        path: `*.geojson` or `*.json`.
+        path: `*.geojson`, `*.json` or `*.wkt`, or a polygon in well-known text.
         key: setting that named it, for messages.
         origin: of the model's metres; None: the file's coordinates are metres themselves.
         lines_too: whether lines will do where there are no polygons.
@@ -81,10 +127,7 @@ def read_shapes(
         if not np.isfinite(places).all():
             raise DataError(f"{where}: a corner is NaN or infinite")
         if origin is not None:
-            try:
-                return origin.from_degrees(places[:, 1], places[:, 0])
-            except DataError as error:
-                raise DataError(f"{where}: {error} (longitude first, then latitude)") from None
+            return _to_metres(places, origin, where)
         if np.abs(places).max(initial=0) > FARTHEST:
             far = f"{np.abs(places).max():.3g} is no coordinate in metres"
             raise DataError(f"{where}: {far}; give those of the measurements, within {FARTHEST:g} m")

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from gsparc.data.schema import Measurements
 from gsparc.processes.level_field import LevelField, fit_level_field
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
@@ -72,6 +73,14 @@ class LevelsAtPlaces:
     def __len__(self) -> int:
         return len(self.level)
 
+    @staticmethod
+    def of(data: Measurements) -> tuple[LevelsAtPlaces, np.ndarray]:
+        """Return those of powers that were measured, and (n,) their rows."""
+        rows = np.flatnonzero((data.censored_side(np.arange(len(data))) == 0) & (data.target[:, 0] > 0))
+        station = np.zeros(len(data), np.int64) if data.station is None else data.station
+        level = 10 * np.log10(data.target[rows, 0].astype(np.float64))
+        return LevelsAtPlaces(data.moving[rows], station[rows], level), rows
+
     def take(self, rows: np.ndarray) -> LevelsAtPlaces:
         """Return some of them."""
         return LevelsAtPlaces(self.place[rows], self.station[rows], self.level[rows])
@@ -109,6 +118,22 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
         else:
             links = replace(links, station=_pairwise(links.station, texts[best.head]))
     return found
+
+
+def run_warnings(data: Measurements) -> list[str]:
+    """Warn of runs that tell levels apart as a transmitter elsewhere would, or another gain."""
+    if data.site.kind != "rssi" or data.run is None or data.site.static_end is None:
+        return []
+    links, rows = LevelsAtPlaces.of(data)
+    said = {
+        "transmitter": "did what stands still move between them? dataset.runs=[NAME] takes one",
+        "device": "another gain or device in each? dataset.columns.device=HEAD takes offsets off a table's",
+    }
+    return [
+        f"runs explain {one.share:.0%} of what places and stations leave: {said[one.kind]}"
+        for one in find_effects(links, rows, {"run": data.run.astype(str)})
+        if one.kind in said
+    ]
 
 
 def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]) -> dict[str, str]:

@@ -71,9 +71,9 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     limited = frozenset(floors[:, 0].astype(int).tolist() if floor_known else ())
     absent = np.zeros(0, np.int64)
     # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
-    # with a station for each place has no empty cells.
+    # with a station for each place, as of serving cells, has no empty cells.
     told = data.censored is not None or data.provenance.get("absent") == "unknown"
-    if not told and len(first) < len(data):
+    if not told and len(first) < len(np.unique(link)):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
     parts = [] if stations is None else [name.split(FROM_ROW) for name in stations.name]
     for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:

@@ -16,11 +16,12 @@ LEAST, MOST, SITES = 20, 100, 100  # places where a site was heard, that tell; t
 CLEAR = math.log(1e12)  # ratio of likelihoods: shadowing is not Gaussian
 LIKELY = math.log(30)  # the same of kilometres: few sites stand within a thousandth of the reach of 0, 0
 FEW = 3  # sites at places of others: of two a hill may be the reason
+STRONG, SHARES = 10, (1, 0.75, 0.5)  # a tenth of a site's levels lies about it, its beams ahead of it
 SLOPES = -60.0, -10.0  # of levels over the logarithm of the distance [dB]
 
 
 def misplaced_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of sites whose levels tell other places: each other's, or their own in kilometres.
+    """Warn of sites whose levels tell other places: each other's, shifted ones, or their own in kilometres.
 
     Of the sectors of a site the strongest counts, so that no beam makes up for a distance.
     """
@@ -28,24 +29,42 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
         return []
     where, first, site = np.unique(levels.station_position, axis=0, return_index=True, return_inverse=True)
     site, known = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
-    gains, thousandfold = np.full((len(where),) * 2, -np.inf), where * [1e3, 1e3, 1]
-    names, kilometres = [levels.names[t] for t in first], list[str]()
-    for one in np.flatnonzero(known)[:SITES]:
+    heard = dict[int, np.ndarray]()
+    for one in np.flatnonzero(known)[:SITES].tolist():
         rows = np.flatnonzero((site == one) & np.isfinite(levels.level_db))
         rows = rows[np.argsort(-levels.level_db[rows], kind="stable")]
-        rows = rows[np.unique(levels.position[rows], axis=0, return_index=True)[1]]
-        if len(rows) >= LEAST:
-            some = np.random.default_rng(0).permutation(rows)[:MOST]
-            places = np.vstack([where[one], thousandfold[one], where[known]])
-            gain = _gains(levels.position[some], levels.level_db[some], places)
-            kilometres += [names[one]] * bool(gain[0] > LIKELY)
-            gains[one, known] = gain[1:] - math.log(len(where))  # each that is tried may fit by chance
+        rows = rows[np.sort(np.unique(levels.position[rows], axis=0, return_index=True)[1])]
+        heard |= {one: rows} if len(rows) >= LEAST else {}
+    strong = [levels.position[rows[: len(rows) // STRONG]].mean(axis=0) for rows in heard.values()]
+    shift = np.median(strong - where[[*heard]], axis=0) * [1, 1, 0] if heard else np.zeros(3)
+    shifts = shift * np.array(SHARES)[:, None]
+    gains, thousandfold, shifted = (
+        np.full((len(where),) * 2, -np.inf),
+        where * [1e3, 1e3, 1],
+        np.zeros(len(SHARES)),
+    )
+    names, kilometres = [levels.names[t] for t in first], list[str]()
+    for one, rows in heard.items():
+        some = np.random.default_rng(0).permutation(rows)[:MOST]
+        places = np.vstack([where[one], thousandfold[one], where[one] + shifts, where[known]])
+        gain = _gains(levels.position[some], levels.level_db[some], places)
+        kilometres += [names[one]] * bool(gain[0] > LIKELY)
+        shifted += np.maximum(gain[1 : 1 + len(SHARES)], -LIKELY)
+        gains[one, known] = gain[1 + len(SHARES) :] - math.log(
+            len(where)
+        )  # each that is tried may fit by chance
     gains[np.diag_indices(len(where))] = 0
     who = list_first(kilometres)
     said = f"levels of {who} fall with distance from a place a thousand times as far: is it in kilometres?"
     stated, likely = linear_sum_assignment(gains, maximize=True)
     warnings, moved = [said] * bool(kilometres), np.flatnonzero(stated != likely)
-    if len(moved) >= FEW and gains[stated, likely].sum() > CLEAR:
+    exchanged = gains[stated, likely].sum()
+    if shifted.max() > max(CLEAR, exchanged) and len(heard) >= FEW:
+        said = "fall with distance from places ({:+.0f}, {:+.0f}) m beside the stated ones".format(
+            *shifts[shifted.argmax()]
+        )
+        warnings.append(f"levels of all {len(heard)} sites {said}: is their list about another origin?")
+    elif len(moved) >= FEW and exchanged > CLEAR:
         pairs = list_first([f"{names[i]} from that of {names[likely[i]]}" for i in moved])
         said = f"levels fall with distance from places of other stations, {pairs}"
         warnings.append(f"{said}: are names or places exchanged?")

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from gsparc.data.assemble import check_positions
+from gsparc.data.checks.column_effects import run_warnings
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import LinkLevels, link_levels
@@ -94,7 +95,7 @@ def find_implausible(
     hints += map(Severe, convention_warnings(data))
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
-    steps = find_level_steps(levels)
+    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data)]
     return [*hints, *sanity_warnings(levels, steps)], levels, steps
 
 

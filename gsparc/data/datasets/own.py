@@ -59,6 +59,8 @@ def apply_settings(
     saturation_db: float | str = "auto",
     tx_position: Sequence[float] | None = None,
     frequency_hz: float | Sequence[float] | None = None,
+    carrier_hz: float | None = None,
+    spacing_hz: float | None = None,
     **conventions: bool | None,
 ) -> Raw:
     """Return the same with what settings say of the file.
@@ -73,6 +75,7 @@ def apply_settings(
             repeats; `none`: there is none.
         tx_position: of a transmitter that stood still, where the file does not say it [m].
         frequency_hz: of the tones, likewise [Hz].
+        carrier_hz, spacing_hz: of tones, the middle one and from one to the next, instead [Hz].
         **conventions: those of `CONVENTIONS` that the file follows instead of the schema's.
 
     Raises:
@@ -85,6 +88,7 @@ def apply_settings(
     followed = [name for name, follows in conventions.items() if follows]
     said |= {"conventions": " ".join(followed)} if followed else {}
     given = {"tx_position": tx_position, "frequency_hz": frequency_hz}
+    given |= {"carrier_hz": carrier_hz, "spacing_hz": spacing_hz}
     arrays = {name: finite_array(value) for name, value in given.items() if value is not None}
     return replace(raw, arrays={**raw.arrays, **arrays}, attributes={**raw.attributes, **said})
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.outliers import FEW
 from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.errors import Caution, Severe, list_first, name_row_ranges
@@ -43,9 +44,8 @@ def _without_fix(check: Checker, measured: str) -> None:
         if len(pair) < 1 + degrees:  # refused where degrees are read
             continue
         place = np.column_stack(pair)[:, :2].astype(np.float64)
-        null, earth = (place == 0).all(axis=1), np.array(ON_EARTH)
-        beyond = (place < earth[:, 0]) | (place > earth[:, 1])
-        off = np.asarray(degrees & beyond.any(axis=1))
+        null, earth = (place == 0).all(axis=1), np.array(ON_EARTH if degrees else [(-FARTHEST, FARTHEST)] * 2)
+        off = np.asarray(~((place >= earth[:, 0]) & (place <= earth[:, 1])).all(axis=1))
         known = place[~(null | off)]
         if not len(known):
             continue

@@ -1,8 +1,11 @@
-"""Cells that hold several numbers, lists and complex ones, as a column for each."""
+"""Cells that hold several numbers, lists, complex ones and places, as a column for each."""
 
 from __future__ import annotations
 
+import ast
+import json
 import re
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -10,18 +13,31 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.errors import list_first
+from gsparc.data.tables.heads import AXIS_WORDS, LISTS, SHEET, parse_head, words_of
+from gsparc.data.tables.records import unfold_places
 from gsparc.data.tables.sheet import Sheet
 
 LIST = re.compile(r"\s*\[(.+)\]\s*", re.DOTALL)
+PLACES = LISTS["place"] | LISTS["vector"] | set(AXIS_WORDS)
 LOGGED = "CSI_DATA"  # begins the rows of an ESP32, whose lists hold imaginary parts before real ones
+NUMBER = r"[-+]?\d*\.?\d+(?:e[-+]?\d+)?"
+PAIR = re.compile(rf"(?i)\s*[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?\s*")
+POINT = re.compile(
+    rf"(?i)\s*(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)\s*"
+)
+FINE = re.compile(r"\.\d{4}")  # digits of degrees that tell streets apart
 
 
 def unfold_cells(sheet: Sheet) -> tuple[Sheet, list[str]]:
-    """Return lists of one length as NAME_1, ..., complex numbers as csi_re_1, csi_im_1, ..., and a note."""
+    """Return lists of one length as NAME_1, ..., complex numbers as csi_re_1, ..., named ones, and a note."""
     logged = bool((sheet.frame.iloc[:, :1] == LOGGED).all(axis=None))
     parts: list[pd.DataFrame] = []
     unfolded: list[str] = []
     for head in sheet.heads:
+        if (held := _records(sheet, head)) is not None:
+            parts.append(held)
+            unfolded.append(f"{head} ({', '.join(held)})")
+            continue
         rows = [_numbers(cell) for cell in sheet.frame[head].iloc[:1]]
         rows += [_numbers(cell) for cell in sheet.frame[head].iloc[1:]] if rows[0] is not None else []
         if len({-1 if row is None else len(row) for row in rows}) > 1 or rows[0] is None:
@@ -32,13 +48,43 @@ def unfold_cells(sheet: Sheet) -> tuple[Sheet, list[str]]:
         if logged:
             values = values[:, 1::2] + 1j * values[:, ::2].real
             tones = np.fft.fftfreq(values.shape[1], 1 / values.shape[1]).round().astype(int).tolist()
-        held = {"csi_re": values.real, "csi_im": values.imag} if values.imag.any() else {head: values.real}
-        parts += [pd.DataFrame(v, columns=[f"{name}_{tone}" for tone in tones]) for name, v in held.items()]
+        named = {"csi_re": values.real, "csi_im": values.imag} if values.imag.any() else {head: values.real}
+        parts += [pd.DataFrame(v, columns=[f"{name}_{tone}" for tone in tones]) for name, v in named.items()]
         unfolded.append(head)
     frame = pd.concat(parts, axis=1) if unfolded else sheet.frame
     if not unfolded or frame.columns.has_duplicates:
         return sheet, []
     return replace(sheet, frame=frame), [f"a column for each number of a cell: {list_first(unfolded, 3)}"]
+
+
+def _records(sheet: Sheet, head: str) -> pd.DataFrame | None:
+    """Columns of what a column's cells hold by names or as places; None where one of them holds neither."""
+    named = bool(PLACES & {*words_of(head)}) and parse_head(head).role is None
+    texts = (cell.strip() for cell in sheet.frame[head] if isinstance(cell, str))
+    first = next((text for text in texts if text.lower() not in SHEET["missing"]), "")
+    if _record(first, named) is None:  # before all cells of wide tables are looked at
+        return None
+    read = [_record(cell, named) if cell else {} for cell in sheet.words(head)]
+    if None in read:
+        return None
+    frame = unfold_places(pd.json_normalize([{head: record} for record in read]))
+    short = {name: name.removeprefix(f"{head}.") for name in frame}
+    plain = [n for n, bare in short.items() if parse_head(n).role is None and bare not in sheet.heads]
+    return None if frame.empty else frame.rename(columns={name: short[name] for name in plain})
+
+
+def _record(cell: str, named: bool) -> dict[str, Any] | None:
+    """What one cell holds by name, places under one of `records.PLACES`; None where it is neither."""
+    if cell.startswith("{"):
+        for read in (json.loads, ast.literal_eval):
+            with suppress(ValueError, SyntaxError, RecursionError, MemoryError):
+                return dict(read(cell))
+    if point := POINT.fullmatch(cell):
+        return {"point": [float(one) for one in (point[1] or "").split()]}
+    pair = PAIR.fullmatch(cell)
+    numbers = re.split(r"[,;\s]+", pair[1]) if pair else []
+    fine = named or (numbers and all(FINE.search(one) for one in numbers))
+    return {"pair": [float(one) for one in numbers]} if fine and numbers else None
 
 
 def _numbers(cell: Any) -> np.ndarray | None:

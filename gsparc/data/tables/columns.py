@@ -13,12 +13,11 @@ import pandas as pd
 
 from gsparc.data.errors import Caution, list_first, suggest_name
 from gsparc.data.tables import heads
-from gsparc.data.tables.heads import ENDS, KINDS, LISTS, Head, unit_of, unit_suits, words_of
+from gsparc.data.tables.heads import CHANNELS, ENDS, KINDS, LISTS, POLAR, Head, unit_of, unit_suits, words_of
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.units import SCHEMA, UNITS, Unit, list_units
 
 LEVELS = ("rssi_db", "rssi")
-CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS, POLAR)
 # Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
 ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))

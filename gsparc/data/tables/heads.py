@@ -20,6 +20,7 @@ PERCENT = (
 # Quantities a column can hold: of an end (the moving one when it is not named), and of a row.
 ENDS = ("", "rx_", "tx_", "station_")
 AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longitude": "angle"}
+CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
 # May be several columns: stations, or frequencies.
 MANY = ("rssi_db", "rssi", "csi_re", "csi_im", "csi_amp", "csi_phase")
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
@@ -36,7 +37,7 @@ LISTS = {name: set(words.split()) for name, words in SHEET.items() if isinstance
 KINDS = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | meaning_by_word("kinds")
 STATION_WORDS, END_WORDS = LISTS["station"], meaning_by_word("ends")
 TOGETHER = {word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()}
-_AXIS, _PART = meaning_by_word("axes"), meaning_by_word("part")
+AXIS_WORDS, PARTS = meaning_by_word("axes"), meaning_by_word("part")
 
 
 @dataclass(frozen=True)
@@ -135,16 +136,16 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
 
 
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:
-    axes = [word for word in rest if word in _AXIS]
-    above = len(axes) == 1 and _AXIS[axes[0]] == "z"
-    ends = [word for word in rest if word not in _AXIS and not (above and word in LISTS["above"])]
+    axes = [word for word in rest if word in AXIS_WORDS]
+    above = len(axes) == 1 and AXIS_WORDS[axes[0]] == "z"
+    ends = [word for word in rest if word not in AXIS_WORDS and not (above and word in LISTS["above"])]
     less = len(ends) + len(axes) < len(rest)
     if len(axes) != 1 or len(ends) > 1:
         return None
     if not ends:
-        return Head(_AXIS[axes[0]], unit=unit, word=axes[0], less=less)
+        return Head(AXIS_WORDS[axes[0]], unit=unit, word=axes[0], less=less)
     end = "station_" if ends[0] in STATION_WORDS else END_WORDS.get(ends[0])
-    return None if end is None else Head(end + _AXIS[axes[0]], unit=unit, word=axes[0], less=less)
+    return None if end is None else Head(end + AXIS_WORDS[axes[0]], unit=unit, word=axes[0], less=less)
 
 
 def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
@@ -166,24 +167,24 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
 
 def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
     numbers = [word for word in words if word.isdigit()]
-    parts = [word for word in words if word in _PART]
+    parts = [word for word in words if word in PARTS]
     tone = re.search(r"(?i)(?<!\d)\d+(?:\.\d+)?\s*[kmg]?hz\W*$", plain)  # S21_re_3.5GHz
     if len(parts) == 1 and tone is not None:
-        return Head(_PART[parts[0]], tone[0], unit, parts[0])
-    others = [word for word in words if word not in {*_PART, *numbers, *LISTS["channel"]}]
+        return Head(PARTS[parts[0]], tone[0], unit, parts[0])
+    others = [word for word in words if word not in {*PARTS, *numbers, *LISTS["channel"]}]
     named = bool(LISTS["channel"] & set(words))
     plainly = ("re", "im", "real", "imag", *("amp", "amplitude", "mag", "magnitude", "phase") * bool(numbers))
     if len(parts) != 1 or not (named or parts[0] in plainly):
         return None
     if others or len(numbers) > 1:  # of a channel, but not plainly the number of a tone: refused by its label
-        return Head(_PART[parts[0]], " ".join(numbers + others), unit, parts[0]) if named else None
+        return Head(PARTS[parts[0]], " ".join(numbers + others), unit, parts[0]) if named else None
     label = numbers[0] if numbers else ""
     dash = re.search(rf"(.?)[-\u2212]{label}(?!\d)", plain) if numbers else None
     if dash is not None and not dash[1].isalnum():
         label = f"-{label}"
     elif dash is not None and "-" not in plain[: dash.start()]:  # csi-re-2 has the mark between all words
         label = f"{label} or -{label}"
-    return Head(_PART[parts[0]], label, unit, parts[0])
+    return Head(PARTS[parts[0]], label, unit, parts[0])
 
 
 def _text(words: list[str], unit: Unit | None) -> Head:

@@ -16,9 +16,10 @@ from pathlib import Path
 import pandas as pd
 
 from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
-from gsparc.data.files import check_content, check_line_length
+from gsparc.data.files import check_content, check_fetched, check_line_length
 from gsparc.data.raw import ARRAY_SUFFIXES
 from gsparc.data.tables import is_table
+from gsparc.data.tables.cells import unfold_cells
 from gsparc.data.tables.heads import SHEET, parse_head
 from gsparc.data.tables.records import read_records
 from gsparc.data.tables.sheet import Sheet
@@ -95,7 +96,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         how = "write Parquet, of means by cells of places where rows are many"
         raise DataError(f"{source}: {fault} cells are read: {how}")
     lines = _with_heads(lines, comment, delimiter, source)
-    lines, again_notes = _heads_once(lines)
+    lines, again_notes = _heads_once(lines, delimiter)
     lines, comment_notes = _without_comments(lines, delimiter, source)
     notes += comment_notes + again_notes
     heads, *rows = _rectangular(lines, delimiter, source)
@@ -194,13 +195,14 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
     return lines, []
 
 
-def _heads_once(lines: Lines) -> tuple[Lines, list[str]]:
-    """The lines without those that repeat the heads, with comments above, as in files joined, and a note."""
+def _heads_once(lines: Lines, delimiter: str) -> tuple[Lines, list[str]]:
+    """The lines without those that repeat the heads, with what is written above, and a note."""
     (first, *below), again, above = lines, set[int](), list[int]()
     for n in below:
         text = lines[n].strip("\ufeff \t")
         again |= {n, *above} if text == lines[first].strip() else set()
-        above = [*above, n] if text.startswith(COMMENTS) else []
+        titled = text.startswith(COMMENTS) or len(_cells(text, delimiter)) == 1
+        above = [*above, n] if titled else []
     if not again:
         return lines, []
     where = name_row_ranges([f"line {n}" for n in sorted(again)])
@@ -297,6 +299,12 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
         fault = f"{count} heads, but every line below has {counts[0]} cells{hint}"
         raise DataError(f"{source}, line {min(lines)}: {fault}")
     problems, below = Problems(source), list(lines)[1:]
+    for n, row in zip(below, cells[1:], strict=True):
+        if len(row) != count and sum(parse_head(cell).role is not None for cell in row) > 1:
+            fault = (
+                f"heads of another table than that of line {min(lines)}: write each into a file of its own"
+            )
+            raise DataError(f"{source}, line {n}: {fault}")
     names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
@@ -327,7 +335,7 @@ def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[
 
 
 def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
-    """Read the cells of a table, with notes on what was recognised.
+    """Read the cells of a table, a column for each number of one, with notes on what was recognised.
 
     Args:
         path: of the table.
@@ -341,6 +349,7 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
         raise DataError(f"{path}: no such file; expected a table, or arrays (*{', *'.join(ARRAY_SUFFIXES)})")
     if not is_table(path):
         raise DataError(f"{path}: expected a table (csv, parquet, json, ...), no arrays")
+    check_fetched(path)
     with path.open("rb") as file:
         first = b"".join(file.read(PEEKED).removeprefix(codecs.BOM_UTF8).split())
     kind = next((kind for start, kind in STARTS.items() if first.startswith(start)), None)
@@ -348,4 +357,5 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
     if kind == RECORDS and path.stat().st_size > MOST_BYTES:
         raise DataError(f"{path}: records of more than {MOST_BYTES:,} bytes; write them as Parquet")
     sheet, notes = read_text(path) if kind is None else (read_frame(path, kind), [])
-    return replace(sheet, problems=Problems(path) if problems is None else problems), notes
+    sheet, of_cells = unfold_cells(sheet)
+    return replace(sheet, problems=Problems(path) if problems is None else problems), [*notes, *of_cells]

@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gsparc.data.amplitudes import join_polar
 from gsparc.data.errors import Caution, list_first, suggest_name
+from gsparc.data.links.hearing import MOST_DB
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
-from gsparc.data.tables.cells import unfold_cells
 from gsparc.data.tables.columns import (
-    CHANNELS,
     JOINED,
     LEVELS,
-    POLAR,
     Chosen,
     Column,
     choose_columns,
@@ -31,7 +30,16 @@ from gsparc.data.tables.columns import (
     schema_unit,
     used_heads,
 )
-from gsparc.data.tables.heads import AXES, LISTS, PERCENT, station_in_head, words_of
+from gsparc.data.tables.heads import (
+    AXES,
+    CHANNELS,
+    LISTS,
+    PERCENT,
+    POLAR,
+    TOGETHER,
+    station_in_head,
+    words_of,
+)
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.places import (
     UNKNOWN_HEIGHT,
@@ -65,10 +73,9 @@ def parse_table(
         DataError: all problems, with row and column.
     """
     sheet, notes = read_sheet(path)
-    sheet, of_cells = unfold_cells(sheet)
     sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
     sheet, of_tones = unfold_tones(sheet)
-    notes = [*notes, *of_cells, *of_slots, *of_tones]
+    notes = [*notes, *of_slots, *of_tones]
     listed = None
     if stations_file is not None:
         second, _ = read_sheet(stations_file, sheet.problems)
@@ -98,8 +105,8 @@ def parse_table(
     return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes), explain=explain)
 
 
+UNKNOWN_ASU, MOST_GSM = 99, 31  # arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
-TURN = 6.3  # radians of a full turn, and a little: larger phases are degrees
 
 
 class Builder:
@@ -117,7 +124,7 @@ class Builder:
         measured = self._measurement()
         # Ends after the measurement: columns of several stations decide whether a station's column is needed.
         self._ends(measured)
-        for role in ("sensitivity_db", "frequency_hz"):
+        for role in ("sensitivity_db", "frequency_hz", "spacing_hz"):
             if role in self.chosen and len(self.chosen[role][0].value) < 2:
                 values = self._of_rows(role)
                 self.arrays |= {} if values is None else {role: values}
@@ -139,8 +146,10 @@ class Builder:
                     how = say_column("rssi_db", f"{head}*-1")
                     return self.refuse(f"{fault}; {how} takes losses for levels")
                 if "asu" in words_of(head):
-                    ways = [say_column("rssi_db", f"{head}{turn}") for turn in ("-140", "*2-113")]
-                    return self.refuse(f"{fault}; {head!r} is ASU: {ways[0]} of LTE, {ways[1]} of GSM")
+                    asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
+                    coarse = (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all()
+                    how = say_column("rssi_db", f"{head}{'*2-113' if coarse else '-140'}")
+                    return self.refuse(f"{fault}; {head!r} is ASU, of {'GSM' if coarse else 'LTE'}: {how}")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
@@ -168,6 +177,10 @@ class Builder:
             choices = " or ".join(say_column(name, first.head or "") for name in LEVELS)
             fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
             self.refuse(f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or "")
+        size = np.median(np.abs(np.unique(values[np.isfinite(values)])))  # a mark counts once
+        if role == "rssi_db" and size > MOST_DB and first.head and first.unit is None:
+            how = say_column(role, f"{first.head}*{10.0 ** -np.ceil(np.log10(size / MOST_DB)):g}")
+            self.refuse(f"most of it is beyond {MOST_DB} dB: in parts of a dB? say {how}", first.head)
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
@@ -191,16 +204,10 @@ class Builder:
                 self.refuse("amplitudes below 0: levels? say dataset.columns.rssi_db='NAME_*'", head)
             return
         first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
-        if names == POLAR:
-            # A unit in the head has turned values into degrees by now; without one, over a turn is no radian.
-            degrees = pairs[1][self.tones[0]].unit is not None or np.nanmax(np.abs(second)) > TURN
-            if pairs[1][self.tones[0]].unit is None:
-                self.notes.append(f"phases are taken as {'degrees' if degrees else 'radians'}")
-            unit = pairs[0][self.tones[0]].unit
-            first = 10 ** (first / 20) if unit is not None and unit.kind == "level" else first
-            turn = np.exp(1j * (np.radians(second) if degrees else second))
-            first, second = first * turn.real, first * turn.imag
         csi = first + 1j * second
+        if names == POLAR:
+            csi, said = join_polar(first, second, [pair[self.tones[0]].unit for pair in pairs])
+            self.notes += said
         csi = csi[:, 0] if csi.shape[1] == 1 else csi
         self.arrays["csi"] = csi
         if np.isnan(csi).any():
@@ -314,7 +321,8 @@ class Builder:
             # What other columns add to a listed name stands where that does: antennas, carriers, devices.
             apart = known and not set(words) <= set(joined.names)
             self.listed = listed.part_by(plain, words) if apart else listed if words is plain else joined
-        self.sheet.refuse_rows(head, np.flatnonzero(words == ""), "no station; expected its name")
+        nameless = f"no station; expected its name{self._complete_names()}"
+        self.sheet.refuse_rows(head, np.flatnonzero(words == ""), nameless)
         if self.listed is not None:
             self._all_listed(words, head)
             return None if self.sheet.problems else self._by_list(words)
@@ -341,6 +349,16 @@ class Builder:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
+
+    def _complete_names(self) -> str:
+        """The setting of columns that name a station in every row, for messages; empty without any."""
+        full = [head for head in self.sheet.heads if (self.sheet.words(head) != "").all()]
+        for head in full:
+            for parts in [TOGETHER[word] for word in words_of(head) if word in TOGETHER]:
+                names = [head, *[other for other in full if parts & {*words_of(other)}]]
+                if len(names) > 1:
+                    return f", or {say_column('station', '+'.join(names))}, which no row lacks"
+        return ""
 
     def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
         """Stations at places that nobody gave."""
@@ -454,6 +472,9 @@ class Builder:
             self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], ends)
             if np.ptp(np.diff(self.tones)):
                 self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
+        if channels and "spacing_hz" in self.arrays:
+            middle = 0 if self.tones.min() < 0 else self.tones[len(self.tones) // 2]
+            self.arrays["frequency_hz"] = (self.tones - middle) * self.arrays.pop("spacing_hz")
         if "carrier_hz" not in self.chosen:
             return
         column = self.chosen["carrier_hz"][0]

@@ -15,7 +15,9 @@ from gsparc.data.files import check_content
 
 POINTS = {"trkpt", "wpt", "Placemark"}  # of GPX and KML
 MOST_VALUES = 10_000  # of a cell
-PLACE = ("longitude", "latitude", "height")  # as GeoJSON and KML order coordinates
+DEGREES, METRES = ["longitude", "latitude", "height"], ["x", "y", "z"]  # as GeoJSON and KML order coordinates
+# Of cells with a place: whether latitudes come first; over how many degrees places that are none reach.
+PLACES = {"coordinates": (False, 360), "point": (False, 3), "pair": (True, 3)}
 
 
 def read_records(path: Path) -> pd.DataFrame:
@@ -33,15 +35,27 @@ def read_records(path: Path) -> pd.DataFrame:
         frame = frame.explode(name, ignore_index=True)
         inner = pd.json_normalize([one if isinstance(one, dict) else {} for one in frame.pop(name)])
         frame = frame.join(inner.add_prefix(f"{name}."))
-    for name in [name for name in frame if name.rpartition(".")[2] == "coordinates"]:
-        padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
-        places = pd.DataFrame([one[:3] for one in padded], dtype=float)
-        frame = frame.join(places.rename(columns=dict(enumerate(PLACE))).loc[:, lambda p: p.notna().any()])
+    frame = unfold_places(frame)
     lengths = frame.map(lambda value: len(value) if isinstance(value, list) else 0).max()
     for name in lengths.index[lengths > MOST_VALUES]:
         raise ValueError(f"more than {MOST_VALUES:,} values in {name!r} of one record; expected one in each")
     short = Counter(name.rpartition(".")[2] for name in frame)
     return frame.rename(columns=lambda name: last if short[last := name.rpartition(".")[2]] == 1 else name)
+
+
+def unfold_places(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return lists of coordinates, in columns called as in `PLACES`, as a column for each."""
+    for name in [name for name in frame if name.rpartition(".")[2] in PLACES]:
+        before, dot, how = name.rpartition(".")
+        padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
+        places = pd.DataFrame([one[:3] for one in padded]).apply(pd.to_numeric, errors="coerce")
+        (turned, most), across = PLACES[how], places[[0, 1]]
+        degrees = (across.abs().max() <= 360).all() and (np.ptp(across.dropna(), axis=0) < most).all()
+        heads = DEGREES if degrees else METRES
+        heads = [heads[1], heads[0], heads[2]] if degrees and turned else heads
+        places.columns = [before + dot + head for head in heads]
+        frame = frame.join(places.loc[:, places.notna().any()])
+    return frame
 
 
 def _holds_records(value: Any) -> bool:
@@ -81,8 +95,16 @@ def _of_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
-    """Records of {column: {row: value}} or {column: [value]}, as pandas writes them; else none."""
-    columns = [list(c.values()) if isinstance(c, dict) else c for c in content.values()]
+    """Records of what pandas writes but lists of records; else none.
+
+    {column: {row: value}}, {row: {column: value}}, {column: [value]}, or columns beside rows of data.
+    """
+    if isinstance(rows := content.get("data"), list) and isinstance(heads := content.get("columns"), list):
+        return [dict(zip(heads, row, strict=True)) for row in rows]
+    held = [*content.values()]
+    if all(isinstance(one, dict) for one in held) and all(map(str.isdigit, content)):
+        return held if len(held) > 1 else []
+    columns = [list(c.values()) if isinstance(c, dict) else c for c in held]
     if len(columns) < 2 or not all(isinstance(c, list) and len(c) == len(columns[0]) > 1 for c in columns):
         return []
     return [dict(zip(content, row, strict=True)) for row in zip(*columns, strict=True)]

@@ -22,10 +22,8 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
     """
     if "rssi_db" not in chosen or not np.ptp(data.moving, axis=0).any():
         return []
-    measured = np.flatnonzero((data.censored_side(np.arange(len(data))) == 0) & (data.target[:, 0] > 0))
-    row, station = file_row[measured], np.zeros(len(data), np.int64) if data.station is None else data.station
-    level = 10 * np.log10(data.target[measured, 0].astype(np.float64))
-    links = LevelsAtPlaces(data.moving[measured], station[measured], level)
+    links, measured = LevelsAtPlaces.of(data)
+    row = file_row[measured]
     used = used_heads(chosen)
     words = {head: sheet.words(head) for head in sheet.heads if head not in used}
     names = [column.head or "" for column in chosen.get("station", ())]

@@ -7,6 +7,7 @@ import zlib
 import numpy as np
 import pytest
 from PIL import Image
+from pyproj import Transformer
 from refusals import refused
 from towns import town_model
 
@@ -14,6 +15,8 @@ import gsparc
 from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.area import lay_grid
 from gsparc.apps.maps.floor_plan import read_floor_plan
+from gsparc.apps.maps.geojson import read_shapes
+from gsparc.data.links.georeference import Georeference
 
 SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
 
@@ -32,6 +35,26 @@ def test_a_polygon_keeps_its_holes(tmp_path):
     grid = lay_grid(None, str(geojson(tmp_path / "a.geojson")), 1.5, 0.5)
     assert grid.inside.sum() == 400 - 16
     assert not grid.inside[9, 9] and grid.inside[0, 0]
+
+
+CORNERS = np.array([[0.0, 0], [40, 0], [40, 30], [0, 30], [0, 0]])
+ORIGIN = Georeference(-33.86, 151.21)
+DEGREES = np.stack(ORIGIN.to_degrees(CORNERS)[::-1], axis=1)
+
+
+@pytest.mark.parametrize("way", ["standard", "latitude first", "EPSG:32756", "EPSG:3857"])
+@pytest.mark.parametrize("text", [True, False])
+def test_areas_in_another_order_projection_or_format_were_refused(tmp_path, caplog, way, text):
+    drawn = DEGREES[:, ::-1] if way == "latitude first" else DEGREES
+    if way.startswith("EPSG"):
+        drawn = np.stack(Transformer.from_crs(4326, way, always_xy=True).transform(*DEGREES.T), axis=1)
+    corners = ", ".join(f"{x:.12g} {y:.12g}" for x, y in drawn)
+    area = f"POLYGON (({corners}))" if text else geojson(tmp_path / "a.geojson", [drawn.tolist()])
+    shape, _ = read_shapes(area, "area", ORIGIN)
+    np.testing.assert_allclose(shape.bounds, [0, 0, 40, 30], atol=0.01)
+    assert bool(caplog.records) == (way != "standard")
+    (tmp_path / "a.wkt").write_text(f"MULTIPOLYGON ((({corners})))\n")
+    assert read_shapes(tmp_path / "a.wkt", "area", ORIGIN)[0].equals_exact(shape, 1e-3)
 
 
 def test_a_plan_lies_where_its_two_points_say(tmp_path):
