@@ -49,7 +49,7 @@ SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one leng
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
-EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
+EVIDENCE_LOOKS = 30
 AMONG_ROWS = 4.0  # weight of errors among rows, of those at squares
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
@@ -321,7 +321,7 @@ def fit_kernel_by_evidence(
 
     best = np.append(start.parameters().numpy(), math.log(start.amplitude))
     if limit:
-        best, value = density.minimise(negative_log_evidence, [best], bounds, limit, EVIDENCE_SETTLED)
+        best, value = density.minimise(negative_log_evidence, [best], bounds, limit, density.SETTLED / count)
     else:
         value = float(negative_log_evidence(torch.from_numpy(best)))
     return value, replace(start.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
