@@ -115,7 +115,7 @@ class KernelCandidate:
 def candidate_priors(
     rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
 ) -> list[KernelCandidate]:
-    """Return the likeliest settings of each mean law, the best first, then one for gaps, and kriging's.
+    """Return the likeliest settings of each mean law, the best first, kriging's, and one for gaps.
 
     That for gaps is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or
     very many rows the best law alone. Each law has further `terms`.
@@ -133,7 +133,7 @@ def candidate_priors(
     few = rows.subset(once).draw_subset(COMPARED_ON, seed)
     squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
     gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
-    return [*found, max(gaps, key=lambda one: one.score), *_kriged(rows, trends[0])]
+    return [*found, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
 
 
 def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
