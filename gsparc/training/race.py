@@ -9,6 +9,7 @@ third of its looks moved its error by less than the standard error: then it is w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -66,7 +67,7 @@ class Race:
         self.note(name, now)
         _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
         best, own = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
-        if not before or now <= STALLED * before[-1]:
+        if now <= STALLED * (before[-1] if before else math.inf):
             return now
         apart, whole = best - own, max(float(best.abs().square().sum()), 1e-30)
         gains = (best * apart.conj()).real.double().sum(1) / whole
