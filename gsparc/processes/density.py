@@ -24,8 +24,8 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 
 LOOKS = 40  # of a walk: most evaluations
-# Gain of a step that is the last [nats of all rows]. Over rows a gain of g has a standard error of sqrt(2 g): below
-# 2 none is sure. What remains after such a step is many times as much: at .5 it was 5 % of some errors.
+# Gain of a step that is the last [nats of all rows]. Over rows a gain of g has a standard error of sqrt(2 g):
+# below 2 none is sure. What remains after such a step is many times as much: at .5 it was 5 % of some errors.
 SETTLED = 0.03
 FINEST = 2e-5  # of them per number, of images, whose numbers are not independent: answers move by 1e-4 beyond
 BAD = 1e12  # in place of a density where no Cholesky factor exists
