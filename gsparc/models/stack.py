@@ -8,6 +8,7 @@ is surely better than one predictor alone, on units of rows that its weights wer
 
 from __future__ import annotations
 
+import copy
 import functools
 import logging
 from collections.abc import Mapping, Sequence
@@ -138,18 +139,16 @@ def to_real_entries(values: Tensor) -> Tensor:
 def leave_out_groups(
     member: ClosedForm, data: Measurements, rows: np.ndarray, groups: Sequence[np.ndarray]
 ) -> LeftOutRows | None:
-    """Return rows of every group, predicted from the others with the parameters of all; None without groups.
+    """Return rows of every group, predicted from the others of rows (n,) with the parameters of all.
 
-    In the end the member is conditioned on all rows (n,) again.
+    None without groups. The member stays as it is.
     """
     if not groups:
         return None
-    answers = []
+    answers, apart = [], copy.copy(member)
     for group in groups:
-        member.condition(data, np.setdiff1d(rows, group))
-        answers.append(member.predict(data.batch(group)))
-    # Back to all rows, of which the last group is still missing.
-    member.condition(data, rows)
+        apart.condition(data, np.setdiff1d(rows, group))
+        answers.append(apart.predict(data.batch(group)))
     mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
 

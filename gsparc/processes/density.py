@@ -23,7 +23,11 @@ from gsparc.processes.factor import BLAS, Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 
-LOOKS, SETTLED = 40, 5e-6  # of a walk: most evaluations, and the relative gain of a step that is the last
+LOOKS = 40  # of a walk: most evaluations
+# Gain of a step that is the last [nats of all rows]. Over rows a gain of g has a standard error of sqrt(2 g):
+# below 2 none is sure. What remains after such a step is many times as much: at .5 it was 5 % of some errors.
+SETTLED = 0.03
+FINEST = 2e-5  # of them per number, of images, whose numbers are not independent: answers move by 1e-4 beyond
 BAD = 1e12  # in place of a density where no Cholesky factor exists
 TINY = np.finfo(float).tiny
 
@@ -156,7 +160,7 @@ def covariance_of(kernel: Kernel, distance: Tensor, columns: Tensor | None = Non
 
 def minimise(
     objective: Callable[[Tensor], Tensor], starts: Sequence[np.ndarray],
-    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, settled: float = SETTLED,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """Find where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
 
@@ -169,7 +173,7 @@ def minimise(
         starts: (p,) each.
         bounds: p of them.
         looks: most evaluations.
-        tolerance: relative gain of a step that is the last.
+        settled: gain of a step that is the last, in the objective's unit.
     """
     low, high = np.array(bounds).T
 
@@ -191,24 +195,24 @@ def minimise(
     start = min(points, key=lambda point: evaluate(point)[0]) if len(points) > 1 else points[0]
     result = minimize(
         evaluate, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-        options={"ftol": tolerance, "maxfun": looks},
+        options={"ftol": settled / max(abs(evaluate(start)[0]), 1.0), "maxfun": looks},
     )  # fmt: skip
     return result.x, float(result.fun)
 
 
 def fit_kernel(
     objective: Callable[[Kernel], tuple[Tensor, Tensor]], starts: Sequence[Kernel],
-    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, tolerance: float = SETTLED,
+    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, settled: float = SETTLED,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find where an objective of kernels is least, and the kernel there, from the best of `starts` on.
 
     Args:
         objective: its value, with autograd, and the best amplitude.
         starts: of terms of one kind.
-        bounds, looks, tolerance: see `minimise`.
+        bounds, looks, settled: see `minimise`.
     """
     first, points = starts[0], [one.parameters().numpy() for one in starts]
-    best, _ = minimise(lambda at: objective(first.with_values(at))[0], points, bounds, looks, tolerance)
+    best, _ = minimise(lambda at: objective(first.with_values(at))[0], points, bounds, looks, settled)
     with torch.no_grad():
         kernel = first.with_values(torch.from_numpy(best))
         value, amplitude = objective(kernel)
@@ -217,7 +221,7 @@ def fit_kernel(
 
 def fit_kernel_by_left_out(
     starts: Sequence[Kernel], distance: Tensor, columns: Tensor | None, values: Tensor,
-    bounds: Sequence[tuple[float, float]] = (), looks: int = LOOKS, tolerance: float = SETTLED,
+    bounds: Sequence[tuple[float, float]] = (), looks: int = LOOKS,
     entries: int = 1, bounded: bool = True, partitions: Sequence[Iterable[Tensor]] = (),
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel.
@@ -233,5 +237,6 @@ def fit_kernel_by_left_out(
         return value / len(values), amplitude
 
     bounds = bounds or starts[0].bounds(distance)
-    value, kernel = fit_kernel(objective, starts, bounds, looks, tolerance)
+    settled = max(SETTLED / (len(values) * entries), FINEST)
+    value, kernel = fit_kernel(objective, starts, bounds, looks, settled)
     return value * len(values), kernel

@@ -23,7 +23,7 @@ from torch import Tensor
 from gsparc.ops.queries import has_query_kernel, nearest_weights
 from gsparc.ops.transforms import to_numpy
 from gsparc.processes.averages import MeanVariance, mean_at_places
-from gsparc.processes.density import TINY, fit_kernel
+from gsparc.processes.density import LOOKS, SETTLED, TINY, fit_kernel
 from gsparc.processes.factor import Factor, NotDefiniteError
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.neighbourhood import (
@@ -330,4 +330,5 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
     among = f"among {' and '.join(str(len(own)) for own in sets)}"
     bounds = starts[0].bounds(torch.from_numpy(scale))
-    return fit_kernel(lambda one: nearest_density(one, sample), starts, bounds)[1], f"{note} {among}"
+    search = starts, bounds, LOOKS, SETTLED / len(rows)
+    return fit_kernel(lambda one: nearest_density(one, sample), *search)[1], f"{note} {among}"

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import torch
 
-from gsparc.processes.density import ProfiledDensity, covariance_of, fit_kernel
+from gsparc.processes.density import SETTLED, ProfiledDensity, covariance_of, fit_kernel
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.neighbourhood import covering_rows
 
@@ -21,7 +21,7 @@ SPANS = 3.0  # spacings between places, that the longer length starts from at le
 NOISES = (1e-4, 10.0)  # of the signal's power
 LOGIT = 6.0  # of the shares
 LEARNED_ON = 400  # rows
-LOOKS, SETTLED = 8, 1e-4
+LOOKS = 8
 
 
 def initial_kernel(length: float, spacing: float = 0.0) -> Kernel:
@@ -55,4 +55,4 @@ def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start
     ]  # fmt: skip
     distance = distances(at, at)
     evidence = lambda kernel: ProfiledDensity.apply(covariance_of(kernel, distance), real)  # noqa: E731
-    return fit_kernel(evidence, [start], bounds, LOOKS, SETTLED)[1]
+    return fit_kernel(evidence, [start], bounds, LOOKS, SETTLED / real.numel())[1]

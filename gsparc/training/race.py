@@ -3,12 +3,14 @@
 Of errors x of the best and y of a candidate their mean of weight w has x + w (y - x). As a candidate learns,
 its own part of y falls, and what both miss stays. So does x y, and |x|^2 - x y is the most that a mean may
 gain, however far behind the candidate is now: errors say little about that (J. M. Bates and
-C. W. J. Granger, "The combination of forecasts", 1969, weigh by both).
+C. W. J. Granger, "The combination of forecasts", 1969, weigh by both). A candidate has settled where the last
+third of its looks moved its error by less than the standard error: then it is weighed as it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +19,7 @@ from torch import Tensor
 LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidate
 SURE = 1.0  # standard errors of paired rows
 FAR = 5.0  # times the error of the best: what stalls there has a part of its own that will not fall
+LEAST_THIRD = 2  # looks
 STALLED = 0.8  # of a candidate's error a look ago: what falls more may yet learn what the best misses, too
 
 
@@ -46,33 +49,47 @@ class Race:
         missed = (mean - target).detach()
         return Race(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
-    def check_candidate(self, name: str, rows: np.ndarray, missed: Tensor, last_error: float = 0.0) -> float:
+    def check_candidate(
+        self, name: str, rows: np.ndarray, missed: Tensor, before: Sequence[float] = (0.0,)
+    ) -> float:
         """Return the mean squared error of another candidate, where both left rows out.
 
         Args:
             name: of it, for the learning curve.
             rows: (m,) rows, which it missed by `missed` (m, ...).
-            last_error: what was returned a look ago; infinity at the first.
+            before: what was returned at earlier looks; empty at the first.
 
         Raises:
-            Behind: it is `STALLED` while `FAR` behind, or weighing it gains less than `LEAST_GAIN`, even
+            FellBehind: it is `STALLED` while `FAR` behind, or weighing it gains less than `LEAST_GAIN`, even
                 `SURE` errors above.
         """
         now = mean_square(missed)
         self.note(name, now)
         _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
         best, own = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
-        whole = max(float(best.abs().square().sum()), 1e-30)
-        gains = (best * (best - own).conj()).real.double().sum(1) / whole
-        gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
-        if now <= STALLED * last_error:
+        if now <= STALLED * (before[-1] if before else math.inf):
             return now
+        apart, whole = best - own, max(float(best.abs().square().sum()), 1e-30)
+        gains = (best * apart.conj()).real.double().sum(1) / whole
+        if has_settled([*before, now], own):
+            squares = apart.abs().double().square().sum(1) / whole
+            weight = min(max(float(gains.sum() / squares.sum().clamp_min(1e-30)), 0.0), 1.0)
+            gains = weight * (2 * gains - weight * squares)
+        gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
         known = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
         if now > FAR * mean_square(best):
             raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {known}")
         if gain + SURE * error < LEAST_GAIN:
             raise FellBehind(f"{name}: averaging it with {known} gains {gain:.0%} ± {error:.0%}")
         return now
+
+
+def has_settled(errors: Sequence[float], missed: Tensor) -> bool:
+    """Tell whether the last third of looks lowered the error by less than its standard error over rows."""
+    third, squares = len(errors) // 3, missed.abs().double().square().mean(1)
+    if third < LEAST_THIRD:
+        return False
+    return min(errors[:-third]) - min(errors[-third:]) < float(squares.std()) / len(squares) ** 0.5
 
 
 def mean_square(values: Tensor) -> float:

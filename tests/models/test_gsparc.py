@@ -226,8 +226,8 @@ def test_a_search_that_could_gain_too_little_ends(monkeypatch, caplog):
 @pytest.mark.parametrize(
     "name,plain",
     [
-        ("powers", "gp"), ("images", "gp"), ("static array", "gp"), ("moving array", "gp"),
-        ("channels", None), ("channels of an array", None),
+        ("images", "gp"), ("static array", "gp"), ("moving array", "gp"),
+        ("powers", None), ("channels", None), ("channels of an array", None),
     ],
 )  # fmt: skip
 def test_without_gaussians_it_is_the_plain_process(name, plain):

@@ -28,8 +28,8 @@ def test_a_candidate_behind_goes_on_where_its_errors_are_its_own():
 def test_a_candidate_ends_that_stays_far_behind():
     one = race()
     with pytest.raises(FellBehind, match=r"^far: \d+ times the error of the best so far \(error 0\.0"):
-        one.check_candidate("far", ROWS, 5 * OWN[1], 25.0)
-    assert one.check_candidate("falling", ROWS, 5 * OWN[1], 100.0) == pytest.approx(25, rel=0.2)
+        one.check_candidate("far", ROWS, 5 * OWN[1], [25.0])
+    assert one.check_candidate("falling", ROWS, 5 * OWN[1], [100.0]) == pytest.approx(25, rel=0.2)
 
 
 def test_a_candidate_ends_that_misses_what_the_best_misses():
@@ -37,7 +37,15 @@ def test_a_candidate_ends_that_misses_what_the_best_misses():
         FellBehind, match=r"^near: averaging it with the best so far \(error 0\.0\d+ .* gains -?\d+% ±"
     ):
         race().check_candidate("near", ROWS, OWN[0] + 0.1 * OWN[1])
-    assert race().check_candidate("falling", ROWS, OWN[0] + 0.1 * OWN[1], 3.0) == pytest.approx(1, rel=0.2)
+    falling = race().check_candidate("falling", ROWS, OWN[0] + 0.1 * OWN[1], [3.0])
+    assert falling == pytest.approx(1, rel=0.2)
+
+
+def test_a_search_that_had_settled_went_on_for_what_no_mean_gained():
+    missed = 0.9 * OWN[0] + OWN[1]  # its own part would have to fall before a mean gained 3 %
+    assert race().check_candidate("learning", ROWS, missed, [9.0, 6.0, 4.0, 3.0, 2.2]) > 1
+    with pytest.raises(FellBehind, match=r"gains 0% ±"):
+        race().check_candidate("settled", ROWS, missed, [9.0, 6.0, 1.8, 1.8, 1.8])
 
 
 def test_only_rows_that_both_left_out_are_compared():

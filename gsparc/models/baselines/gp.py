@@ -25,7 +25,7 @@ from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_an
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import power_rows
 from gsparc.physics.separable import Separable, separate_axes
-from gsparc.processes.density import SETTLED, TINY, fit_kernel_by_left_out
+from gsparc.processes.density import TINY, fit_kernel_by_left_out
 from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
@@ -115,9 +115,8 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
     lengths = combinations(spread * STARTS, count)
     starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    # The figures move by 1e-4 beyond this.
     known = starts, distances(places, places), None, values, bounds
-    return fit_kernel_by_left_out(*known, tolerance=2 * SETTLED, entries=entries, bounded=False)[1]
+    return fit_kernel_by_left_out(*known, entries=entries, bounded=False)[1]
 
 
 class GaussianProcess(Differentiable, ClosedForm):

@@ -29,6 +29,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.image_sources.search import NOISE
 from gsparc.physics.waves import LIGHT
+from gsparc.processes.density import SETTLED
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances
 
@@ -39,7 +40,6 @@ CELL = 1 / 4  # of a wavelength
 REFINED, STEPS = 6, 8  # best draws, and Gauss-Newton steps for each
 MIN_PROBABILITY = 0.8  # of one optimum, to resolve a source
 SWEEPS = 8  # over all sources
-TOLERANCE_M = 1e-3  # [m], largest move of a sweep that ends the refinement
 MIN_NOISE = 1e-3  # of the rows' power
 POWER_UPDATES, MAX_RATIO = 3, 8.0  # fixed-point iterations, and largest change in each
 MAX_POWER = 4.0  # of a source, times the median
@@ -124,13 +124,13 @@ class PositionRefinement:
         self.resolved = torch.zeros(len(self.terms), dtype=torch.bool)
         size = torch.linalg.det(self.prior.covariance)
         order = uncertain[size[uncertain].argsort()].tolist()
+        lowest = math.inf
         for _ in range(SWEEPS):
-            self._update_powers()
-            before = self.current.points
+            if lowest - (nll := self._update_powers()) < SETTLED:
+                break
+            lowest = nll
             for k in order:
                 self._refine_source(k)
-            if float((self.current.points - before).norm(dim=1).max()) < TOLERANCE_M:
-                break
         return self.current
 
     def _source_covariance(self, k: int) -> Tensor:
@@ -147,8 +147,11 @@ class PositionRefinement:
             power[without] = 0
         return (power @ self.terms.flatten(1)).unflatten(0, self.terms.shape[1:])
 
-    def _update_powers(self) -> None:
-        """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992)."""
+    def _update_powers(self) -> float:
+        """Powers and noise by the fixed point of D. J. C. MacKay ("Bayesian interpolation", 1992).
+
+        Returns the negative log likelihood before the last update.
+        """
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
             given = condition_with_noise(self.sum_source_covariances(), self.noise, self.rows.target)
@@ -159,6 +162,7 @@ class PositionRefinement:
             residual = float(given.weights.abs().square().sum())
             ratio = residual / (outputs * float(given.factor.inverse.diagonal().real.sum()))
             self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
+        return given.nll
 
     def _refine_source(self, k: int) -> None:
         """Position and covariance of source k given its rays, the channels and all other sources."""

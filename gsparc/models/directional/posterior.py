@@ -10,6 +10,7 @@ those of one kernel; what is uncertain of a source's place multiplies its own pa
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -123,7 +124,8 @@ class SightedSources:
     def conditioned(self) -> Conditioned:
         """The rows given their covariance, which is factored in float64."""
         exact = to_double(replace(self))
-        covariance = exact._cross_covariance(exact.waves, exact._coherence(), exact.power)
+        one_by_one = (coherence(one, one) for one in exact.phase_vectors)  # of all sources: gigabytes
+        covariance = exact._cross_covariance(exact.waves, one_by_one, exact.power)
         covariance *= exact._gain_correlation(self.kernel)
         return condition_with_noise(covariance, self.kernel.noise, exact.rows.target).in_float32
 
@@ -216,12 +218,20 @@ class SightedSources:
     def _coherence(self) -> Tensor:
         return coherence(self.phase_vectors, self.phase_vectors)
 
-    def _cross_covariance(self, waves: Tensor, retained: Tensor, power: Tensor) -> Tensor:
+    def _cross_covariance(self, waves: Tensor, retained: Iterable[Tensor], power: Tensor) -> Tensor:
         """Covariance (m, n) of waves (m, K) with the rows, before the correlation over places."""
         uncertain = self.incoherent
         # Certain sources together in one product; each uncertain one has a coherence of its own.
         exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
         total = (waves * exact) @ self.waves.mH
+        if not len(uncertain):
+            return total
+        # In real numbers, with one buffer: products of complex columns would each take three of all rows.
+        real, imag = total.real.contiguous(), total.imag.contiguous()
+        buffer = torch.empty_like(real)
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):
-            total += (power[k] * waves[:, k])[:, None] * self.waves[:, k].conj() * coherent
-        return total
+            own, other = (torch.view_as_real(one[:, k].contiguous()) for one in (power * waves, self.waves))
+            real.addcmul_(torch.mm(own, other.T, out=buffer), coherent)
+            turned = torch.stack([own[:, 1], -own[:, 0]], 1)
+            imag.addcmul_(torch.mm(turned, other.T, out=buffer), coherent)
+        return torch.complex(real, imag)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import math
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -124,7 +123,7 @@ class ImageSourceGP(SourcesInFrame):
         if self._groups and context.race is not None:
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
-            look = partial(self._log_look, context.race, group, data.batch(group), [math.inf])
+            look = partial(self._log_look, context.race, group, data.batch(group), [])
         given = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
         members = self._run_searches(row_sets, settings, effort, look, given)
         if calibrated:
@@ -193,7 +192,7 @@ class ImageSourceGP(SourcesInFrame):
         mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors[-1]))
+        errors.append(race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors))
 
     def _draw(self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""

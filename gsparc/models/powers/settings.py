@@ -18,12 +18,20 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
+from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.models.stack import best_weights
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
-from gsparc.processes.kernel import EndShadowing, ExponentialShadowing, Kernel, Shadowing, distances
+from gsparc.processes.kernel import (
+    NOISE_SPAN,
+    EndShadowing,
+    ExponentialShadowing,
+    Kernel,
+    Shadowing,
+    distances,
+)
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
@@ -43,13 +51,14 @@ SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at 
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
-TWO_LENGTHS_NEED = 100  # rows that were heard; for a mixture too: of fewer no squares tell
+TWO_LENGTHS_NEED, MIXED_FROM = 100, 20  # rows that were heard
+LEAST_SILL = 1e-2  # of the nugget: below it levels are all alike to kriging
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
 SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
-EVIDENCE_LOOKS, EVIDENCE_SETTLED = 30, 1e-4
+EVIDENCE_LOOKS = 30
 AMONG_ROWS = 4.0  # weight of errors among rows, of those at squares
 AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
@@ -106,15 +115,15 @@ class KernelCandidate:
 def candidate_priors(
     rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
 ) -> list[KernelCandidate]:
-    """Return the likeliest settings of each mean law, the best first, then one for gaps.
+    """Return the likeliest settings of each mean law, the best first, kriging's, and one for gaps.
 
-    That is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or very
-    many rows the best law alone. Each law has further `terms`.
+    That for gaps is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or
+    very many rows the best law alone. Each law has further `terms`.
     """
     rest = subtract_means(rows, terms)
     laws = _candidate_laws(rest, site, "auto")
     trends = [MeanLaw(add_terms_to_trend(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
-    if not TWO_LENGTHS_NEED <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
+    if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
     found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
     if rows.silent.any():
@@ -124,7 +133,17 @@ def candidate_priors(
     few = rows.subset(once).draw_subset(COMPARED_ON, seed)
     squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
     gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
-    return [*found, max(gaps, key=lambda one: one.score)]
+    return [*found, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
+
+
+def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
+    """The settings of a variogram, which ordinary kriging has; none where it shows no distance to count."""
+    found = fit_variogram(rows.places, rows.decibels[:, None])
+    if not found.sill > LEAST_SILL * found.nugget:
+        return []
+    noise = max(found.nugget / found.sill, NOISE_SPAN[0])
+    kernel = Kernel.from_length(found.range, noise, found.sill, ExponentialShadowing)
+    return [KernelCandidate(-math.inf, mean.trend, kernel, 0.0, mean.notes)]
 
 
 def mix_candidates(
@@ -321,7 +340,7 @@ def fit_kernel_by_evidence(
 
     best = np.append(start.parameters().numpy(), math.log(start.amplitude))
     if limit:
-        best, value = density.minimise(negative_log_evidence, [best], bounds, limit, EVIDENCE_SETTLED)
+        best, value = density.minimise(negative_log_evidence, [best], bounds, limit, density.SETTLED / count)
     else:
         value = float(negative_log_evidence(torch.from_numpy(best)))
     return value, replace(start.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))

@@ -12,10 +12,12 @@ from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.powers import settings
 from gsparc.models.powers.field import PowerField
 from gsparc.models.target_rows import power_rows
 from gsparc.processes import powers
+from gsparc.processes.kernel import ExponentialShadowing
 from gsparc.processes.powers import condition_on_powers
 from gsparc.training.context import FitContext
 
@@ -123,7 +125,18 @@ def test_a_mixture_is_stored_whole(monkeypatch, nearest):
 
 
 def test_few_rows_have_one_process():
-    assert len(fitted_to(PowerField(), walks(), np.arange(80))[0].priors) == 1
+    assert len(fitted_to(PowerField(), walks(), np.arange(settings.MIXED_FROM - 1))[0].priors) == 1
+
+
+@pytest.mark.parametrize("rows", [30, 150])
+def test_kriging_was_no_member(rows):
+    data = walks()
+    known = power_rows(data, np.arange(rows))
+    found = fit_variogram(known.places, known.decibels[:, None])
+    kernels = [one.kernel for one in settings.candidate_priors(known, data.site, 0, 300)]
+    (own,) = (one for one in kernels if one.length == found.range)
+    assert isinstance(own.terms[0], ExponentialShadowing) and own.amplitude == found.sill
+    assert own.noise == pytest.approx(found.nugget / found.sill, abs=1e-6)
 
 
 def test_gaps_were_predicted_by_lengths_of_rows_with_neighbours():

@@ -18,7 +18,13 @@ from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.settings import EVIDENCE_LOOKS, fit_kernel_by_evidence
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.models.stack import mean_and_error
-from gsparc.processes.density import LeftOutDensity, covariance_of, fit_kernel_by_left_out, minimise
+from gsparc.processes.density import (
+    SETTLED,
+    LeftOutDensity,
+    covariance_of,
+    fit_kernel_by_left_out,
+    minimise,
+)
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.places import extra_columns, moving_end
 from gsparc.processes.posterior import Exact
@@ -28,7 +34,6 @@ from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_proces
 from gsparc.processes.trend import Trend
 
 START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
-SETTLED = 1e-6  # of settings that all stations have alike
 LEAST_DB2 = 1e-6  # of a station's process: levels that are equal to the last digit leave none
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
@@ -109,7 +114,7 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
         else:
             some = heard.select_station(number).thin_rows(ENDS_ON, seed)
             known = some.distances_terms_values(trend)
-            _, own = fit_kernel_by_left_out([kernel], *known, tolerance=SETTLED)
+            _, own = fit_kernel_by_left_out([kernel], *known)
         priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -145,7 +150,8 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
     def mean_density(at: Tensor) -> Tensor:
         return torch.stack([left_out_density(at, number)[0] for number in views]).sum() / len(few.places)
 
-    best, _ = minimise(mean_density, [start.parameters().numpy()], start.bounds(far), tolerance=SETTLED)
+    begin, settled = [start.parameters().numpy()], SETTLED / len(few.places)
+    best, _ = minimise(mean_density, begin, start.bounds(far), settled=settled)
     amplitudes = [float(left_out_density(torch.from_numpy(best), number)[1]) for number in views]
     logs = np.log(np.maximum(amplitudes, LEAST_DB2))
     count = np.array([len(values) for _, _, values in views.values()])

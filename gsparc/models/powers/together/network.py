@@ -23,7 +23,7 @@ from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows
 from gsparc.processes.censored import PseudoValues
-from gsparc.processes.density import NegativeLogEvidence, minimise
+from gsparc.processes.density import SETTLED, NegativeLogEvidence, minimise
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import horizontal, moving_end, other_end
@@ -261,7 +261,7 @@ def _fit_by_evidence(
     *bounds, noise = start.terms[0].bounds(middle)
     bounds = [*_shared_bounds(), *[(-math.inf, math.inf)] * bands, *bounds, noise, noise]
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
-    best, _ = minimise(negative_log_evidence, [begin], bounds)
+    best, _ = minimise(negative_log_evidence, [begin], bounds, settled=SETTLED / count)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
     learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.with_values(logs)
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
