@@ -27,7 +27,8 @@ def draw_confidences(
     names: Iterable[str], rows: pd.DataFrame, title: str, folder: Path, end: str = ""
 ) -> None:  # fmt: skip
     """Save pictures of `PICTURES` by name, of the runs of a frame that state a confidence, if any."""
-    runs = [row for row in own_rows(rows).to_dict("records") if _states(row)]
+    every: list[Row] = own_rows(rows).to_dict("records")  # type: ignore[assignment]
+    runs = [row for row in every if _states(row)]
     for name in names if runs else ():
         if name != "snr_brackets" or runs[0]["kind"] != "rssi":  # powers have no ratio to an error
             figure = PICTURES[name](runs)
@@ -117,11 +118,12 @@ def _draw_brackets(runs: list[Row]) -> Figure:
         left.set(ylabel=f"{axis_of(name)} of a test row")
         known = np.isfinite(own[name])
         low, high = np.quantile(own[name][known], OUTER)
-        begin = np.floor(np.clip(own[name][known], low, high) / BRACKET_DB)  # the outermost are open
-        groups = pd.Series(own["confidence"][known]).groupby(begin * BRACKET_DB)
-        names = [f"{start:.0f}–{start + BRACKET_DB:.0f}\n{len(group)}" for start, group in groups]
+        begin = BRACKET_DB * np.floor(np.clip(own[name][known], low, high) / BRACKET_DB)  # outermost are open
+        starts, counts = np.unique(begin, return_counts=True)
+        sure = [own["confidence"][known][begin == start].mean() for start in starts]
+        names = [f"{a:.0f}–{a + BRACKET_DB:.0f}\n{n}" for a, n in zip(starts, counts, strict=True)]
         right.tick_params(axis="x", labelsize=7)
-        right.bar(names, groups.mean(), color=PALETTE[0], alpha=0.7)
+        right.bar(names, sure, color=PALETTE[0], alpha=0.7)
         right.axhline(PAPER_TAU, color=GREY, linestyle="--", label=f"threshold {PAPER_TAU}")
         right.set(xlabel=f"{axis_of(name)}, and the number of rows", ylabel="mean confidence", ylim=(0, 1.15))
         right.legend(loc="upper left")

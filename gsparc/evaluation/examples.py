@@ -50,10 +50,11 @@ class Examples:
 
     def write(self, path: Path) -> None:
         """Write them, atomically; values to three digits, which is what is seen of them."""
-        own = {f"of {name}": values.astype(np.float16) for name, values in self.predicted.items()}
-        arrays = {name: value for name, value in vars(self).items() if name != "predicted"}
+        images = {f"of {name}": values for name, values in self.predicted.items()} | {"truth": self.truth}
+        arrays = {name: values.astype(np.float16) for name, values in images.items()}
+        arrays |= {"rows": self.rows, "edges": self.edges, "confidence": self.confidence}
         with whole_file(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, **arrays | {"truth": self.truth.astype(np.float16)}, **own)
+            np.savez_compressed(file, allow_pickle=False, **arrays)
 
     @classmethod
     def read(cls, path: Path) -> Examples | None:
