@@ -101,10 +101,10 @@ def draw_distributions(
             low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
             axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
             axes.axvline(np.median(values) if len(values) else np.nan, lw=0.8, ls="--", color=style["color"])
-        for method, values in _samples_of_rivals(rows, name).items():
+        for method, draws in _samples_of_rivals(rows, name).items():
             line_of = style_of(method).line
-            axes.step(*_shares(values), lw=0.8, label=method, **line_of)  # of all draws
-            axes.axvline(np.median(np.concatenate(values)), lw=0.6, ls="--", color=line_of["color"])
+            axes.step(*_shares(draws), lw=0.8, label=method, **line_of)
+            axes.axvline(np.median(np.concatenate(draws)), lw=0.6, ls="--", color=line_of["color"])
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
         if name in (TIMES, "mse", "nmse"):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)

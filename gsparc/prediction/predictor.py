@@ -139,8 +139,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
     def select_carrier(self, frequency_hz: float) -> Predictor:
         """Return the same model asked about one carrier [Hz], also one that nobody measured if it can.
 
-        >>> wideband.select_carrier(28e9).spectrum(tx=[2.0, 1.0, 1.5]).shape
-        (90, 360)
+        >>> predictor.select_carrier(28e9)  # of a model of one carrier
+        Traceback (most recent call last):
+            ...
+        ValueError: frequency_hz=2.8e+10: arrays has one carrier alone
 
         Raises:
             ValueError: the model knows one carrier, or its own carriers alone.

@@ -88,13 +88,13 @@ def test_path_that_is_not_utf8(tmp_path):
 
 def test_each_problem_is_one_line(tmp_path, arrays):
     arrays["spectrum"][4, 0, 0] = np.nan
-    arrays["tx_position"][7] = np.inf
+    arrays["tx_position"][7], arrays["tx_position"][8] = np.inf, np.nan  # one alone would be left out
     np.savez(tmp_path / "bad.npz", **arrays, maks=np.ones(3))
     good, text = _said(tmp_path / "bad.npz")
     lines = text.strip().splitlines()
-    assert not good and len(lines) == 4
-    assert "did you mean 'mask'" in lines[0] and "row 7" in lines[1] and "row 4" in lines[2]
-    assert lines[3].endswith("bad.npz: refused, 3 problems")
+    assert not good and len(lines) == 5
+    assert "did you mean 'mask'" in lines[0] and "row 7" in lines[1] and "row 8" in lines[2]
+    assert "row 4" in lines[3] and lines[4].endswith("bad.npz: refused, 4 problems")
 
 
 def test_exit_status(tmp_path, arrays, capsys):
