@@ -214,10 +214,12 @@ def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) 
             if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
                 raise ValueError("its checkpoint is of another run than its summary")
             tested = rows_to_score(opened.split.folds[0], "test")
-            calls[number] = opened.predictor.cycle_places(opened.data.moving[tested])  # not of an uplink
+            call = opened.predictor.cycle_places(opened.data.moving[tested])
+            call(0)  # what reads an uplink answers at no places
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
+        calls[number] = call
         threads[number] = int(run.facts.get("machine/threads") or torch.get_num_threads())
     times = timing.time_interleaved(calls, replace(timing.BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
     for number, ms in times.items():

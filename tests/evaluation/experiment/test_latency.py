@@ -56,11 +56,11 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
 def test_a_sweep_of_a_method_that_reads_an_uplink_ended_without_its_table(tmp_path, monkeypatch, caplog):
     """It answers at no places, so that it cannot be timed again; the sweep's report was lost for that."""
 
-    def refuse(places):
+    def refuse(number):
         raise ValueError("uplink: reads a fresh uplink, and positions alone are none")
 
     opened = SimpleNamespace(
-        stored=[SimpleNamespace(extra={})], predictor=SimpleNamespace(cycle_places=refuse),
+        stored=[SimpleNamespace(extra={})], predictor=SimpleNamespace(cycle_places=lambda places: refuse),
         split=SimpleNamespace(folds=[Fold(*[np.arange(3)] * 3)]),
         data=SimpleNamespace(moving=np.zeros((3, 3))),
     )  # fmt: skip
