@@ -21,11 +21,12 @@ from gsparc.models.channels.terms import Isotropic, Noise
 from gsparc.models.channels.terms.compressed import Basis, Cache, get_or_make
 from gsparc.models.channels.terms.term import ChannelTerm
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.density import SETTLED, TINY
+from gsparc.processes.density import TINY
 from gsparc.processes.left_out import left_out_residuals as left_out_rows
 
 WEAK = 1e-3  # pull of every parameter to where it started, which holds those that nothing depends on
 STEPS = 30
+SETTLED = 1e-6  # relative change of the objective at which steps end
 
 Grouping = list[Tensor] | None  # rows that are left out together; None: one by one
 
@@ -190,10 +191,9 @@ def fit_terms(
             gradient = gradient + part.design.T @ power_gradient(part, own, now)
         return total, gradient.numpy()
 
-    first = abs(cost_and_slopes(begin.numpy())[0])
     optimum = minimize(
         cost_and_slopes, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds,
-        options={"maxiter": steps, "ftol": SETTLED / max(first, 1.0)},
+        options={"maxiter": steps, "ftol": SETTLED},
     )  # fmt: skip
     found = torch.from_numpy(optimum.x)
     fitted = tuple(term.with_values(own) for term, own in zip(terms, found.split(sizes), strict=True))
