@@ -56,8 +56,8 @@ def _without_fix(check: Checker, measured: str) -> None:
             lost[f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"] = null
         # One value that repeats is a mark of a logger; several are faults only where they are few.
         if off.sum() <= max(1, FEW * rows) or (2 * off.sum() < rows and not np.ptp(place[off], axis=0).any()):
-            where = "({:g}, {:g}) {}".format(*place[off.argmax()], "degrees" if degrees else "m")
-            lost[f"no such place on Earth, {where}"] = off
+            x, y = place[off.argmax()]
+            lost[f"no such place on Earth, ({x:g}, {y:g}) {'degrees' if degrees else 'm'}"] = off
         for what, out in [(what, out) for what, out in lost.items() if out.any()]:
             which = name_row_ranges([str(name) for name in arrays["row_name"][out]])
             check.notes.append(Caution(f"{which}: {what}; these {out.sum()} of {rows} rows are left out"))
