@@ -209,15 +209,15 @@ def slopes(predictor: Predictor, at: torch.Tensor) -> dict[str, torch.Tensor]:
     }
 
 
-def differences(predictor: Predictor, at: torch.Tensor) -> dict[str, torch.Tensor]:
+def differences(predictor: Predictor, at: torch.Tensor, step: float = STEP) -> dict[str, torch.Tensor]:
     """Central differences of fourth order: (B, D) of each of `sums`."""
     columns: dict[str, list[torch.Tensor]] = {}
     for axis in torch.eye(at.shape[1], dtype=at.dtype):
         with torch.no_grad():
-            near, far = ([sums(predictor, at + h * n * STEP * axis) for h in (1, -1)] for n in (1, 2))
+            near, far = ([sums(predictor, at + h * n * step * axis) for h in (1, -1)] for n in (1, 2))
         for name in near[0]:
             first, second = (pair[0][name] - pair[1][name] for pair in (near, far))
-            columns.setdefault(name, []).append((8 * first - second) / (12 * STEP))
+            columns.setdefault(name, []).append((8 * first - second) / (12 * step))
     return {name: torch.stack(parts, 1) for name, parts in columns.items()}
 
 
@@ -228,13 +228,14 @@ def error(found: torch.Tensor, wanted: torch.Tensor) -> float:
 
 def equal_differences(predictor, data):
     at = places(predictor)
-    found, wanted = slopes(predictor, at), differences(predictor, at)
+    # A pixel that reaches 0 within a step has no difference there: by a twentieth it has.
+    found, wanted = slopes(predictor, at), [differences(predictor, at, s) for s in (STEP, STEP / 20)]
     assert "mean" in found
     for part, slope in found.items():
         assert slope.dtype == torch.float64 and slope.abs().max() > 0, part
-        assert error(slope, wanted[part]) < 1e-5, part
-    for part in set(wanted) - set(found):
-        assert wanted[part].abs().max() == 0, part
+        assert min(error(slope, one[part]) for one in wanted) < 1e-5, part
+    for part in set(wanted[0]) - set(found):
+        assert wanted[0][part].abs().max() == 0, part
 
 
 def are_the_same_in_forward_mode_and_transforms(predictor, data):
