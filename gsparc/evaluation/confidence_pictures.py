@@ -51,6 +51,7 @@ def _loss(row: Row) -> np.ndarray:
         return np.abs(own["error_db"])
     if row["kind"] != "spectrum":
         return bounded_loss(own["error_power"] / np.maximum(own["target_power"], 1e-300))
+    # Images smaller than the window have no SSIM: the absolute error alone tells.
     return (1 - SSIM_WEIGHT) * own["mae"] + SSIM_WEIGHT * (1 - np.nan_to_num(own["ssim_gauss"], nan=1.0))
 
 

@@ -129,7 +129,7 @@ CASES = {
     "arbitrary strength units": (table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140), {},
         "'asu' is ASU, of LTE: dataset.columns.rssi_db=asu-140", "GSM"),
     "strength units of GSM": (table("x,y,asu", *PLACES.T, np.where(NINTH, 99, (LEVELS[:, 0] + 98) // 2)), {},
-        "'asu' is ASU, of GSM: dataset.columns.rssi_db=asu*2-113", "LTE"),
+        "'asu' is ASU, of GSM: dataset.columns.rssi_db=asu*2-113; if weak, of LTE:", "saturat"),
     "units that are said": (table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140),
         {"columns": {"rssi_db": "asu-140"}}, "good", "warning"),
     "joined files": (wide("") + wide(""), {}, "line 242: the heads again; left out", "refused"),

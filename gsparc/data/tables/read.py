@@ -147,9 +147,10 @@ class Builder:
                     return self.refuse(f"{fault}; {how} takes losses for levels")
                 if "asu" in words_of(head):
                     asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
-                    coarse = (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all()
-                    how = say_column("rssi_db", f"{head}{'*2-113' if coarse else '-140'}")
-                    return self.refuse(f"{fault}; {head!r} is ASU, of {'GSM' if coarse else 'LTE'}: {how}")
+                    how = f"of LTE: {say_column('rssi_db', f'{head}-140')}"
+                    if (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all():  # of LTE these would all be weak
+                        how = f"of GSM: {say_column('rssi_db', f'{head}*2-113')}; if weak, {how}"
+                    return self.refuse(f"{fault}; {head!r} is ASU, {how}")
                 if {"quality", "percent", "pct"} & set(words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)

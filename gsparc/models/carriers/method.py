@@ -145,9 +145,7 @@ class CarrierField(OneArray):
         value = cross @ self.left
         if self.weight:  # else the paths, which are most of a query, explain nothing
             value = value + self.weight * self._expected_values(places)[which]
-        if self._inverse is None:
-            self._inverse = Factor.from_gram(one.gram(self.rows)).inverse
-        variance = (one.prior - (cross @ self._inverse * cross).sum(1)).clamp(0, one.prior)
+        variance = (one.prior - (cross @ self._inverse_of_rows() * cross).sum(1)).clamp(0, one.prior)
         unknown, error = variance / one.prior, one.amplitude * (variance + one.noise)
         near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE
         share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * self.alone.has_process(station)
@@ -162,9 +160,16 @@ class CarrierField(OneArray):
 
     def add_carrier(self, frequency_hz: float) -> Self:
         """See `AddsCarriers`."""
+        self._inverse_of_rows()  # which the copies share: else each would make its own
         result = super().add_carrier(frequency_hz)
         result.alone = self.alone.add_unknown()
         return result
+
+    def _inverse_of_rows(self) -> Tensor:
+        """Inverse (n, n) of the rows' covariance, made once."""
+        if self._inverse is None:
+            self._inverse = Factor.from_gram(self.covariance.gram(self.rows)).inverse
+        return self._inverse
 
     def count_components(self) -> int:
         """Return the number of mirror planes."""
