@@ -20,7 +20,6 @@ import gsparc
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1"}
 RUN = {"cwd": ROOT, "env": ENVIRONMENT, "capture_output": True, "text": True}
-MOST_IMPORTS = 50  # processor time of all notebooks: 22 to 32 times that of importing what they import
 
 
 class Links(HTMLParser):
@@ -141,12 +140,9 @@ def test_names_are_those_that_users_import(site):
 @pytest.mark.timeout(1800)
 def test_tutorials_run():
     pytest.importorskip("nbclient", reason="tutorials need the extra docs: make docs")
-    code = "import gsparc.evaluation.summary, time; print(time.process_time())"
-    unit_s = float(subprocess.run([sys.executable, "-c", code], check=True, **RUN).stdout)
-    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **RUN)
+    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **RUN)  # a cell's limit is its own
     assert done.returncode == 0, done.stdout + done.stderr
-    used_s = int(re.search(r"5 notebooks: .* (\d+) s of processor", done.stderr)[1])
-    assert used_s < MOST_IMPORTS * unit_s, (unit_s, done.stderr)
+    assert "5 notebooks: " in done.stderr
 
 
 @pytest.mark.slow

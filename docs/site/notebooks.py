@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import resource
 import sys
 import tempfile
 import time
@@ -48,9 +47,7 @@ def main(names: list[str]) -> float:
         seconds = run(file)
         total += seconds
         log.info("%s: %.0f s", file.stem, seconds)
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    processor = used.ru_utime + used.ru_stime  # what else the machine does stretches the clock alone
-    log.info("%d notebooks: %.0f s, %.0f s of processor time", len(found), total, processor)
+    log.info("%d notebooks: %.0f s", len(found), total)
     return total
 
 
