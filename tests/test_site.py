@@ -140,7 +140,7 @@ def test_names_are_those_that_users_import(site):
 @pytest.mark.timeout(1800)
 def test_tutorials_run():
     pytest.importorskip("nbclient", reason="tutorials need the extra docs: make docs")
-    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **RUN)  # a cell's limit is its own
+    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **RUN)  # which limits each cell
     assert done.returncode == 0, done.stdout + done.stderr
     assert "5 notebooks: " in done.stderr
 
