@@ -12,8 +12,10 @@ from gsparc.data.schema import Measurements, show_names
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
 from gsparc.evaluation.scores import FEW, Scores
 from gsparc.evaluation.table import Column, Table
+from gsparc.models.powers.groups import number_squares
 
 WORST = 3  # stations shown; the file has all
+BY_CHANCE, SURE = 1e-4, 0.999  # chance at which a station is missed; most that a prediction is trusted
 ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
 
 
@@ -30,12 +32,16 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     """Return the share of places, with rows of two stations or more, whose measured strongest is predicted.
 
-    What was not heard counts as weaker than all that was. Of k stations tied as predicted strongest a right
-    one counts 1 / k. Empty without such places.
+    What was not heard counts as weaker than all that was; in lists of the strongest all that is not listed,
+    see `strongest_told`. Of k stations tied as predicted strongest a right one counts 1 / k. Empty without
+    such places.
     """
     if data.station is None:
         return {}
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
+    if "strongest_told" in scores.samples:
+        told = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
+        return {BEST_SERVER: float(told.mean())}
     # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
     most = np.where(data.censored_side(row) < 0, data.target[row, 0] * data.site.target_scale, np.nan)
     told = scores.samples.get("served", scores.samples["prediction"])
@@ -50,6 +56,37 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     places = strongest.groupby(["fold", "place"])
     found = places.sum()[(places.size() > 1) & places.measured.any()]
     return {BEST_SERVER: float((found.right / found.predicted).mean())} if len(found) else {}
+
+
+def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
+    """Return stations that no list holds though lists should, a row each: `rows`, `expected`, `chance`.
+
+    Of `rows` of the station `expected` should be listed. Rows of one square of floor err together and count
+    as one, by their mean probability: a station that is there stays out of all with at most this `chance`.
+    Empty of other data than lists of the strongest.
+    """
+    if not {"strongest_told", "heard_share"} <= scores.samples.keys():
+        return pd.DataFrame(columns=["rows", "expected", "chance"])
+    assert data.station is not None
+    rows = pd.DataFrame({
+        "station": data.station[scores.row], "square": number_squares(data.moving[scores.row]),
+        "share": scores.samples["heard_share"], "listed": data.censored_side(scores.row) <= 0,
+    }).dropna()  # fmt: skip
+    missed = 1 - rows.groupby(["station", "square"]).share.mean().clip(upper=SURE)
+    by = rows.groupby("station")
+    found = by.agg(rows=("share", "size"), expected=("share", "sum"), listed=("listed", "any"))
+    found["chance"] = missed.groupby("station").prod()
+    return found[~found.listed & (found.chance < BY_CHANCE)].drop(columns="listed")
+
+
+def describe_unlisted(scores: Scores, data: Measurements) -> str | None:
+    """Return stations of `unlisted_stations` in words, the surest first; None without."""
+    found, stations = unlisted_stations(scores, data).sort_values("chance"), data.site.stations
+    if stations is None or not len(found):
+        return None
+    names = np.array(stations.shown)[found.index]
+    said = zip(names, found.expected, found["rows"], found.chance, strict=True)
+    return ", ".join(f"{n} (in {e:.0f} of {r:.0f} lists; chance {c:.0e})" for n, e, r, c in said)
 
 
 def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[str, Any]:

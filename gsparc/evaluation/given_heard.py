@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.links.strongest import StrongestLists
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import power_in_decibels
 from gsparc.models.method import Method
 from gsparc.models.per_station import UNHEARD, PerStation
@@ -19,9 +19,25 @@ DRAWS = 100  # of the levels of all that may be listed
 FARTHEST = -8.0  # deviations below its limit that a predicted level is clamped at
 
 
+def strongest_lists(data: Measurements) -> StrongestLists | None:
+    """Return what is listed at each moment, where these are lists of the strongest; None elsewhere."""
+    if data.place is None or data.station is None or data.site.stations is None:
+        return None
+    heard = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
+    level, at = _levels_db(data, heard), data.moving[heard]
+    count = len(data.site.stations)
+    lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)
+    return lists if lists.are_strongest() else None
+
+
+def _levels_db(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    return 10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale)
+
+
 def levels_given_heard(
-    method: Method, learned: Measurements, asked: Measurements, mean_db: np.ndarray, spread_db: np.ndarray
-) -> dict[str, np.ndarray]:
+    method: Method, learned: Measurements, asked: Measurements, mean_db: np.ndarray, spread_db: np.ndarray,
+    lists: StrongestLists | None = None,
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Return the probability (n,) of being heard, mean and deviation (n,) [dB] of levels that are, by name.
 
     What a level must exceed is drawn: in lists of the N strongest, where the method learned from unlisted
@@ -35,15 +51,13 @@ def levels_given_heard(
         learned: rows that it learned from.
         asked: n rows, in its coordinates.
         mean_db, spread_db: (n,) of levels, heard or not; where these are NaN they stay.
+        lists: of the strongest, that the learned rows are; None: they are none.
     """
-    level = 10 * np.log10(learned.target[:, 0].astype(float) * learned.site.target_scale)
+    level = _levels_db(learned, np.arange(len(learned)))
     silent = learned.censored_side(np.arange(len(learned))) > 0
     mine, own = (np.zeros(len(d), int) if d.station is None else d.station for d in (asked, learned))
-    others, told = None, method.uses_censored and (spread_db > 0).any()
-    if told and learned.place is not None and learned.site.stations is not None:
-        heard = learned.place[~silent], own[~silent], level[~silent], learned.moving[~silent]
-        lists = StrongestLists.from_rows(*heard, len(learned.site.stations))
-        others = _draw_others(method, lists, asked, mine) if lists.are_strongest() else None
+    told = method.uses_censored and (spread_db > 0).any()
+    others = _draw_others(method, lists, asked, mine) if told and lists is not None else None
     chance, mean, spread = np.full(len(asked), np.nan), mean_db.copy(), spread_db.copy()
     for station in np.intersect1d(mine, own[silent]):
         at = np.flatnonzero((mine == station) & (spread_db > 0))
@@ -75,16 +89,8 @@ def _draw_others(method: Method, lists: StrongestLists, asked: Measurements, min
         asked, mine: n rows, and their stations (n,).
     """
     places, which = np.unique(asked.moving, axis=0, return_inverse=True)
-    known = {number for number, _ in method} if isinstance(method, PerStation) else {UNHEARD}
-    count = lists.level.shape[1]
-    answered = np.array([t in known or UNHEARD in known for t in range(count)])
-    station, at = np.nonzero((lists.listed_near(places) & answered).T)
-    query = Query.from_places(asked.site, torch.from_numpy(places[at]).float(), torch.from_numpy(station))
-    said, unit = method.predict(query), asked.site.target_scale
-    assert said.variance is not None
-    power, variance = said.mean[:, 0].double().numpy() * unit, said.variance.double().numpy() * unit**2
-    level = np.full((2, len(places), count), -np.inf)  # and deviation
-    level[:, at, station] = power_in_decibels(power, variance)
+    level = _levels_near(method, lists, asked.site, places)
+    count = level.shape[2]
     rng, result, kept = np.random.default_rng(0), np.empty((len(asked), DRAWS)), -lists.length
     for place in range(len(places)):
         rows = which.reshape(-1) == place
@@ -94,6 +100,47 @@ def _draw_others(method: Method, lists: StrongestLists, asked: Measurements, min
         # One that has a place itself leaves the others one less.
         result[rows] = np.where(drawn[mine[rows]] >= last, beyond, last)
     return result
+
+
+def _levels_near(method: Method, lists: StrongestLists, site: Site, places: np.ndarray) -> np.ndarray:
+    """Levels and deviations (2, M, T) [dB] of stations listed near places (M, 3); -inf of others."""
+    known = {number for number, _ in method} if isinstance(method, PerStation) else {UNHEARD}
+    answered = np.array([t in known or UNHEARD in known for t in range(lists.level.shape[1])])
+    station, at = np.nonzero((lists.listed_near(places) & answered).T)
+    level = np.full((2, len(places), len(answered)), -np.inf)
+    if not len(at):
+        return level
+    query = Query.from_places(site, torch.from_numpy(places[at]).float(), torch.from_numpy(station))
+    said = method.predict(query)
+    variance = torch.zeros(len(at)) if said.variance is None else said.variance
+    power = said.mean[:, 0].double().numpy() * site.target_scale
+    with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
+        level[:, at, station] = power_in_decibels(power, variance.double().numpy() * site.target_scale**2)
+    return level
+
+
+def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -> np.ndarray:
+    """Return at rows (n,) of moments whether the measured strongest station is the predicted one of all.
+
+    Every station that was listed nearby is asked about, listed here or not: what a list of the strongest
+    leaves out is weaker. Of k stations tied as predicted strongest a right one counts 1 / k.
+    """
+    assert asked.station is not None and asked.place is not None
+    _, first, which = np.unique(asked.place, return_index=True, return_inverse=True)
+    which = which.reshape(-1)
+    if method.name == "nearest":  # the nearest moment as it was, not each station's own
+        known = np.isfinite(lists.place).all(1)
+        level = lists.level[known][cKDTree(lists.place[known]).query(asked.moving[first])[1]]
+        level = np.nan_to_num(level, nan=-np.inf)
+    else:
+        level = _levels_near(method, lists, asked.site, asked.moving[first])[0]
+    measured = np.full(level.shape, -np.inf)
+    heard = np.flatnonzero(asked.censored_side(np.arange(len(asked))) <= 0)
+    np.maximum.at(measured, (which[heard], asked.station[heard]), _levels_db(asked, heard))
+    best, told = (one == one.max(1, keepdims=True) for one in (measured, level))
+    told &= np.isfinite(level)
+    share = (best & told).sum(1) / np.maximum(told.sum(1), 1)
+    return np.where(np.isfinite(measured.max(1)), share, np.nan)[which]
 
 
 def levels_of_nearest_moment(learned: Measurements, asked: Measurements) -> np.ndarray:

@@ -13,7 +13,12 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.data.units import power_in_decibels
-from gsparc.evaluation.given_heard import levels_given_heard, levels_of_nearest_moment
+from gsparc.evaluation.given_heard import (
+    levels_given_heard,
+    levels_of_nearest_moment,
+    strongest_lists,
+    strongest_told,
+)
 from gsparc.evaluation.metrics import METRICS, power_errors
 from gsparc.models.method import Method, predict_in_batches
 
@@ -177,7 +182,11 @@ def score_methods(
             variance = scored["variance"] * data.site.target_scale**2
             with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
                 level = power_in_decibels(scored["prediction"], variance)
-            given = levels_given_heard(method, own.subset(known), data.subset(rows), *level)
+            there, asked = own.subset(known), data.subset(rows)
+            lists = strongest_lists(there)
+            if lists is not None and strongest_lists(data) is not None:
+                scored["strongest_told"] = strongest_told(method, lists, asked)
+            given = levels_given_heard(method, there, asked, *level, lists)
             # Who learned from heard rows alone predicts such levels.
             scored |= given if method.uses_censored else {"heard_share": given["heard_share"]}
         samples.append(scored)

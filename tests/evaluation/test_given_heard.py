@@ -10,7 +10,7 @@ from networks import network
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.given_heard import levels_given_heard
+from gsparc.evaluation.given_heard import levels_given_heard, strongest_lists
 from gsparc.evaluation.summary import remarks
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, Prediction
@@ -98,7 +98,8 @@ def test_listed_levels_had_to_exceed_those_of_lists_that_lack_their_station():
     data = from_arrays(arrays)
     heard = data.subset(np.flatnonzero(data.censored == 0))
     own = np.full(len(heard), SPREAD_DB)
-    found = levels_given_heard(Told(data.site.target_scale), data, heard, MEANS_DB[heard.station], own)
+    told, lists = Told(data.site.target_scale), strongest_lists(data)
+    found = levels_given_heard(told, data, heard, MEANS_DB[heard.station], own, lists)
     error = found["heard_db"] - every[moment, station]
     for one in range(6):
         assert abs(error[station == one].mean()) < 0.3
