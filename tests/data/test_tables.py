@@ -176,6 +176,14 @@ def test_long_layout_with_a_second_file(write, caplog):
     assert "listed, but in no row, and kept: 5" in table.notes
 
 
+def test_names_that_a_join_wrote_as_floats_were_other_stations(write):
+    """Drives joined with a list: 379.0 stood beside 379, two stations for one."""
+    stations = write("pci,x,y,z\n379.0,0,0,9\n12.0,9,9,9\n", "stations.csv")
+    drive = write("x,y,rssi,pci\n1,1,-80,379\n1,2,-81,379.0\n2,1,-90,12.0\n")
+    arrays = parse_table(drive, {}, stations).arrays
+    assert arrays["station_name"].tolist() == ["379", "12"] and arrays["station"].tolist() == [0, 0, 1]
+
+
 @pytest.mark.parametrize("heads, columns", [
     ("rssi_b,rssi_a", {}),
     ("b,a", {}),

@@ -79,7 +79,8 @@ class Sheet:
         texts = column.astype(str)
         if not texts[~missing].map(str.isascii).all():  # one name may be written in several ways
             texts = texts.str.normalize("NFC").str.replace(INVISIBLE, "", regex=True)
-        text = texts.str.strip().to_numpy(dtype=object)
+        texts = texts.str.strip().str.replace(r"^(\d+)\.0+$", r"\1", regex=True)  # as joins write them
+        text = texts.to_numpy(dtype=object)
         empty = missing | np.isin(np.char.lower(text.astype(str)), SHEET["missing"])
         return np.where(empty, "", text).astype(str)
 
