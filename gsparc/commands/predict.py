@@ -6,6 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.promise import read_promise
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.answers import predict_file
 from gsparc.prediction.operating_point import load
@@ -18,7 +19,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.frequency_hz is not None:
         predictor = predictor.select_carrier(config.frequency_hz)
     station = None if config.station is None else str(config.station)
+    promise = read_promise(predictor.extra)
     how: dict[str, Any] = {"columns": settings["columns"], "overwrite": bool(config.overwrite)}
+    how["tested"] = None if promise is None else promise.expected_errors
     facts = predict_file(predictor, config.places, config.out, station=station, **how)
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
@@ -28,5 +31,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     if ends:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
     before += f", {empty} predictions empty" if (empty := facts["predict/empty"]) else ""
-    before += f"; predictions in {facts['out']}; summary "
+    before += f"; predictions in {facts['out']}"
+    if promise is None and predictor.site.kind == "rssi":
+        before += "; deviations are the model's own: gsparc map ckpt=FILE tests them, then ask again"
+    before += "; summary "
     return finish_run(run_dir, facts | {"ckpt": str(config.ckpt)}, before=before)

@@ -118,7 +118,7 @@ def _of_sheet(
     station = plain = None
     if "station" in chosen:
         head, station = chosen["station"][0].head or "", sheet.joined(c.head for c in chosen["station"])
-        plain = sheet.words(head)
+        plain = sheet.joined([head])
         sheet.refuse_rows(head, np.flatnonzero(station == ""), "no station; expected its name")
     sheet.problems.raise_if_any()
     device, name = (

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from gsparc.data.files import whole_file
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.data.target import Kind
-from gsparc.data.units import PowerUnit
+from gsparc.data.units import PowerUnit, power_in_decibels
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
 from gsparc.prediction.placing import (
@@ -36,6 +37,8 @@ log = logging.getLogger(__name__)
 CHUNK = 512  # places predicted at a time
 MOST_ENTRIES = 16  # of a channel, as columns of a table
 ENDINGS = (".csv", ".npz")
+# Expected errors (N,) [dB] of local places, numbers of stations and deviations [dB]; NaN where refused.
+Tested = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,17 @@ class Answers:
 
     Attributes:
         place: (N,) int64, row of the places.
+        station: (N,) its number; 0 where there is one.
         names: (N,) of stations by heads of columns, see `Stations.named`; empty where the model has none.
         said: (N, ...) in the predictor's unit.
+        refused: (N,) bool, as maps refuse places; None where no error was tested.
     """
 
     place: np.ndarray
+    station: np.ndarray
     names: dict[str, np.ndarray]
     said: Prediction
+    refused: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.place)
@@ -58,7 +65,7 @@ class Answers:
 
 def predict_file(
     predictor: Predictor, places: str | Path, out: str | Path | None = None, *, station: str | None = None,
-    columns: dict[str, object] | None = None, overwrite: bool = False,
+    columns: dict[str, object] | None = None, overwrite: bool = False, tested: Tested | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Predict at the places of a file and write the answers; what was guessed is logged.
 
@@ -69,6 +76,7 @@ def predict_file(
         station: name or number of the only one to predict.
         columns: of a table of places, by quantity, where a guess will not do.
         overwrite: whether a file that is there may be replaced.
+        tested: expected errors of powers by what was held out, which stand for the model's own deviations.
 
     Returns:
         Facts for `summary.json`.
@@ -96,10 +104,17 @@ def predict_file(
             queries.rows[int(np.argmax(far))],
         )  # fmt: skip
     power = site.power_unit(predictor.unit) if site.kind == "rssi" else None
+    if tested is not None and power is not None and predictions.said.variance is not None:
+        local = np.hstack([world[end] - site.origin for end in ("tx", "rx") if end in world])
+        predictions = _with_tested(predictions, local[predictions.place], power, tested)
+        if refused := int(np.count_nonzero(predictions.refused)):
+            what = f"{refused} of {len(predictions)} predictions are refused (column refused)"
+            log.warning("%s: %s: too far from what was measured", places, what)
     write_answers(path, queries, predictions, site.kind, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
+        "predict/refused": None if predictions.refused is None else int(predictions.refused.sum()),
         "predict/stations": len(np.unique(predictions.names.get("station", ()))),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,
@@ -118,6 +133,20 @@ def predict_file(
         ends = {"lowest": float(known.min()), "highest": float(known.max())}
         facts |= {f"predict/{name}_{unit_suffix(power)}": value for name, value in ends.items()}
     return facts
+
+
+def _with_tested(answers: Answers, local: np.ndarray, power: PowerUnit, tested: Tested) -> Answers:
+    """Answers whose deviations are the tested ones; NaN where they are refused."""
+    assert answers.said.variance is not None
+    mean = answers.said.mean[:, 0].double().numpy()
+    spread = own = answers.said.variance.double().sqrt().numpy()
+    if not power.decibels:
+        with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
+            spread = power_in_decibels(mean, own**2)[1]
+    error = tested(local, answers.station, spread)
+    scaled = torch.from_numpy(own * error / np.where(spread > 0, spread, np.nan))
+    said = replace(answers.said, variance=scaled.square())
+    return replace(answers, said=said, refused=np.isnan(error))
 
 
 def _notes(queries: QueryPlaces, site: Site) -> list[str]:
@@ -184,8 +213,8 @@ def predict_places(
     # Blocks are of stations, answers are wanted in the order of places.
     said = Prediction.joined([*parts.values()], torch.from_numpy(np.argsort(rows, kind="stable")))
     rows.sort()
-    called = {} if stations is None else stations.named
-    return Answers(row[rows], {head: np.array(of)[number[rows]] for head, of in called.items()}, said)
+    of_row, called = number[rows], {} if stations is None else stations.named
+    return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called.items()}, said)
 
 
 def _select_device(predictor: Predictor, device: str, source: str) -> Predictor:
@@ -248,6 +277,7 @@ def write_answers(
     if kind != "rssi":
         columns |= {kind: mean} if archive else _entries(mean)
     columns |= {} if said.confidence is None else {"confidence": said.confidence.numpy()}
+    columns |= {} if predictions.refused is None else {"refused": predictions.refused.astype(np.int8)}
     if not archive:
         columns = _in_order(columns, queries, predictions)
         # A float32 is written with as many digits as tell it from its neighbours, .1 and not .10000000149.

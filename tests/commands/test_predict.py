@@ -13,6 +13,8 @@ from doors import knock
 from drives import city_drive, write_table
 
 import gsparc
+from gsparc.apps.maps.intervals import HeldOutLevels
+from gsparc.apps.maps.promise import Promise
 from gsparc.commands.check import main as check
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import train
@@ -435,3 +437,30 @@ def test_empty_predictions_left_without_a_word(town, tmp_path, caplog, monkeypat
     monkeypatch.setattr(Predictor, "predict", predict)
     assert predict_file(town, places, overwrite=True)["predict/empty"] == 3
     assert "3 of 6 predictions are empty (no number), the first in line 3" in caplog.text
+
+
+def test_predict_answered_where_maps_refuse_and_its_deviations_held_79_of_90(tmp_path):
+    """Errors twice the model's deviations on rows held out up to 5 m from the others."""
+    rng, count = np.random.default_rng(0), 400
+    town = fitted(stations(rssi_db=powers(walk()) + 2 * rng.normal(size=(60, 3))), tmp_path)
+    own = np.full(count, 1.5)
+    level, none, block = 2 * own * rng.normal(size=count), np.zeros(count), np.arange(count) // 4
+    of = rng.integers(0, 3, count)
+    evidence = HeldOutLevels(level, none, own, rng.uniform(0, 5, count), block, of, none.astype(np.int8))
+    known = np.repeat(walk() - town.site.origin, 3, 0)
+    places = np.array([[10.0, 10, 1.5], [5, 15, 1.5], [10, 300, 1.5]])
+    file = write_table(tmp_path / "asked.csv", "xyz", places.tolist())
+    before = read(predict_file(town, file)["out"])
+    assert "refused" not in before[0]
+    Promise(evidence, known, np.tile(np.arange(3), 60), 5.0).store(tmp_path / "model.ckpt")
+    asked = [f"ckpt={tmp_path}/model.ckpt", f"places={file}", "overwrite=true"]
+    done = knock(COMMANDS["predict"].run, "predict", [*asked, f"hydra.run.dir={tmp_path}/run"])
+    after = read(file.with_name("asked.predicted.csv"))
+    far = np.array([float(row["y"]) > 100 for row in after])
+    assert [int(row["refused"]) for row in after] == far.astype(int).tolist()
+    assert column(after, "rssi_db") == pytest.approx(column(before, "rssi_db"))
+    assert all(row["rssi_db_std"] == "" for row, one in zip(after, far, strict=True) if one)
+    near = [row for row, one in zip(after, far, strict=True) if not one]
+    own = [row for row, one in zip(before, far, strict=True) if not one]
+    assert (column(near, "rssi_db_std") / column(own, "rssi_db_std")).mean() == pytest.approx(2, rel=0.2)
+    assert any("3 of 9 predictions are refused" in line for line in (*done.out, *done.err)), done

@@ -78,6 +78,14 @@ class Promise:
         """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
         return intervals.nearest_distances(self.known, self.station, places, np.full(len(places), station))
 
+    def expected_errors(self, places: np.ndarray, station: np.ndarray, spread_db: np.ndarray) -> np.ndarray:
+        """Return root mean square errors (n,) [dB] of levels at local places (n, D) of stations (n,).
+
+        NaN where they are refused: farther from what was learned than any error was tested.
+        """
+        far = intervals.nearest_distances(self.known, self.station, places, station)
+        return self.calibration().half_and_error(spread_db, far, station)[1]
+
     def store(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
         update_extra(path, {KEY: asdict(self)})

@@ -313,7 +313,7 @@ class Builder:
             return None if where is None else self._unnamed(where)
         words, head = self.sheet.joined(c.head for c in columns), columns[0].head or ""
         if self.listed is not None:
-            plain = self.sheet.words(head)
+            plain = self.sheet.joined([head])
             listed, joined = self.listed.use_names_of(plain), self.listed.use_names_of(words)
             exact = columns[0].label == JOINED and bool(columns[0].word)
             # Where the list knows the names without what other columns add to them, these are taken.

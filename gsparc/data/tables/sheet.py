@@ -24,6 +24,7 @@ SEXAGESIMAL = re.compile(
 )
 
 INVISIBLE = "[\u200b-\u200d\u2060\ufeff]"  # spaces of no width, which names are pasted with
+WHOLE = re.compile(r"^(\d+)\.0+$")  # 379.0 is 379: a name that a join of tables turned into a number
 
 
 @dataclass(frozen=True)
@@ -79,14 +80,13 @@ class Sheet:
         texts = column.astype(str)
         if not texts[~missing].map(str.isascii).all():  # one name may be written in several ways
             texts = texts.str.normalize("NFC").str.replace(INVISIBLE, "", regex=True)
-        texts = texts.str.strip().str.replace(r"^(\d+)\.0+$", r"\1", regex=True)  # as joins write them
-        text = texts.to_numpy(dtype=object)
+        text = texts.str.strip().to_numpy(dtype=object)
         empty = missing | np.isin(np.char.lower(text.astype(str)), SHEET["missing"])
         return np.where(empty, "", text).astype(str)
 
     def joined(self, heads: Iterable[str | None]) -> np.ndarray:
         """Return text (S,) of several columns together; empty where the first is."""
-        parts = [self.words(head or "") for head in heads]
+        parts = [[WHOLE.sub(r"\1", word) for word in self.words(head or "")] for head in heads]
         names = [" ".join(filter(None, row)) if row[0] else "" for row in zip(*parts, strict=True)]
         return np.array(names, dtype=str)
 
