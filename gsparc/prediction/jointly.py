@@ -35,7 +35,9 @@ class JointMixin:
         known = self._joint_method()
         return None if known is None else self._predict_levels(known, places, torch.as_tensor(stations))
 
-    def predict_new(self, places: Any, station: Any, sectors: Any) -> tuple[np.ndarray, np.ndarray] | None:
+    def predict_new(
+        self, places: Any, station: Any, sectors: Any, like: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return levels (G, k) and deviations [dB] of k sectors that are not there yet, see `predict_joint`.
 
         Args:
@@ -43,11 +45,12 @@ class JointMixin:
             station: (3,) where they are to stand, world [m].
             sectors: (k, 5) azimuth from north, -1 without a pattern, tilt, widths across and in height
                 [deg], and power over the mean of those that stand [dB].
+            like: number of a station of their band; None: of the first.
         """
         if (known := self._joint_method()) is None:
             return None
         still = np.asarray(station, np.float64) - self.site.origin
-        more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64))
+        more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64), like)
         count = 0 if self.site.stations is None else len(self.site.stations)
         level, covariance, _ = self._predict_levels(more, places, count + torch.arange(len(sectors)))
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

@@ -74,10 +74,14 @@ class Sectors(Trend):
         units = torch.nn.functional.one_hot
         return units(rank).double(), units(self.band, len(self.levels)).double()
 
-    def add_sectors(self, sectors: Tensor) -> Sectors:
-        """Return these and further ones (k, 5), see `table`, of a site of their own and the first band."""
+    def add_sectors(self, sectors: Tensor, like: int | None = None) -> Sectors:
+        """Return these and further ones (k, 5), see `table`, of a site of their own.
+
+        Their band is that of sector `like`; None: the first.
+        """
         site = self.site.new_full((len(sectors),), int(self.site.max()) + 1)
-        band, table = torch.cat([self.band, 0 * site]), torch.cat([self.table, sectors.double()])
+        of_band = torch.full_like(site, 0 if like is None else int(self.band[like]))
+        band, table = torch.cat([self.band, of_band]), torch.cat([self.table, sectors.double()])
         return replace(self, table=table, site=torch.cat([self.site, site]), band=band)
 
     def mean(self, places: Tensor) -> Tensor:

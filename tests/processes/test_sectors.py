@@ -51,6 +51,14 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
         return level({name: float(spread) / 2}) - level({name: -float(spread) / 2})
 
     np.testing.assert_allclose(trend.mean(places), level({}), atol=1e-5)
+    # A sector like the second, on its band and on the first: apart by the bands' levels.
+    further, second = places.clone(), places.clone()
+    further[:, -1], second[:, -1] = 2.0, 1.0
+    new = trend.table[1:]
+    on = [trend.add_sectors(new, like).mean(further) for like in (1, 0, None)]
+    np.testing.assert_allclose(on[0], trend.mean(second))
+    np.testing.assert_allclose(on[0] - on[1], 6.0, atol=1e-9)
+    np.testing.assert_allclose(on[1], on[2])
     columns, terms = trend.shared_columns(places).numpy(), trend.columns(places).numpy()
     np.testing.assert_allclose(columns[:, 0], slope("exponent", SHARED_SPREAD[0]), atol=1e-5)
     np.testing.assert_allclose(columns[:, 5], slope("tilt", SHARED_SPREAD[5]), atol=1e-5)

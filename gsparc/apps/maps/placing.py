@@ -20,11 +20,20 @@ from gsparc.apps.maps.promise import Promise, held_out_evidence
 from gsparc.data.blocks import evenly_spaced
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_all
-from gsparc.data.limits import Checked, check_arguments, finite_array, number, setting, whole
+from gsparc.data.limits import (
+    POSITIVE,
+    Checked,
+    check_arguments,
+    finite_array,
+    number,
+    or_null,
+    setting,
+    whole,
+)
 from gsparc.data.query_places import read_query_places
-from gsparc.data.schema import Site
+from gsparc.data.schema import Site, Stations
 from gsparc.data.splits import Fold
-from gsparc.models.powers.together.network import number_sites
+from gsparc.models.powers.together.network import ONE_BAND, number_sites
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
@@ -44,6 +53,7 @@ class NewAntenna(Checked):
         azimuth: of its sectors from north [deg], one or a list; None: alike in all directions.
         tilt: below the horizon [deg], as widths of beams across and in `height`; of sectors alone.
         power_db: over the mean of the stations that stand [dB].
+        carrier_hz: of one of the bands of stations that stand; None: the lowest.
     """
 
     azimuth: float | Sequence[float] | None = None
@@ -51,6 +61,24 @@ class NewAntenna(Checked):
     width: float = setting(65.0, number(0, 360, open_low=True))
     height: float = setting(10.0, number(0, 180, open_low=True))
     power_db: float = setting(0.0, number(-100, 100))
+    carrier_hz: float | None = setting(None, or_null(POSITIVE))
+
+    def find_alike(self, stations: Stations) -> int | None:
+        """Return a station of its band; None: of the only one, or the lowest.
+
+        Raises:
+            DataError: no station that stands is of its band.
+        """
+        if self.carrier_hz is None:
+            return None
+        known = np.zeros(0) if stations.carrier_hz is None else stations.carrier_hz
+        away = np.abs(np.log(known / self.carrier_hz))
+        if not len(known) or away.min() > np.log(ONE_BAND):
+            bands = ", ".join(f"{one / 1e6:g}" for one in np.unique(known)) or "unknown ones"
+            raise DataError(
+                f"antenna.carrier_hz={self.carrier_hz:g}: no station's band; there are {bands} MHz"
+            )
+        return int(away.argmin()) if np.ptp(known) else None
 
     def sectors(self) -> np.ndarray:
         """Return (k, 5), see `gsparc.prediction.predictor.Predictor.elsewhere`.
@@ -262,9 +290,14 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: NewAntenna) -> Any:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
-    known = predictor.predict_new(cells, place, antenna.sectors())
-    if known is None and antenna.azimuth is not None:
-        raise DataError(f"antenna.azimuth: {predictor.method.name} knows no patterns; model=gsparc does")
+    assert predictor.site.stations is not None
+    like = antenna.find_alike(predictor.site.stations)
+    known = predictor.predict_new(cells, place, antenna.sectors(), like)
+    if known is None and (antenna.azimuth is not None or like is not None):
+        lacks = (
+            "carrier_hz: {} knows no bands" if antenna.azimuth is None else "azimuth: {} knows no patterns"
+        )
+        raise DataError(f"antenna.{lacks.format(predictor.method.name)}; model=gsparc does")
     if known is None:
         level, spread = predict_levels(predictor, cells, station=place)
     else:
@@ -277,7 +310,8 @@ def assumption(site: Site, height: float, antenna: NewAntenna) -> str:
     """Return in words what a new station is taken to be, `height` [m] high."""
     carrier = None if site.stations is None else site.stations.carrier_hz
     # The first band is the lowest: see `gsparc.processes.sectors.Sectors.add_sectors`.
-    band = "" if carrier is None or np.ptp(carrier) == 0 else f" in the band of {carrier.min() / 1e6:g} MHz"
+    several = carrier is not None and np.ptp(carrier) > 0
+    band = f" in the band of {(antenna.carrier_hz or carrier.min()) / 1e6:g} MHz" if several else ""
     return f"assumed: {height:.4g} m high{band}, {antenna} (see station_height_m, antenna)"
 
 

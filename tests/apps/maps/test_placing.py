@@ -204,6 +204,14 @@ def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
     assert assumption(two, 8.0, NewAntenna([0, 120])).startswith(
         "assumed: 8 m high in the band of 1800 MHz, sect"
     )
+    named = NewAntenna(carrier_hz=2.65e9)  # within a tenth of 2.6 GHz
+    assert named.find_alike(two.stations) == 0 and NewAntenna().find_alike(two.stations) is None
+    assert "in the band of 2650 MHz" in assumption(two, 8.0, named)
+    refused(
+        "no station's band; there are 1800, 2600 MHz", NewAntenna(carrier_hz=8e8).find_alike, two.stations
+    )
+    known = replace(site, stations=replace(site.stations, carrier_hz=np.array([2.6e9, 2.6e9])))
+    assert NewAntenna(carrier_hz=2.6e9).find_alike(known.stations) is None
 
 
 def test_a_station_of_no_known_height_was_nan():

@@ -238,15 +238,16 @@ class JointPowerField(ClosedForm):
         never = never if network is None else replace(never, trend=network.add_sectors(ROUND))
         return SharedTermsPosterior({}, never, self.unheard.columns, weights)
 
-    def add_station(self, place: np.ndarray, sectors: Tensor) -> JointPowerField:
+    def add_station(self, place: np.ndarray, sectors: Tensor, like: int | None = None) -> JointPowerField:
         """Return one that knows k further stations, of no rows, as its last.
 
         Args:
             place: (3,) local [m].
             sectors: (k, 5) of a network, see `Sectors.table`; of others azimuths are -1.
+            like: station of their band, in a network; None: of the first.
 
         Raises:
-            DataError: azimuths, and this is no network.
+            DataError: azimuths or another's band, and this is no network.
             ValueError: before `condition`.
         """
         _, elsewhere = self._require_posteriors()
@@ -254,8 +255,12 @@ class JointPowerField(ClosedForm):
         result.places = np.concatenate([self.places, np.tile(place, (len(sectors), 1))])
         if network is None and (sectors[:, 0] != NO_AZIMUTH).any():
             raise DataError("azimuths of a new station: this model was learned without azimuths")
+        if network is None and like is not None:
+            raise DataError(
+                "antenna.carrier_hz: this model was learned without azimuths, and tells no bands apart"
+            )
         if network is not None:
-            never = replace(self.own.never, trend=network.add_sectors(sectors))
+            never = replace(self.own.never, trend=network.add_sectors(sectors, like))
             result.own = replace(self.own, never=never)
         result.elsewhere = result._unheard_posterior((elsewhere.factor, elsewhere.mean))
         return result
