@@ -62,6 +62,10 @@ class Answers:
     def __len__(self) -> int:
         return len(self.place)
 
+    def count_refused(self) -> int | None:
+        """Return how many are refused; None where no error was tested."""
+        return None if self.refused is None else int(self.refused.sum())
+
 
 def predict_file(
     predictor: Predictor, places: str | Path, out: str | Path | None = None, *, station: str | None = None,
@@ -107,14 +111,14 @@ def predict_file(
     if tested is not None and power is not None and predictions.said.variance is not None:
         local = np.hstack([world[end] - site.origin for end in ("tx", "rx") if end in world])
         predictions = _with_tested(predictions, local[predictions.place], power, tested)
-        if refused := int(np.count_nonzero(predictions.refused)):
+        if refused := predictions.count_refused():
             what = f"{refused} of {len(predictions)} predictions are refused (column refused)"
             log.warning("%s: %s: too far from what was measured", places, what)
     write_answers(path, queries, predictions, site.kind, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
-        "predict/refused": None if predictions.refused is None else int(predictions.refused.sum()),
+        "predict/refused": predictions.count_refused(),
         "predict/stations": len(np.unique(predictions.names.get("station", ()))),
         "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
         "places": str(places), "out": str(path), "predict/unit": predictor.unit,

@@ -393,7 +393,7 @@ class HasJoint(Protocol):
         """See `gsparc.models.powers.together.field.JointPowerField.predict_joint`."""
         ...
 
-    def add_station(self, place: np.ndarray, sectors: Tensor) -> HasJoint:
+    def add_station(self, place: np.ndarray, sectors: Tensor, like: int | None = None) -> HasJoint:
         """See `gsparc.models.powers.together.field.JointPowerField.add_station`."""
         ...
 

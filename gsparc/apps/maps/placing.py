@@ -310,8 +310,9 @@ def assumption(site: Site, height: float, antenna: NewAntenna) -> str:
     """Return in words what a new station is taken to be, `height` [m] high."""
     carrier = None if site.stations is None else site.stations.carrier_hz
     # The first band is the lowest: see `gsparc.processes.sectors.Sectors.add_sectors`.
-    several = carrier is not None and np.ptp(carrier) > 0
-    band = f" in the band of {(antenna.carrier_hz or carrier.min()) / 1e6:g} MHz" if several else ""
+    band = ""
+    if carrier is not None and np.ptp(carrier) > 0:
+        band = f" in the band of {(antenna.carrier_hz or carrier.min()) / 1e6:g} MHz"
     return f"assumed: {height:.4g} m high{band}, {antenna} (see station_height_m, antenna)"
 
 
