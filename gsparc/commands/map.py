@@ -11,6 +11,7 @@ from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.intervals import cross_validate
+from gsparc.apps.maps.kmz import write_kmz
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings
@@ -76,14 +77,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     ends = None if promise is None else covered_between(field, predictor, promise)
     lines = map_notes(field, coverage, ends)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
+    every = list(list_layers(field))
+    of_one = {f"power {station}" for station in field.stations}
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in list_layers(field):
+    for layer in every:
         for suffix in SUFFIXES:
             name = file_name(layer, suffix)
             if any(fnmatch(name, one) for one in wanted):
-                of_one = layer.name in {f"power {station}" for station in field.stations}
-                folder = run_dir / "stations" if of_one else run_dir
+                folder = run_dir / "stations" if layer.name in of_one else run_dir
                 folder.mkdir(exist_ok=True)
                 draw_layer(field, layer, folder / name, title, floor)
         if layer.words:
@@ -92,6 +94,8 @@ def task(config: DictConfig) -> dict[str, Any]:
             write_classes(run_dir / file_name(layer, ".tif"), field, layer.values, layer.words, layer.table())
     if tiff:
         write_geotiff(run_dir / "map.tif", field)
+    if tiff and field.grid.origin is not None:
+        write_kmz(run_dir / "map.kmz", field, [layer for layer in every if layer.name not in of_one])
     facts = {
         **field.summarise(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,

@@ -1,5 +1,6 @@
 """A town with two stations whose powers are a distance law and shadowing, and a model of it."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -9,10 +10,14 @@ from campaigns import compose
 from scipy.linalg import cholesky
 from scipy.spatial.distance import cdist
 
+import gsparc
 from gsparc.commands.train import train
+from gsparc.data.links.georeference import Georeference
+from gsparc.prediction.predictor import Predictor
 
 MASTS = np.array([[10.0, 20, 8], [70, 45, 8]])
 SIDE = (80.0, 60.0)
+ORIGIN = Georeference(47.2, 11.3)
 
 
 def town_file(path: Path, rows: int = 300, seed: int = 0) -> Path:
@@ -40,3 +45,10 @@ def trained(file: Path, model: str, *more: str) -> Path:
     own = ("dataset=own", f"dataset.file='{file}'", f"model={model}", "baselines=[]", "logger=none")
     train(compose(*own, *more), file.parent)
     return file.parent / "model.ckpt"
+
+
+def town_on_earth() -> Predictor:
+    """The town's model, which knows its place on Earth."""
+    predictor = gsparc.load(town_model())
+    predictor.site = replace(predictor.site, georeference=ORIGIN)
+    return predictor

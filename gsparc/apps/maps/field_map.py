@@ -300,7 +300,7 @@ def write_geotiff(path: str | Path, raster: FieldMap) -> None:
     bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
     if len(raster.stations) > 1:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
-    profile = _profile(raster, count=len(bands), dtype="float32", nodata=float("nan"))
+    profile = raster_profile(raster, count=len(bands), dtype="float32", nodata=float("nan"))
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         file.update_tags(unit=raster.unit, threshold_db=raster.threshold_db, height_m=raster.grid.height)
         for number, (name, values) in enumerate(bands.items(), 1):
@@ -320,7 +320,7 @@ def write_classes(
     from rasterio.warp import transform_geom
 
     values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
-    profile = _profile(raster, count=1, dtype="uint16", nodata=NO_CLASS)
+    profile = raster_profile(raster, count=1, dtype="uint16", nodata=NO_CLASS)
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         # Before the values, which fix what colours mean.
         file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
@@ -332,7 +332,7 @@ def write_classes(
     write_shapes(Path(path).with_suffix(".geojson"), named)
 
 
-def _profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
+def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
     """What rasterio is told of a file and its `bands`, in the projection of `Georeference`.
 
     Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample them. Without

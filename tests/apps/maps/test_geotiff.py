@@ -1,26 +1,16 @@
 """A GeoTIFF lies at the right place on Earth."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from towns import town_model
+from towns import ORIGIN, town_model, town_on_earth
 
 import gsparc
 from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.field_map import NO_CLASS, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.data.errors import DataError
-from gsparc.data.links.georeference import Georeference
-
-ORIGIN = Georeference(47.2, 11.3)
-
-
-def town_on_earth():
-    predictor = gsparc.load(town_model())
-    predictor.site = replace(predictor.site, georeference=ORIGIN)
-    return predictor
 
 
 def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):

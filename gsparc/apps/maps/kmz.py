@@ -1,0 +1,77 @@
+"""Layers of a map as images for Google Earth: a KMZ of the OGC's KML 2.2."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, tostring
+from zipfile import ZipFile
+
+import numpy as np
+from matplotlib.image import imsave
+
+from gsparc.apps.maps.field_map import FieldMap, raster_profile
+from gsparc.apps.maps.pictures import Layer
+from gsparc.data.files import whole_file
+
+NAMESPACE = "http://www.opengis.net/kml/2.2"
+DEGREES = "EPSG:4326"
+OPACITY = 0.75  # of images, through which the ground is seen
+
+
+def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> None:
+    """Write layers, the first shown and the others to be switched on; the map must know its place on Earth.
+
+    Cells of a grid of metres become those of one of degrees, each with the nearest's colour.
+    """
+    from rasterio.enums import Resampling
+    from rasterio.transform import array_bounds
+    from rasterio.warp import calculate_default_transform, reproject
+
+    profile = raster_profile(field)
+    size = profile["width"], profile["height"]
+    left, right, low, high = field.grid.extent
+    to, width, height = calculate_default_transform(profile["crs"], DEGREES, *size, left, low, right, high)
+    west, south, east, north = array_bounds(height, width, to)
+    box = {"north": north, "south": south, "east": east, "west": west}
+    kml = Element("kml", xmlns=NAMESPACE)
+    folder = SubElement(kml, "Folder")
+    with whole_file(path) as partial, ZipFile(partial, "w") as archive:
+        for number, layer in enumerate(layers):
+            image = np.zeros((4, height, width), np.uint8)
+            cells = np.moveaxis(np.flipud(_colours(layer)), 2, 0)  # images go from north to south
+            how = {"src_crs": profile["crs"], "dst_crs": DEGREES, "resampling": Resampling.nearest}
+            reproject(cells, image, src_transform=profile["transform"], dst_transform=to, **how)
+            picture, file = BytesIO(), f"{number}.png"
+            imsave(picture, np.ascontiguousarray(np.moveaxis(image, 0, 2)))
+            archive.writestr(file, picture.getvalue())
+            overlay = SubElement(folder, "GroundOverlay")
+            for name, text in {"name": layer.name, "visibility": str(int(number == 0)),
+                               "description": _explain(layer)}.items():  # fmt: skip
+                SubElement(overlay, name).text = text
+            SubElement(SubElement(overlay, "Icon"), "href").text = file
+            edges = SubElement(overlay, "LatLonBox")
+            for name, degrees in box.items():
+                SubElement(edges, name).text = f"{degrees:.9f}"
+        archive.writestr("doc.kml", tostring(kml, encoding="utf-8", xml_declaration=True))
+
+
+def _colours(layer: Layer) -> np.ndarray:
+    """Colours and opacity (ny, nx, 4) uint8; nothing where nothing is said."""
+    known = np.isfinite(layer.values)
+    shown = layer.legend.to_colours(layer.values)
+    if layer.words:
+        table = (255 * layer.table()[:, :3]).astype(np.uint8)
+        shown = table[np.where(known, layer.values, 0).astype(int)]
+    return np.dstack([shown, np.where(known, round(255 * OPACITY), 0)]).astype(np.uint8)
+
+
+def _explain(layer: Layer) -> str:
+    """What its colours mean, as HTML."""
+    if not layer.words:
+        ends = f"{layer.legend.low:.4g} to {layer.legend.high:.4g}"
+        return f"{layer.legend.label}: {ends}, colours of {layer.legend.colours}"
+    rows = layer.class_table()
+    lines = zip(rows["colour"], rows["station"], rows["share"], strict=True)
+    return "<br>".join(f'<font color="{c}">&#9632;</font> {name} ({share:.1%})' for c, name, share in lines)
