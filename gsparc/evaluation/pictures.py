@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import SceneWalls
@@ -214,7 +215,9 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
         title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {given[t]:.0f})" * int(turned[t])
         axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
-    figure.suptitle(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first")
+    few = [stations.shown[t] for t in np.flatnonzero((azimuth != NO_AZIMUTH) & ~enough)]
+    left = f"; too few rows to draw: {list_first(few, 6)}" if few else ""
+    figure.suptitle(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{left}")
     for axis in axes.flat[len(chosen) :]:
         axis.set_visible(False)
     figure.supxlabel("angle from the azimuth that is used [deg]")

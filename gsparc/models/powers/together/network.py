@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.data.checks.plausibility import find_noise
-from gsparc.data.errors import Caution
+from gsparc.data.errors import Caution, list_first
 from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows
@@ -50,6 +50,7 @@ LOOSE = 1.5  # deviation of logarithms of kernels' numbers from usual
 LITTLE = 0.1  # usual noise and deviations by bearing, of the variance; usual lengths, of that between places
 BOUND = 5.0  # deviations of what sectors share, beyond which it is not looked for
 CONTRADICTED_DEG, ROUND_DEG = 30.0, 360.0
+UNSEEN_DEG = 60.0  # errors of an azimuth, and larger ones, that rows must tell or it counts as not tested
 SURE = 10.0, 0.1  # nats, and nats a row, by which another azimuth must be likelier
 SUREST, TURNED = 0.75, 8  # of the largest gain, that are turned at a time; times
 TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
@@ -142,6 +143,7 @@ def learn_network(
             break
         rough, gains, scale = _fit_rough(quiet, turned)
     notes = _note_turned(network.table[:, 0], rough.table[:, 0], names)
+    notes += _note_untested(quiet, rough, gains, scale, names)
     if piles:
         rough, gains, scale = _fit_rough(few, rough)
     trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
@@ -202,25 +204,52 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
 
 
 @torch.no_grad()
-def _correct_azimuths(rows: StationRows, trend: Sectors, gains: Tensor, scale: float) -> Sectors:
-    """Those azimuths that rows contradict most turned to where they fit."""
-    table, gained = trend.table.clone(), torch.zeros(len(trend.table))
-    for t in range(len(table)):
+def _misfits_of_turns(
+    rows: StationRows, trend: Sectors, gains: Tensor, scale: float
+) -> tuple[Tensor, Tensor]:
+    """How badly rows fit each azimuth turned by `TURNS` (T, K) [nats], and what tells two turns apart (T,).
+
+    Zero of all turns where a sector has no azimuth, or nothing was heard of it.
+    """
+    result = torch.zeros(len(trend.table), len(TURNS), dtype=torch.float64)
+    sure = torch.full_like(result[:, 0], SURE[0])
+    rest = torch.zeros(len(TURNS), len(OWN_SPREAD) - 2, dtype=torch.float64)  # as it is
+    own = torch.cat([TURNS.double()[:, None], rest], 1)
+    for t in range(len(trend.table)):
         part = rows.subset(np.flatnonzero(sector_of(rows.places) == t))
-        if not len(part.index) or part.silent.all() or table[t, 0] == NO_AZIMUTH:
+        if not len(part.index) or part.silent.all() or trend.table[t, 0] == NO_AZIMUTH:
             continue
-        rest = torch.zeros(len(TURNS), len(OWN_SPREAD) - 2, dtype=torch.float64)  # as it is
-        own = torch.cat([TURNS.double()[:, None], rest], 1)
         mean = trend.powers_at(torch.from_numpy(part.places), trend.shared, trend.levels, own)
         levels = (gains[t] + GAINS)[:, None]
         likely = _misfits(mean[:, None] + levels, part, torch.tensor(scale)).sum(2)
-        likely = (likely + 0.5 * (levels[:, 0] / GAIN_DB).square()).amin(1)
-        best = int(likely.argmin())
-        nats, said = float(likely[len(TURNS) // 2] - likely[best]), float(TURNS[best])
-        if abs(said) >= CONTRADICTED_DEG and nats > SURE[0] + SURE[1] * len(part.index):
-            gained[t], table[t, 0] = nats, (table[t, 0] + said) % ROUND_DEG
-    surest = gained >= SUREST * gained.max()
-    return replace(trend, table=torch.where(surest[:, None], table, trend.table))
+        result[t] = (likely + 0.5 * (levels[:, 0] / GAIN_DB).square()).amin(1)
+        sure[t] += SURE[1] * len(part.index)
+    return result, sure
+
+
+def _correct_azimuths(rows: StationRows, trend: Sectors, gains: Tensor, scale: float) -> Sectors:
+    """Those azimuths that rows contradict most turned to where they fit."""
+    misfit, sure = _misfits_of_turns(rows, trend, gains, scale)
+    least, best = misfit.min(1)
+    nats, turn = misfit[:, len(TURNS) // 2] - least, TURNS[best]
+    gained = torch.where((turn.abs() >= CONTRADICTED_DEG) & (nats > sure), nats, 0 * nats)
+    surest = (gained > 0) & (gained >= SUREST * gained.max())
+    table = trend.table.clone()
+    table[surest, 0] = (table[surest, 0] + turn[surest].double()) % ROUND_DEG
+    return replace(trend, table=table)
+
+
+def _note_untested(
+    rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
+) -> list[str]:
+    """A note on azimuths that may be wrong by `UNSEEN_DEG` without any row that tells."""
+    misfit, sure = _misfits_of_turns(rows, trend, gains, scale)
+    far = (TURNS.abs() >= UNSEEN_DEG).nonzero()[:, 0]
+    told = misfit[:, far].amin(1) - misfit[:, len(TURNS) // 2] > sure
+    blind = ((trend.table[:, 0] != NO_AZIMUTH) & ~told).nonzero()[:, 0].tolist()
+    said = f"{list_first([names[t] for t in blind], 12)} of {len(names)} sectors"
+    every = f"azimuths taken as listed, as no rows tell them from {UNSEEN_DEG:g} degrees more: {said}"
+    return [every] if blind else []
 
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
