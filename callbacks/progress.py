@@ -18,17 +18,20 @@ SHOWN = {  # all of it fits a terminal of 80 columns
 
 TIMED = 50  # steps, after the first, from which the minutes of the training are estimated
 LONG_S = 60.0  # trainings beyond are worth a line
+CHANGED = 1.3  # ratio of two estimates that is worth another line
 
 
 class StepProgress(L.Callback):
     """A rich progress bar over optimiser steps (epochs mean little when data are few).
 
-    A line says after some steps how long all take here, where that is over a minute.
+    A line says after some steps how long all take here, where that is over a minute, and again at quarters
+    of the way where they have become slower or faster.
     """
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
         self._began: tuple[int, float] | None = None  # a step, and when it was done [s]
+        self._told_s: float | None = None  # what a step takes, as the last line said
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Draw the bar, once for all devices."""
@@ -41,7 +44,7 @@ class StepProgress(L.Callback):
             TextColumn("{task.fields[figures]}"),
         )
         self._bar.start()
-        self._began = None
+        self._began = self._told_s = None
         stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
         self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
 
@@ -53,9 +56,13 @@ class StepProgress(L.Callback):
         step = trainer.global_step
         self._bar.update(task, completed=step)
         self._began = self._began or (step, time.perf_counter())
-        if step - self._began[0] == TIMED:
-            each = (time.perf_counter() - self._began[1]) / TIMED
-            if (left := each * (trainer.max_steps - step)) > LONG_S:
+        since, quarter = step - self._began[0], max(trainer.max_steps // 4, 1)
+        if since == TIMED or (since > TIMED and step % quarter == 0):
+            now = time.perf_counter()
+            each, self._began = (now - self._began[1]) / since, (step, now)
+            other = self._told_s is None or not 1 / CHANGED < each / self._told_s < CHANGED
+            if other and (left := each * (trainer.max_steps - step)) > LONG_S:
+                self._told_s = each
                 pace = f"{trainer.max_steps:,} steps, {1000 * each:.0f} ms each here"
                 self._bar.console.print(f"{pace}: about {left / 60:.0f} min to go", highlight=False)
         if step % 20 == 0 or step == trainer.max_steps:

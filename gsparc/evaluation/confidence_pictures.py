@@ -64,11 +64,13 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         bins = np.linspace(sure.min(), sure.max(), 25)
         for name, part, colour in (("low", ~high, PALETTE[2]), ("high", high, PALETTE[1])):
             both.hist(sure[part], bins, density=True, alpha=0.6, color=colour, label=f"{name} loss")
-        both.set(xlabel="confidence C", ylabel="density of test rows", title=_label(row))
+        both.set(
+            xlabel="confidence C", ylabel="density of test rows", title=f"{_label(row)}, {len(loss)} rows"
+        )
         both.legend()
         part = np.searchsorted(np.quantile(loss, (0.2, 0.4, 0.6, 0.8)), loss)
         names = ["lowest", "2", "3", "4", "highest"]
-        fifths.boxplot([sure[part == number] for number in range(5)], tick_labels=names, showfliers=False)
+        fifths.boxplot([sure[part == number] for number in range(5)], tick_labels=names)
         fifths.set(xlabel="fifth of the loss", ylabel="confidence C")
         spectra = row["kind"] == "spectrum"
         error = row["run"].samples["mae"] if spectra else loss
@@ -95,7 +97,9 @@ def _draw_coverage(runs: list[Row]) -> Figure:
             for part, colour, what in ((above, PALETTE[2], "above"), (~above, GREY, "below")):
                 label = f"{what} {PAPER_TAU} (paper), {part.mean():.0%}"
                 places.plot(own["x_m"][part], own["y_m"][part], ".", color=colour, markersize=4, label=label)
-    places.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="test rows")
+    places.set(
+        xlabel="x [m]", ylabel="y [m]", aspect="equal", title="test rows, confidence by min-max over them"
+    )
     places.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18))
     curve.axvline(PAPER_TAU, color=GREY, linestyle=":", label=f"threshold {PAPER_TAU}")
     curve.set(xlabel="threshold τ", ylabel="share of test rows with C ≥ τ", xlim=(0, 1), ylim=(0, 1.02))
@@ -122,7 +126,9 @@ def _draw_brackets(runs: list[Row]) -> Figure:
         begin = BRACKET_DB * np.floor(np.clip(own[name][known], low, high) / BRACKET_DB)  # outermost are open
         starts, counts = np.unique(begin, return_counts=True)
         sure = [own["confidence"][known][begin == start].mean() for start in starts]
-        names = [f"{a:.0f}–{a + BRACKET_DB:.0f}\n{n}" for a, n in zip(starts, counts, strict=True)]
+        names = [f"{a:.0f}–{a + BRACKET_DB:.0f}" for a in starts]
+        names[0], names[-1] = f"< {starts[0] + BRACKET_DB:.0f}", f"≥ {starts[-1]:.0f}"
+        names = [f"{name}\n{count}" for name, count in zip(names, counts, strict=True)]
         right.tick_params(axis="x", labelsize=7)
         right.bar(names, sure, color=PALETTE[0], alpha=0.7)
         right.axhline(PAPER_TAU, color=GREY, linestyle="--", label=f"threshold {PAPER_TAU}")

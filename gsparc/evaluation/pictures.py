@@ -130,7 +130,7 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
         axis.tick_params(labelsize=7)
     figure.supylabel("elevation [°]", fontsize=9)
     below: dict[str, Any] = {"location": "bottom", "shrink": 0.8, "aspect": 40}
-    figure.colorbar(power, ax=axes[:, :-1], label="relative strength over azimuth [°]", **below)
+    figure.colorbar(power, ax=axes[:, :-1], label="relative strength; azimuth [°] runs across", **below)
     figure.colorbar(error, ax=axes[:, -1], label="difference", **{**below, "aspect": 10})
     figure.suptitle(title)
     figure.set_label("The same test rows, measured and predicted")

@@ -1,3 +1,4 @@
+import re
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -42,3 +43,17 @@ def test_an_exception_gives_the_terminal_back(screen):
     bar.on_exception(trainer, module, RuntimeError())
     bar.on_train_batch_end(trainer, module)  # nothing left to draw on
     assert bar._bar is None
+
+
+def test_minutes_were_promised_before_a_field_grew(screen, monkeypatch):
+    """5 minutes were said after 50 steps of 1,000 Gaussians, 15 it took with the 4,000 they grew to."""
+    clock = iter([0.0, 50 * 0.1, 50 * 0.1 + 950 * 0.5, 1e4, 2e4])
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
+    bar, (trainer, module) = StepProgress(), run()
+    trainer.max_steps = 4004
+    bar.on_train_start(trainer, module)
+    for trainer.global_step in (1, 51, 1001):
+        bar.on_train_batch_end(trainer, module)
+    bar.on_train_end(trainer, module)
+    said = re.findall(r"4,004 steps, (\d+) ms each here: about (\d+) min to go", screen.export_text())
+    assert said == [("100", "7"), ("500", "25")]

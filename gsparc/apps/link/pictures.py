@@ -29,32 +29,37 @@ RATES = {
     "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
     "chosen_bps": ("b--o", "from the predicted one"),
 }  # fmt: skip
-# Below one error in the 1440 blocks of a point: where 0 errors are drawn.
-LEAST_RATE = 3e-4
 
 
 def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
-    """Draw BLER above, BER below, a column a modulation; bars are 95 % intervals."""
+    """Draw BLER above, BER below, a column a modulation, with 95 % intervals.
+
+    Triangles are their ends where no block failed.
+    """
     figure, axes = panels(5.6 * len(rates), 8, 2, len(rates), grid=False)
     for column, (modulation, curves) in enumerate(rates.items()):
         for name, (label, colour, line) in STYLES.items():
             if name not in curves:
                 continue
             curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
-            bler = curve.bler.clip(LEAST_RATE).to_numpy()
+            bler = curve.bler.where(curve.errors > 0).to_numpy()
             counts = zip(curve.errors, curve.blocks, strict=True)
             # Of counts, hence the binomial's own interval: no normal one holds at 0 errors.
-            ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts]).clip(LEAST_RATE)
+            ends = np.array([binomial_interval(int(e), int(n)) for e, n in counts])
             reach = np.maximum([[-1], [1]] * (ends.T - bler), 0)
+            # None failed: the limit alone is known, and a curve through it would show a floor.
+            limit = ends[:, 1][curve.errors == 0]
+            axes[0, column].plot(curve.index[curve.errors == 0], limit, "v", color=colour, fillstyle="none")
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
             axes[0, column].errorbar(curve.index, bler, reach, **style_above)
-            axes[1, column].plot(curve.index, curve.ber.clip(1e-6), **style)
+            axes[1, column].plot(curve.index, curve.ber.where(curve.ber > 0), **style)
         axes[0, column].set_title(f"{modulation.upper()}, one layer, {title}", fontsize=10)
         # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
         for row, what in enumerate(("block error rate", "bit error rate")):
             axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=what)
             axes[row, column].grid(alpha=0.3, which="both")
+    axes[0, 0].plot([], [], "v", color="grey", fillstyle="none", label="none failed: 95 % limit")
     axes[0, 0].legend(fontsize=7)
     save(figure, path)
 
@@ -81,7 +86,8 @@ def draw_rates(
         right.axhline(least, color="grey", linestyle="--", label=f"accepted from {least:.2g} on")
         right.legend()
     share = middle.chosen_bps.mean(), middle.oracle_bps.mean()
-    right.set_title("{:.1f} of {:.1f} Mbit/s".format(*(value / 1e6 for value in share)))
+    of = "{:.1f} of {:.1f} Mbit/s".format(*(value / 1e6 for value in share))
+    right.set_title(f"at {middle.snr_db:.0f} dB: {of}")
     save(figure, path)
 
 

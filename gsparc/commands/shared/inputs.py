@@ -107,8 +107,11 @@ def describe_inputs(config: DictConfig, inputs: RunInputs) -> None:
         log.info("%-10s%s", topic, sentence)
     for guess in method.guesses:
         log_of_models.info("guess: %s", guess)
-    guessed = f", {len(method.guesses)} settings of it guessed" if method.guesses else ""
+    name, guessed = method.name, ""
+    if method.guesses:
+        name += f" ({type(method).__name__})"
+        guessed = f", {len(method.guesses)} settings of it guessed, see train.log"
     steps = config.trainer.max_steps
     effort = Effort().scale_by(config.effort)
     how = method.describe_fit(inputs.data, effort, None if steps == -1 else steps)
-    log.info("%-10s%s", "fitting", f"{method.name}{f': {how}' if how else ''}{guessed}")
+    log.info("%-10s%s", "fitting", f"{name}{f': {how}' if how else ''}{guessed}")
