@@ -89,7 +89,7 @@ def _of_csv(path: Path, table: Path) -> Raw:
     from gsparc.data.tables.opening import read_sheet
     from gsparc.data.tables.places import read_places
 
-    (sheet, _), stations = read_sheet(path), read_station_places(table)
+    sheet, stations = read_sheet(path), read_station_places(table)
     missing = [head for head in (LATITUDE, LONGITUDE) if head not in sheet.heads]
     if missing:
         raise DataError(f"{path}, line 1: no column {' and '.join(missing)}; expected those of single_tx.csv")

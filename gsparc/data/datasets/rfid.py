@@ -158,7 +158,7 @@ def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
     """A table of these columns; `DataError` where it is none, or has others."""
     from gsparc.data.tables.opening import read_sheet  # here, as pandas takes half a second to import
 
-    sheet, _ = read_sheet(path, problems)
+    sheet = read_sheet(path, problems)
     sheet = replace(sheet, frame=sheet.frame.rename(columns=str.lower))
     if sorted(sheet.heads) != sorted(heads):
         found = ",".join(sheet.heads)

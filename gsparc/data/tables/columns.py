@@ -84,8 +84,8 @@ def choose_columns(
     settings: Mapping[str, object],
     labelled: Mapping[str, str] = {},
     only: Container[str] | None = None,
-) -> tuple[Chosen, list[str]]:
-    """Choose the columns of each quantity, with a note for each that was guessed.
+) -> Chosen:
+    """Choose the columns of each quantity; what was guessed is noted.
 
     Args:
         sheet: the table.
@@ -100,7 +100,7 @@ def choose_columns(
             # Settings come first: what is said needs no guess, and its column is not guessed again.
             chosen[columns[0].role] = columns
     if sheet.problems:
-        return chosen, []
+        return chosen
     said = used_heads(chosen)
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
@@ -121,7 +121,6 @@ def choose_columns(
         guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
     # First of all, as a second measurement is no second candidate for the first one.
     _one_way(sheet, guesses)
-    notes = []
     for role, found in guesses.items():
         # Columns whose head says less than others of the quantity count only where there is nothing better.
         candidates = [column for column in found if not column.less] or found
@@ -146,23 +145,22 @@ def choose_columns(
             continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact or several:
-            notes.append(_note(chosen[role]))
+            sheet.notes.append(_note(chosen[role]))
     for column in (columns[0] for columns in chosen.values()):
         if not column.word and column.unit is not None and column.unit.changes:
-            notes.append(_turned(column, column.unit))
+            sheet.notes.append(_turned(column, column.unit))
     _one_unit(sheet, chosen)
     # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
-        notes += _wide_survey(sheet, chosen)
+        _wide_survey(sheet, chosen)
     used = used_heads(chosen)
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
         timed = heads.SHEET["times"] * any(LISTS["time"] & set(words_of(head)) for head in unused)
-        notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
-    return chosen, [
-        *notes,
-        *(() if only is not None else _more_levels(sheet, chosen.get("rssi_db", ()), used)),
-    ]
+        sheet.notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
+    if only is None:
+        _warn_of_levels(sheet, chosen.get("rssi_db", ()), used)
+    return chosen
 
 
 def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
@@ -200,17 +198,16 @@ MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f]
 NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
 
 
-def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
-    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels; the notes."""
+def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
+    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels."""
     used = used_heads(chosen)
     rest = [head for head in sheet.heads if head not in used]
     named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
     alike = named or [head for head in rest if _may_be_levels(sheet, head)]
-    if not alike or "station" in chosen:
-        return []
-    chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
-    note = _note(chosen["rssi_db"])
-    return [note if named else Caution(f"{note}: by their values, as no head says so")]
+    if alike and "station" not in chosen:
+        chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
+        note = _note(chosen["rssi_db"])
+        sheet.notes.append(note if named else Caution(f"{note}: by their values, as no head says so"))
 
 
 def _may_be_levels(sheet: Sheet, head: str) -> bool:
@@ -225,18 +222,18 @@ def _may_be_levels(sheet: Sheet, head: str) -> bool:
 BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
 
 
-def _more_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> list[str]:
+def _warn_of_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> None:
     """Warn of columns that are not used, with values like those of several `columns` of levels."""
     if len(columns) < 2:
-        return []
+        return
     rest = [h for h in sheet.heads if h not in used and not LISTS["no_level"] & set(words_of(h))]
     numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
     levels = numbers[[column.head for column in columns]].stack()
     low, high = levels.min(), min(levels.max(), 0)
     alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
-    said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and " if alike else ""
-    advice = f"are not used: of stations, too? call them as {columns[0].head!r} is called"
-    return [Caution(said + advice)] if alike else []
+    if alike:
+        said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
+        sheet.notes.append(Caution(f"{said}of stations, too? call them as {columns[0].head!r} is called"))
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:

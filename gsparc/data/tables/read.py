@@ -72,27 +72,21 @@ def parse_table(
     Raises:
         DataError: all problems, with row and column.
     """
-    sheet, notes = read_sheet(path)
-    sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
-    sheet, of_tones = unfold_tones(sheet)
-    notes = [*notes, *of_slots, *of_tones]
+    sheet = unfold_tones(unfold_slots(read_sheet(path), {str(value) for value in columns.values()}))
     listed = None
     if stations_file is not None:
-        second, _ = read_sheet(stations_file, sheet.problems)
-        listed, list_notes = read_stations(second)
-        notes += list_notes
+        listed = read_stations(replace(read_sheet(stations_file, sheet.problems), notes=sheet.notes))
         sheet.problems.raise_if_any()
     # The list of stations comes before the columns: heads that hold its names are levels of stations.
     labelled: dict[str, str] = {}
     if listed is not None:
         parts = {head: station_in_head(head) for head in sheet.heads}
         listed, labelled = listed.match_heads(parts)
-    chosen, guessed = choose_columns(sheet, columns, labelled)
+    chosen = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
-    sheet, without = drop_rows_without_place(sheet, chosen)
-    builder = Builder(sheet, chosen, listed)
-    arrays = builder.build()
+    sheet = drop_rows_without_place(sheet, chosen)
+    arrays = Builder(sheet, chosen, listed).build()
     sheet.problems.raise_if_any()
     power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
     about = {}
@@ -102,7 +96,7 @@ def parse_table(
     if power is not None and power.unit is not None and power.unit.name in WATTS and not power.unit.times:
         about["unit"] = power.unit.name
     explain = partial(say_effects, sheet, chosen)
-    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes), explain=explain)
+    return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain)
 
 
 UNKNOWN_ASU, MOST_GSM = 99, 31  # arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
@@ -114,8 +108,7 @@ class Builder:
 
     def __init__(self, sheet: Sheet, chosen: Chosen, listed: StationList | None) -> None:
         self.sheet, self.chosen, self.listed = sheet, chosen, listed
-        self.refuse = sheet.refuse
-        self.notes: list[str] = []
+        self.refuse, self.notes = sheet.refuse, sheet.notes
         self.arrays: dict[str, np.ndarray] = {}
         self.tones = np.zeros(1, int)
 
@@ -396,11 +389,9 @@ class Builder:
         assert self.listed is not None
         if (wrong := self.listed.shared_name_problem(words)) is not None:
             return self.refuse(wrong)
-        lacking: list[str] = []
         if head is not None:
-            self.listed, lacking, said = self.listed.add_missing(words)
-            self.notes += said
-        known = {"", *self.listed.names, *lacking}
+            self.listed = self.listed.add_missing(words, self.notes)
+        known = {"", *self.listed.names}
         unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in known]
         place = f"{self.sheet.source}, " + ("the heads" if head is None else f"column {head!r}")
         if len(unlisted) > MOST_NAMED:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Container
 
 import numpy as np
 import pandas as pd
@@ -69,16 +70,15 @@ def band_hz(band: np.ndarray) -> np.ndarray:
     return np.where(band > MOST_BAND, np.where(names, band, np.nan), known) * MHZ
 
 
-def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them, and notes.
+def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndarray]:
+    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them; with notes.
 
     Args:
         sheet: the list.
         used: heads that are read as something else.
     """
     found: dict[str, np.ndarray] = {}
-    notes: list[str] = []
-    unread, heads = [], []
+    notes, unread, heads = sheet.notes, [], []
     for head in [head for head in sheet.heads if head not in used]:
         name = sector_quantity(head)
         values, written, unit = _read_cells(sheet, head, name)
@@ -100,7 +100,7 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
             values = -values
-        notes += _doubt(sheet, head, name, values, written, unit is None)
+        _doubt(sheet, head, name, values, written, unit is None)
         found[name] = values
         heads.append(f"{head!r} as {said}")
     parts = [found.pop(name) for name in TILTS if name in found]
@@ -121,7 +121,7 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     if unread:
         heads_ = f"column{'s' * (len(unread) > 1)} {list_first(unread, 8)}"
         notes.append(Caution(f"{sheet.source}: not read: {heads_}"))
-    return found, notes
+    return found
 
 
 def _read_cells(sheet: Sheet, head: str, name: str | None) -> tuple[np.ndarray, np.ndarray, Unit | None]:
@@ -155,12 +155,10 @@ def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
     return not own.any() or bool(((own >= low) & (own <= high)).all() and np.abs(own).max() >= least)
 
 
-def _doubt(
-    sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool
-) -> list[str]:
+def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool) -> None:
     """Refuse values (T,) that cannot be (DataError), doubt rare ones, and name the unit that fits."""
     if name not in RANGES or np.isnan(values).all():
-        return []
+        return
     (least, most, _, kind), (low, high, apart) = RANGES[name], USUAL.get(name, (*RANGES[name][:2], np.inf))
     low, middle = UNSAID_DBM if unsaid and kind == "power" else low, np.nanmedian(values)
     refused, off = not _fits(UNITS["m"], values, name), (values < least) | (values > most)
@@ -171,7 +169,7 @@ def _doubt(
         single = np.abs(values - middle) > apart
         off |= single & (single.sum() <= FEW * len(values))
     if not off.any():
-        return []
+        return
     rest = values[~off & np.isfinite(values)]
     middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
     others = [one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")]
@@ -193,7 +191,7 @@ def _doubt(
         said += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
     if refused:
         raise DataError(said)
-    return [Caution(said)]
+    sheet.notes.append(Caution(said))
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:
