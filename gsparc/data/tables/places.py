@@ -12,15 +12,8 @@ import pandas as pd
 from gsparc.data.errors import Caution, DataError, list_first, name_row_ranges
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.links.stations import PER_STATION, SECTOR
-from gsparc.data.tables.columns import (
-    BY_ROW,
-    Chosen,
-    choose_columns,
-    rename_for_stations,
-    say_column,
-    used_heads,
-)
-from gsparc.data.tables.heads import AXES, LISTS, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
+from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations, say_column
+from gsparc.data.tables.heads import AXES, ENDS, LISTS, OTHER_NAMES, TOGETHER, parse_head, words_of
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.data.tables.sheet import Sheet
@@ -89,10 +82,16 @@ def read_places(
     return None
 
 
+def read_ends(sheet: Sheet, chosen: Chosen, strict: bool = True) -> dict[str, Places]:
+    """Read the coordinates that a table has of rows, `rx_` and `tx_`; see `read_places`."""
+    read = {end: read_places(sheet, chosen, end, strict=strict) for end in ENDS[:-1]}
+    return {end: where for end, where in read.items() if where is not None}
+
+
 def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
     """Leave out rows in which both coordinates of an end are empty, as loggers write them between fixes."""
     lost = np.zeros(len(sheet), bool)
-    for end in ("", "rx_", "tx_"):
+    for end in ENDS[:-1]:
         for pair in (("x", "y"), ("latitude", "longitude")):
             heads = [chosen[f"{end}{axis}"][0].head for axis in pair if f"{end}{axis}" in chosen]
             if len(heads) == 2 and None not in heads:
@@ -118,7 +117,7 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
         DataError: rows are of one station each, and no column of times says which are of one moment.
     """
     sheet = read_sheet(path)
-    roles = [f"{before}{axis}" for before in ("", "rx_", "tx_") for axis in AXES]
+    roles = [f"{before}{axis}" for before in ENDS[:-1] for axis in AXES]
     said = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
     here = {key: head for key, head in said.items() if head in sheet.heads}
     chosen = choose_columns(sheet, here, {}, [*roles, "station"])
@@ -307,7 +306,7 @@ def read_stations(sheet: Sheet) -> StationList | None:
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station")
     coordinates = read_places(sheet, chosen, "station_", unknown=True)
-    used = used_heads(chosen)
+    used = {column.head for columns in chosen.values() for column in columns}
     aliases = _aliases(sheet, used)
     sectors = read_sectors(sheet, used | {pair[0] for pair in aliases})
     sites = number_sites(sheet)
@@ -344,7 +343,7 @@ def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
     """Columns, alone and with those that make them unique, that may name the stations of a list besides."""
     result: list[tuple[str, ...]] = []
     for head in sheet.heads:
-        words = set(words_of(head)) & STATION_WORDS
+        words = set(words_of(head)) & LISTS["station"]
         if not words:
             continue
         result += [(head,)] if head not in used else []
