@@ -48,15 +48,10 @@ def cause_of(error: InstantiationException) -> BaseException:
 
 def iterate_targets(node: Any) -> Iterator[Any]:
     """Yield every `_target_` in a config (plain containers), at any depth."""
-    if isinstance(node, dict):
-        for key, value in node.items():
-            if key == "_target_":
-                yield value
-            else:
-                yield from iterate_targets(value)
-    elif isinstance(node, list):
-        for value in node:
-            yield from iterate_targets(value)
+    if isinstance(node, dict) and "_target_" in node:
+        yield node["_target_"]
+    for value in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        yield from iterate_targets(value)
 
 
 def import_target(path: str) -> Any:
