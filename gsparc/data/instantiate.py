@@ -94,10 +94,9 @@ def config_node(kind: type) -> dict[str, Any]:
 
     Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
     """
-    defaults = {
-        name: v for name, default in accepted_arguments(kind).items() if (v := _plain(default)) is not _OTHER
-    }
-    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults}
+    plain = {name: _plain(default) for name, default in accepted_arguments(kind).items()}
+    held = {name: default for name, default in plain.items() if default is not _OTHER}
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **held}
 
 
 _OTHER = object()

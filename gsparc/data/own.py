@@ -16,7 +16,7 @@ import numpy as np
 
 from gsparc.data.amplitudes import amplitudes_to_levels
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
-from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
+from gsparc.data.blocks import is_big, row_blocks, write_blocks
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.errors import Caution
@@ -394,7 +394,6 @@ def _scaled(
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
         if mask_or_level is not None or name == "rssi_db" or not is_big(values):
             return (values * lift / (scale * lift)).astype(stored), scale
-        target = allocate_on_disk(values.shape, stored)
-        for part in row_blocks(values):
-            target[part] = values[part].astype(exact) * lift / (scale * lift)
-        return target, scale
+        return write_blocks(
+            values.shape, stored, lambda part: values[part].astype(exact) * lift / (scale * lift)
+        ), scale

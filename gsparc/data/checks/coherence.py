@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.blocks import evenly_spaced, rows_by
 from gsparc.data.limits import SettingError, choice
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
@@ -137,8 +138,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
     """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line, the middle one first."""
     found = [np.zeros((0, 2 if pairs else 3), np.int64)]
-    for run in np.unique(rows.run):
-        own = np.flatnonzero(rows.run == run)
+    for _, own in rows_by(rows.run):
         at = rows.places[own]
         near, index = (part.reshape(len(own), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(own))))
         good = (near <= reach) & (index != np.arange(len(own))[:, None])
@@ -156,4 +156,4 @@ def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
         third = opposite.argmax(1)
         found.append(own[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
     every = np.concatenate(found)
-    return every[np.unique(np.linspace(0, len(every) - 1, MOST).astype(int))] if len(every) else every
+    return every[evenly_spaced(len(every), MOST)]

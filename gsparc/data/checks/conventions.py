@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsparc.data.blocks import rows_by
 from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_array, mask_zero_tones, traits
 from gsparc.data.errors import list_first
 from gsparc.data.moments import Snapshots
@@ -185,8 +186,7 @@ def _groups(place: np.ndarray) -> np.ndarray:
     """Numbers (S,) of parts of the site, halved again and again along their longest side."""
     part = np.zeros(len(place), np.int64)
     for _ in range(HALVINGS):
-        for number in np.unique(part):
-            inside = np.flatnonzero(part == number)
+        for number, inside in rows_by(part):
             along = place[inside, np.ptp(place[inside], axis=0).argmax()]
             part[inside] = 2 * number + (along > np.median(along))
     return part
@@ -276,10 +276,8 @@ def _decibels(data: Measurements) -> list[str]:
     of_group = np.sort([gains[groups == group].sum() for group in np.unique(groups)])
     if of_group[:-DROPPED].sum() < RATIO or np.median(gains) < LOBE:
         return []
-    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g},"
-    return [
-        f"{how} fit a beam more than 1,000 times better as decibels: dataset.decibels=true makes them linear"
-    ]
+    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam"
+    return [f"{how} more than 1,000 times better as decibels: dataset.decibels=true makes them linear"]
 
 
 def _lobe(values: np.ndarray, directions: np.ndarray) -> float:

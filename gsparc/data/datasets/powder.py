@@ -60,7 +60,7 @@ def read_powder(
     for name, height in (("tx_height", tx_height), ("station_height", station_height)):
         number(-np.inf).check(f"dataset.{name}", height)
     if path.suffix.lower() == ".csv":
-        raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
+        raw = _of_csv(path, Path(station_table or path.with_name(STATIONS)))
     else:
         raw = _of_npz(path)
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}

@@ -146,9 +146,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
                 check.notes.append(f"{name}: {said}")
     for name in STATION_FIELDS[1:]:
         check.raw.arrays.pop(name, None)
-    stations = split_by_carrier(
-        check, _selected(check, measured, stations, part) or stations, measured in POWERS
-    )
+    stations = _selected(check, measured, stations, part) or stations
+    stations = split_by_carrier(check, stations, measured in POWERS)
     if measured == "rssi_db":
         forget_unknown(check, ends[0])  # before lists are looked for, in which they would be strong
     absent = check.raw.attributes.get("absent", "auto")

@@ -21,10 +21,8 @@ LIST = re.compile(r"\s*\[(.+)\]\s*", re.DOTALL)
 PLACES = LISTS["place"] | LISTS["vector"] | set(AXIS_WORDS)
 LOGGED = "CSI_DATA"  # begins the rows of an ESP32, whose lists hold imaginary parts before real ones
 NUMBER = r"[-+]?\d*\.?\d+(?:e[-+]?\d+)?"
-PAIR = re.compile(rf"(?i)\s*[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?\s*")
-POINT = re.compile(
-    rf"(?i)\s*(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)\s*"
-)
+PAIR = re.compile(rf"(?i)[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?")
+POINT = re.compile(rf"(?i)(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)")
 FINE = re.compile(r"\.\d{4}")  # digits of degrees that tell streets apart
 
 

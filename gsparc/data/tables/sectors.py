@@ -33,9 +33,8 @@ USUAL = {
 UNSAID_DBM = 30  # a lower power, where nobody says its unit, may be in watts
 FEW, LEAST = 0.2, 3  # share of a column up to which values are single ones; radians beside degrees
 CELL = re.compile(r"(?i)^\s*[bn]?([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)(?:\s.*)?$")
-FIRST_NR = (
-    100_000  # channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1)
-)
+# Channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1).
+FIRST_NR = 100_000
 WIDEST = 2000  # channels of a band of LTE, at most
 NR_MHZ = np.array([[410, 7125], [24250, 71000]])  # where NR has bands (3GPP TS 38.104, 5.1)
 MOST_BAND = 90  # numbers beyond are frequencies [MHz]
@@ -92,10 +91,9 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
             notes.append(Caution(f"{sheet.source}: column {head!r}: {cells}: no {name}; unknown"))
         if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
             values, said = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
-        zero = name == "station_power_db" and (
-            np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
-        )
-        if (zero or name in ("station_width", "station_thickness")) and (values == 0).any():
+        high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
+        empty = "station_width", "station_thickness", *["station_power_db"] * bool(high)
+        if name in empty and (values == 0).any():
             values, said = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
@@ -175,11 +173,8 @@ def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.n
     others = [one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")]
     least_usual, written = USUAL.get(name, (least,))[0], written[off]
     own = {one.name: _convert(one, written) for one in others}
-    fitting = [
-        unit
-        for unit, v in own.items()
-        if ((v >= least_usual) & (v <= high) & ~(abs(v - middle) > apart)).all()
-    ]
+    usual = {one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > apart) for one, v in own.items()}
+    fitting = [one for one, holds in usual.items() if holds.all()]
     shown = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
     said = f"{sheet.source}: column {head!r} holds {list_first(shown, 3)}; expected {name} of "
     said += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
