@@ -145,7 +145,10 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     named = str(raw.attributes.get("conventions", "")).split()
     if kind == "csi" and check.fits_exchanged(*values.shape[1:]):
-        named = check.accept_exchange(named, values.shape[1:])
+        if "exchange_axes" not in named:
+            fits = f"rows of shape {values.shape[1:]} fit frequencies and antennas with their axes exchanged"
+            check.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
+        named = [one for one in named if one != "exchange_axes"]  # it is done here
         values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
     frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
     # Transposed images: their grid is that of the axes as they will be.

@@ -235,13 +235,6 @@ class Checker:
 
         return fits(tones, antennas) and not fits(antennas, tones)
 
-    def accept_exchange(self, named: list[str], shape: tuple[int, ...]) -> list[str]:
-        """Return conventions without `exchange_axes`, which is done; a problem where it is not named."""
-        if "exchange_axes" not in named:
-            fits = f"rows of shape {shape} fit frequencies and antennas with their axes exchanged"
-            self.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
-        return [one for one in named if one != "exchange_axes"]
-
     def read_rotation(self, rows: int) -> np.ndarray | None:
         """Return (S, 3, 3) local to world; the identity when the file says nothing."""
         present = self.present("rx_orientation", "rx_rotation")

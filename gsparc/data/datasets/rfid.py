@@ -89,9 +89,8 @@ def load_rfid(
     count = None if positions is None else len(positions)
     spectra = _read_spectra(root / "spectrum", f"{moving}_pos.csv", count, problems)
     if moving == "rx" and (root / "freq.txt").exists():
-        problems.add(
-            root / "freq.txt", "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
-        )
+        said = "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
+        problems.add(root / "freq.txt", said)
     carriers = _read_carriers(root / "freq.txt", f"{moving}_pos.csv", count, problems)
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
@@ -148,9 +147,8 @@ def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, 
         return np.zeros(0, np.int64), None
     part = sheet.words("split")
     wrong = np.flatnonzero(~(np.isin(number, np.arange(1, count + 1)) & np.isin(part, SPLITS)))
-    sheet.refuse_rows(
-        "spectrum", wrong, f"expected the number of a spectrum, 1 to {count}, and train or test"
-    )
+    expected = f"expected the number of a spectrum, 1 to {count}, and train or test"
+    sheet.refuse_rows("spectrum", wrong, expected)
     return number.astype(np.int64) - 1, (np.flatnonzero(part == "train"), np.flatnonzero(part == "test"))
 
 

@@ -26,9 +26,8 @@ from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, Links, Stations
 from gsparc.data.selection import Selection, select, take_rows
 
-STATION_FIELDS = (
-    *("station", "station_position", "station_name", "station_label", "station_orientation", *SECTOR),
-)
+_OF_STATIONS = ("position", "name", "label", "orientation")
+STATION_FIELDS = ("station", *(f"station_{name}" for name in _OF_STATIONS), *SECTOR)
 
 
 def expand_links(check: Checker, measured: str, part: Selection) -> Links | None:

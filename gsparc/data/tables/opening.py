@@ -298,10 +298,8 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
     problems, below = Problems(source), list(lines)[1:]
     for n, row in zip(below, cells[1:], strict=True):
         if len(row) != count and sum(parse_head(cell).role is not None for cell in row) > 1:
-            fault = (
-                f"heads of another table than that of line {min(lines)}: write each into a file of its own"
-            )
-            raise DataError(f"{source}, line {n}: {fault}")
+            fault = f"heads of another table than that of line {min(lines)}"
+            raise DataError(f"{source}, line {n}: {fault}: write each into a file of its own")
     names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")

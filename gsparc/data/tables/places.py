@@ -65,8 +65,7 @@ def read_places(
         if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
             found = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
-            fault = f"{found}; say {say_column(missing, 'COLUMN')}"
-            return sheet.refuse(fault)
+            return sheet.refuse(f"{found}; say {say_column(missing, 'COLUMN')}")
         absent = np.zeros(len(sheet), bool)
         if unknown:
             present = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
@@ -141,9 +140,8 @@ def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
     alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
     # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
     if empty or alone or 2 * links < len(moment):
-        raise DataError(
-            f"{asked} {named} has {moments} values in {len(moment)} rows, {empty} empty; {wanted}"
-        )
+        found = f"{named} has {moments} values in {len(moment)} rows, {empty} empty"
+        raise DataError(f"{asked} {found}; {wanted}")
     return heads
 
 
@@ -203,10 +201,9 @@ def place_per_station(
         return row_places.take(first)
     if not ask:
         row = moved[0]
-        here, there = first[station[row]], row
-        at = [f"({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in (here, there)]
-        fault = f"station {names[station[row]]!r} is at {at[0]} and at {at[1]}; expected one place for each"
-        sheet.refuse(fault)
+        both = (first[station[row]], row)
+        at = [f"at ({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in both]
+        sheet.refuse(f"station {names[station[row]]!r} is {' and '.join(at)}; expected one place for each")
     return None
 
 
