@@ -35,9 +35,7 @@ def row_blocks(array: Any) -> Iterator[slice]:
 
 def iterate_bytes(array: np.ndarray) -> Iterator[bytes]:
     """Yield bytes of an array in the order of its entries, a block at a time."""
-    if not array.ndim:
-        yield array.tobytes()
-        return
+    array = np.atleast_1d(array)
     for part in row_blocks(array):
         yield np.ascontiguousarray(array[part]).tobytes()
 

@@ -82,13 +82,12 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         reach, near = IN_LINE, _neighbours(rows, IN_LINE * site.wavelength, pairs=False)
     if len(near) < FEWEST:
         return None
-    middle = values[near[:, 0]]
-    first, size = _correlation(middle, values[near[:, 1]])
+    a, b = values[near[:, 0]], values[near[:, 1]]
+    first, size = _correlation(a, b)
     measured = abs(first.mean())
     if reach == IN_LINE:  # in the next step the phase advances as in this one
-        second, _ = _correlation(values[near[:, 2]], middle)
+        second, _ = _correlation(values[near[:, 2]], a)
         measured = np.sqrt(abs((first * second.conj()).mean()))
-    a, b = middle, values[near[:, 1]]
     turned = a * align_factors(a, b, rows.tones, "phase+delay")[:, None]
     phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
     levels = 10 * np.log10(size[:, 0] / size[:, 1])

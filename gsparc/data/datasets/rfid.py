@@ -32,7 +32,7 @@ from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text, read_yaml
-from gsparc.data.limits import finite_array
+from gsparc.data.limits import finite_array, parse_numbers
 from gsparc.data.links.stations import number_places
 from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
 from gsparc.data.schema import LIGHT, End, Measurements, Site, Stations, TrainTest
@@ -214,10 +214,7 @@ def _read_carriers(path: Path, positions: str, count: int | None, problems: Prob
     if not path.exists() or count is None:
         return None
     words = (problems.attempt(lambda: read_text(path, "missing")) or "").split()
-    try:
-        carriers = 1e9 * np.array(words, np.float64)
-    except ValueError:
-        carriers = np.zeros(0)
+    carriers = 1e9 * parse_numbers(words)
     if carriers.shape != (count,) or not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
         expected = f"expected the carrier of each of the {count} rows of {positions} [GHz], one number a line"
         return problems.add(path, f"{len(words)} words; {expected}")
