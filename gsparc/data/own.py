@@ -279,9 +279,8 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     with np.errstate(over="ignore", invalid="ignore"):
         unmarked = "not finite; expected numbers (mark what was not measured in mask)"
         check.refuse_rows(name, _rows(values, _infinite, mask), unmarked)
-        if name == "csi" or values.dtype.kind == "u":
-            return
-        if "decibels" in str(check.raw.attributes.get("conventions", "")).split():
+        followed = str(check.raw.attributes.get("conventions", "")).split()
+        if name == "csi" or values.dtype.kind == "u" or "decibels" in followed:
             return
         wanted = "linear power, at least 0 (is it in dB?"
         wanted += "; then dataset.decibels=true)" if name == "spectrum" else ")"
@@ -393,10 +392,9 @@ def _scaled(
     if scale <= 0:
         return values, 0.0
     lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
+    divisor = scale * lift
     stored, exact = (np.complex64, np.complex128) if name == "csi" else (np.float32, np.float64)
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
         if mask_or_level is not None or name == "rssi_db" or not is_big(values):
-            return (values * lift / (scale * lift)).astype(stored), scale
-        return write_blocks(
-            values.shape, stored, lambda part: values[part].astype(exact) * lift / (scale * lift)
-        ), scale
+            return (values * lift / divisor).astype(stored), scale
+        return write_blocks(values.shape, stored, lambda at: values[at].astype(exact) * lift / divisor), scale
