@@ -21,13 +21,8 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
     """Note rows whose position (S, 3) [m] is not finite or not on Earth; returns whether there are any."""
     with np.errstate(invalid="ignore"):
         good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
-    bad = np.flatnonzero(~good)
-    problems.add_rows(
-        where,
-        (f"{row_names[i]} = {np.array2string(position[i], separator=', ')}" for i in bad),
-        f"expected three finite coordinates in metres, none beyond {FARTHEST:.0e}",
-    )
-    return len(bad) > 0
+    expected = f"expected three finite coordinates in metres, none beyond {FARTHEST:.0e}"
+    return problems.add_values(where, row_names, position, good, expected)
 
 
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
@@ -51,14 +46,13 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     return float(10 ** (round(20 * np.log10(peak * np.sqrt(total / count))) / 20))
 
 
-def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
+def content_hash(arrays: Mapping[str, np.ndarray | float | None]) -> str:
     """Return the SHA-256 of named arrays (type, shape, bytes), the same whatever file they came from."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
-        array = arrays[name]
-        if array is None:
+        if arrays[name] is None:
             continue
-        array = np.ascontiguousarray(array)  # of one number too: (1,)
+        array = np.ascontiguousarray(arrays[name])  # of one number too: (1,)
         digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
         for part in iterate_bytes(array):
             digest.update(part)
@@ -109,8 +103,7 @@ def centre_positions(data: Measurements) -> Measurements:
                "position_std", "device")  # fmt: skip
     hashed = {name: getattr(data, name) for name in of_rows} | {
         "rx": rx, "array": site.array, "subcarriers_hz": site.subcarriers_hz,
-        "target_scale": np.array(site.target_scale),
-        "carrier_hz": None if site.carrier_hz is None else np.array(site.carrier_hz),
+        "target_scale": site.target_scale, "carrier_hz": site.carrier_hz,
         "carriers_hz": None if stations is None else stations.carrier_hz,
         "arrays": None if stations is None else stations.array,
     }  # fmt: skip

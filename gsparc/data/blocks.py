@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing import context, reduction
 from typing import IO, Any
 
@@ -35,9 +35,7 @@ def row_blocks(array: Any) -> Iterator[slice]:
 
 def iterate_bytes(array: np.ndarray) -> Iterator[bytes]:
     """Yield bytes of an array in the order of its entries, a block at a time."""
-    if not array.ndim:
-        yield array.tobytes()
-        return
+    array = np.atleast_1d(array)
     for part in row_blocks(array):
         yield np.ascontiguousarray(array[part]).tobytes()
 
@@ -83,6 +81,14 @@ def allocate_on_disk(shape: tuple[int, ...], dtype: Any) -> OnDisk:
     return OnDisk.from_file(file, dtype, "w+", shape)
 
 
+def write_blocks(shape: tuple[int, ...], dtype: Any, values: Callable[[slice], Any]) -> OnDisk:
+    """Return an array on disk, its rows written as `values` of each block of them are made."""
+    array = allocate_on_disk(shape, dtype)
+    for part in row_blocks(array):
+        array[part] = values(part)
+    return array
+
+
 def allocate(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     """Return an array to be filled, on disk where it is large.
 
@@ -97,10 +103,7 @@ def take(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return rows (n,) of an array, on disk where they are many and lie there already."""
     if not isinstance(array, np.memmap) or len(rows) * array[:1].nbytes < BIG:
         return array[rows]
-    copy = allocate_on_disk((len(rows), *array.shape[1:]), array.dtype)
-    for part in row_blocks(copy):
-        copy[part] = array[rows[part]]
-    return copy
+    return write_blocks((len(rows), *array.shape[1:]), array.dtype, lambda part: array[rows[part]])
 
 
 def map_from_disk(dataset: h5py.Dataset) -> OnDisk:
@@ -109,10 +112,13 @@ def map_from_disk(dataset: h5py.Dataset) -> OnDisk:
     if offset is not None and dataset.dtype.isnative:
         file = open(dataset.file.filename, "rb")  # noqa: SIM115 (the array keeps it)
         return OnDisk.from_file(file, dataset.dtype, "r", dataset.shape, offset)
-    copy = allocate_on_disk(dataset.shape, dataset.dtype)
-    for part in row_blocks(dataset):
-        copy[part] = dataset[part]
-    return copy
+    return write_blocks(dataset.shape, dataset.dtype, lambda part: dataset[part])
+
+
+def rows_by(label: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
+    """Yield each different label of (n,), and the rows (k,) that have it."""
+    for one in np.unique(label).tolist():
+        yield one, np.flatnonzero(label == one)
 
 
 def evenly_spaced(count: int, most: int) -> np.ndarray:

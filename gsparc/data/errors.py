@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 _Found = TypeVar("_Found")
 
 MOST = 300  # characters of a message: what was found may be a whole file in one line
@@ -141,6 +143,12 @@ class Problems(list[str]):
             self.add(f"{where}, {name}", what)
         if len(names) > self.LIMIT:
             self.append(f"{where}: {what}; the same in {len(names) - self.LIMIT} more rows")
+
+    def add_values(self, where: str | Path, rows: Sequence[str], values: Any, good: Any, what: str) -> bool:
+        """Note `what` for rows whose values (S, ...) are not `good` (S,); returns whether there are any."""
+        bad = np.flatnonzero(~good).tolist()
+        self.add_rows(where, (f"{rows[i]} = {np.array2string(values[i], separator=', ')}" for i in bad), what)
+        return len(bad) > 0
 
     def attempt(self, read: Callable[[], _Found]) -> _Found | None:
         """Return what `read` does; None, and noted, where it raises `DataError`."""

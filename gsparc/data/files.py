@@ -72,9 +72,8 @@ def check_content(path: str | Path, text: str | bytes, marks: str) -> None:
     """Raise `DataError` of a large text of which hardly more is left without one of marks than the marks."""
     for mark in marks if len(text) > LONGEST_LINE else "":
         if LEAST_CONTENT * text.count(mark if isinstance(text, str) else mark.encode()) > len(text):  # type: ignore[arg-type]
-            raise DataError(
-                f"{path}: nearly nothing but {mark!r} in {len(text):,} characters; expected values"
-            )
+            fault = f"nearly nothing but {mark!r} in {len(text):,} characters"
+            raise DataError(f"{path}: {fault}; expected values")
 
 
 def load_yaml(text: str, source: str | Path) -> Any:

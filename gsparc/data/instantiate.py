@@ -48,15 +48,10 @@ def cause_of(error: InstantiationException) -> BaseException:
 
 def iterate_targets(node: Any) -> Iterator[Any]:
     """Yield every `_target_` in a config (plain containers), at any depth."""
-    if isinstance(node, dict):
-        for key, value in node.items():
-            if key == "_target_":
-                yield value
-            else:
-                yield from iterate_targets(value)
-    elif isinstance(node, list):
-        for value in node:
-            yield from iterate_targets(value)
+    if isinstance(node, dict) and "_target_" in node:
+        yield node["_target_"]
+    for value in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+        yield from iterate_targets(value)
 
 
 def import_target(path: str) -> Any:
@@ -99,10 +94,9 @@ def config_node(kind: type) -> dict[str, Any]:
 
     Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
     """
-    defaults = {
-        name: v for name, default in accepted_arguments(kind).items() if (v := _plain(default)) is not _OTHER
-    }
-    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults}
+    plain = {name: _plain(default) for name, default in accepted_arguments(kind).items()}
+    held = {name: default for name, default in plain.items() if default is not _OTHER}
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **held}
 
 
 _OTHER = object()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,6 +127,19 @@ def finite_array(numbers: Any) -> np.ndarray:
     except ValueError:  # rows of different lengths
         return np.zeros(0)
     return boxed.astype(np.float64) if all(map(_real, boxed.flat)) else np.zeros(0)
+
+
+def parse_numbers(words: Sequence[str]) -> np.ndarray:
+    """Return numbers (n,) that words write; (0,) where one is none, or not finite.
+
+    >>> parse_numbers(["1", "2.5"]), parse_numbers(["1", "x"])
+    (array([1. , 2.5]), array([], dtype=float64))
+    """
+    try:
+        numbers = np.array(words, np.float64)
+    except ValueError:
+        return np.zeros(0)
+    return numbers if np.isfinite(numbers).all() else np.zeros(0)
 
 
 def setting(default: Any, limit: Limit) -> Any:

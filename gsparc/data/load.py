@@ -12,23 +12,14 @@ from typing import Any
 
 import numpy as np
 import yaml
+from hydra import utils
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data import spacing, splits
+from gsparc.data import instantiate, spacing, splits
 from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import (
-    accepted_arguments,
-    cause_of,
-    from_settings,
-    import_target,
-    iterate_targets,
-    refuse_foreign,
-    suggest_or_list,
-)
 from gsparc.data.limits import choice
 from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
@@ -59,14 +50,14 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     if "_target_" not in settings:
         settings = _plain(OmegaConf.merge(_choice(settings.get("name"), choices), settings))
     if not trusted:
-        for path in iterate_targets(settings):
-            refuse_foreign(path)
+        for path in instantiate.iterate_targets(settings):
+            instantiate.refuse_foreign(path)
     target, name = settings["_target_"], settings.get("name")
     own = [key for key, node in choices.items() if node["_target_"] == target]
     if own and name is not None and name not in own:
         _choice(name, choices)
         raise DataError(f"dataset.name={name}: this is dataset={own[0]}; say dataset={name}")
-    kind = import_target(str(target))
+    kind = instantiate.import_target(str(target))
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
         only = "; only gsparc locate takes it" if name == "fingerprints" else ""
         raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule{only}")
@@ -74,9 +65,9 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     free = "auto" if has_own else str(settings.pop("align", None) or "auto")
     settings = _checked(settings, kind)
     try:  # under its key, which errors then name
-        module = instantiate({"dataset": settings}, _convert_="all")["dataset"]
+        module = utils.instantiate({"dataset": settings}, _convert_="all")["dataset"]
     except InstantiationException as error:
-        raise cause_of(error) from None
+        raise instantiate.cause_of(error) from None
     if not isinstance(module, DataModule):
         raise DataError(f"dataset._target_={target} makes no gsparc.data.datamodule.DataModule")
     module.free = free
@@ -149,8 +140,8 @@ def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
         DataError: unknown name or key, or impossible shares.
     """
     if config.get("name") == "file":
-        return from_settings(FileSettings, config, "split", "setting of split=file")
-    return from_settings(SplitSettings, config, "split")
+        return instantiate.from_settings(FileSettings, config, "split", "setting of split=file")
+    return instantiate.from_settings(SplitSettings, config, "split")
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:
@@ -177,8 +168,9 @@ def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
 
 def _parameters(kind: Any) -> dict[str, Any]:
     """What `kind` takes, with defaults; what a dataset hands on by keyword is what its reader takes."""
-    _, *read = accepted_arguments(getattr(kind, "reader", lambda path: path)).items()
-    return {**dict.fromkeys(getattr(kind, "switches", ())), **dict(read), **accepted_arguments(kind)}
+    reader, taken = getattr(kind, "reader", lambda path: path), instantiate.accepted_arguments
+    _, *read = taken(reader).items()
+    return {**dict.fromkeys(getattr(kind, "switches", ())), **dict(read), **taken(kind)}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
@@ -197,7 +189,8 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
             other = PATHS.get(key)
             if other in known:
                 raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
-            raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest_or_list(key, known)}")
+            hint = instantiate.suggest_or_list(key, known)
+            raise DataError(f"dataset.{key}: no such setting of dataset={name}{hint}")
     for key in known:
         if key in needed and accepted.get(key) in (None, "", "???"):
             say = f"{MADE.get(str(name), '')}say dataset.{key}={key.upper()} for dataset={name}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsparc.data.amplitudes import amplitudes_to_levels
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
-from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
+from gsparc.data.blocks import is_big, row_blocks, write_blocks
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.errors import Caution
@@ -145,7 +145,10 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     named = str(raw.attributes.get("conventions", "")).split()
     if kind == "csi" and check.fits_exchanged(*values.shape[1:]):
-        named = check.accept_exchange(named, values.shape[1:])
+        if "exchange_axes" not in named:
+            fits = f"rows of shape {values.shape[1:]} fit frequencies and antennas with their axes exchanged"
+            check.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
+        named = [one for one in named if one != "exchange_axes"]  # it is done here
         values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
     frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
     # Transposed images: their grid is that of the axes as they will be.
@@ -276,9 +279,8 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     with np.errstate(over="ignore", invalid="ignore"):
         unmarked = "not finite; expected numbers (mark what was not measured in mask)"
         check.refuse_rows(name, _rows(values, _infinite, mask), unmarked)
-        if name == "csi" or values.dtype.kind == "u":
-            return
-        if "decibels" in str(check.raw.attributes.get("conventions", "")).split():
+        followed = str(check.raw.attributes.get("conventions", "")).split()
+        if name == "csi" or values.dtype.kind == "u" or "decibels" in followed:
             return
         wanted = "linear power, at least 0 (is it in dB?"
         wanted += "; then dataset.decibels=true)" if name == "spectrum" else ")"
@@ -390,11 +392,9 @@ def _scaled(
     if scale <= 0:
         return values, 0.0
     lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
+    divisor = scale * lift
     stored, exact = (np.complex64, np.complex128) if name == "csi" else (np.float32, np.float64)
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
         if mask_or_level is not None or name == "rssi_db" or not is_big(values):
-            return (values * lift / (scale * lift)).astype(stored), scale
-        target = allocate_on_disk(values.shape, stored)
-        for part in row_blocks(values):
-            target[part] = values[part].astype(exact) * lift / (scale * lift)
-        return target, scale
+            return (values * lift / divisor).astype(stored), scale
+        return write_blocks(values.shape, stored, lambda at: values[at].astype(exact) * lift / divisor), scale

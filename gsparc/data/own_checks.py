@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems, list_first, suggest_name
-from gsparc.data.raw import Raw
+from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
 from gsparc.ops import SphereGrid
 
@@ -102,7 +102,7 @@ class Checker:
 
     def name_rows(self, rows: int, stations: Stations | None) -> list[str]:
         """Return what messages call each row: `row_name`, or its number, with its station."""
-        arrays, named = self.raw.arrays, [f"row {i}" for i in range(rows)]
+        arrays, named = self.raw.arrays, numbered_rows(rows).tolist()
         if "row_name" in arrays and self.has_shape("row_name", arrays["row_name"], (rows,)):
             named = [str(name) for name in arrays["row_name"]]
         if stations is not None:  # a place alone would name several rows
@@ -149,13 +149,11 @@ class Checker:
         array = self.read_real(name, (3,), (rows, 3))
         if array is None:
             return None
-        rows_named = self.row_names or [f"row {i}" for i in range(len(array))]
-        names = rows_named if array.ndim == 2 else ["its value"]
-        known = np.atleast_2d(array)
         # Places that nobody gave are NaN on purpose and pass unchecked.
         if name == self.unknown:
             return array
-        if check_positions(self.problems, self.describe_array(name), known, names):
+        names = (self.row_names or numbered_rows(len(array)).tolist()) if array.ndim == 2 else ["its value"]
+        if check_positions(self.problems, self.describe_array(name), np.atleast_2d(array), names):
             return None
         stored = self.raw.arrays[name]
         # Distance to the next number: at a UTM northing of 5,000 km float32 has steps of half a metre.
@@ -237,13 +235,6 @@ class Checker:
 
         return fits(tones, antennas) and not fits(antennas, tones)
 
-    def accept_exchange(self, named: list[str], shape: tuple[int, ...]) -> list[str]:
-        """Return conventions without `exchange_axes`, which is done; a problem where it is not named."""
-        if "exchange_axes" not in named:
-            fits = f"rows of shape {shape} fit frequencies and antennas with their axes exchanged"
-            self.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
-        return [one for one in named if one != "exchange_axes"]
-
     def read_rotation(self, rows: int) -> np.ndarray | None:
         """Return (S, 3, 3) local to world; the identity when the file says nothing."""
         present = self.present("rx_orientation", "rx_rotation")
@@ -265,15 +256,9 @@ class Checker:
 
     def to_matrices(self, name: str, values: np.ndarray, rows: Sequence[str]) -> np.ndarray | None:
         """Return rotations (n, 3, 3) of quaternions (n, 4) of an array."""
-        good = is_unit(values)
-        bad = (
-            f"{rows[i]} = {np.array2string(values[i], separator=', ')}"
-            for i in np.flatnonzero(~good).tolist()
-        )
-        self.problems.add_rows(
-            self.describe_array(name), bad, "expected a quaternion (w, x, y, z) of length 1"
-        )
-        return quaternion_to_matrix(values, scalar_first=True) if good.all() else None
+        where, expected = self.describe_array(name), "expected a quaternion (w, x, y, z) of length 1"
+        bad = self.problems.add_values(where, rows, values, is_unit(values), expected)
+        return None if bad else quaternion_to_matrix(values, scalar_first=True)
 
     def read_grid(self, height: int, width: int) -> SphereGrid | None:
         """Return directions of the pixels; by default row i, column j at i and j steps from the horizon."""

@@ -29,8 +29,6 @@ class Placeholder:
         stored.made_with, stored.named, stored.state = made_with, named, None
         return stored
 
-    def __init__(self, *made_with: Any, **named: Any) -> None: ...
-
     def __setstate__(self, state: Any) -> None:
         self.state = state
 

@@ -52,10 +52,7 @@ class Query:
 
     def split(self, size: int) -> Iterator[Self]:
         """Yield all in order, at most `size` at a time."""
-        if len(self) <= size:
-            yield self
-            return
-        for start in range(0, len(self), size):
+        for start in range(0, max(len(self), 1), size):
             yield self.rows(slice(start, start + size))
 
     def to(self, device: torch.device | str) -> Self:

@@ -13,7 +13,7 @@ from gsparc.data.schema import ENDS, End
 from gsparc.data.tables.columns import choose_columns
 from gsparc.data.tables.heads import AXES
 from gsparc.data.tables.opening import read_sheet
-from gsparc.data.tables.places import Places, read_places
+from gsparc.data.tables.places import Places, read_ends
 from gsparc.data.tables.sheet import Sheet
 
 # Only what a query needs: a column that looks like a level is none of its concern.
@@ -64,7 +64,7 @@ def read_query_places(
         DataError: no file, no places, or a place that is none; the first problem, with row and column.
     """
     try:
-        return _of_sheet(*read_sheet(path), moving, columns)
+        return _of_sheet(read_sheet(path), moving, columns)
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
         first = error.problems[0].replace("dataset.columns", "columns")
@@ -79,7 +79,7 @@ def read_times(path: str | Path) -> np.ndarray | None:
     Raises:
         DataError: no such file, or a time that is no number, with its row.
     """
-    sheet, _ = read_sheet(path)
+    sheet = read_sheet(path)
     if "time_s" not in sheet.heads:
         return None
     times = sheet.numbers("time_s")
@@ -90,17 +90,14 @@ def read_times(path: str | Path) -> np.ndarray | None:
     return times
 
 
-def _of_sheet(
-    sheet: Sheet, notes: list[str], moving: Sequence[End], columns: Mapping[str, object]
-) -> QueryPlaces:
+def _of_sheet(sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
     said = {key: value for key, value in columns.items() if value is not None}
     if "device" in sheet.heads:  # a head that a table of measurements would not be taken at its word for
         said.setdefault("device", "device")
-    chosen, guessed = choose_columns(sheet, said, only=GUESSED)
+    chosen = choose_columns(sheet, said, only=GUESSED)
     sheet.problems.raise_if_any()
-    by_end = {end: read_places(sheet, chosen, end) for end in ("", "rx_", "tx_")}
+    rest = read_ends(sheet, chosen)
     sheet.problems.raise_if_any()
-    rest = {end: where for end, where in by_end.items() if where is not None}
     ends: dict[End, Places] = {}
     for end in moving:
         named = f"{end}_" if f"{end}_" in rest else ""
@@ -114,20 +111,19 @@ def _of_sheet(
     # Static ends stand where they were measured: a query cannot move them.
     other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
     if other:
-        guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
-    station = plain = None
-    if "station" in chosen:
-        head, station = chosen["station"][0].head or "", sheet.joined(c.head for c in chosen["station"])
+        sheet.notes.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
+    several = [role for role in ("station", "device", "row_name") if role in chosen]
+    joined = {role: sheet.joined(c.head for c in chosen[role]) for role in several}
+    station, plain = joined.get("station"), None
+    if station is not None:
+        head = chosen["station"][0].head or ""
         plain = sheet.joined([head])
         sheet.refuse_rows(head, np.flatnonzero(station == ""), "no station; expected its name")
     sheet.problems.raise_if_any()
-    device, name = (
-        sheet.joined(c.head for c in chosen[role]) if role in chosen else None
-        for role in ("device", "row_name")
-    )
+
     # Columns that were read as one quantity; joined stations are several columns and stay as text.
     chosen.pop("device", None)
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
-    told = (*notes, *guessed)
-    return QueryPlaces(sheet.source, ends, sheet.rows, station, plain, device, name, told, table)
+    of_rows = sheet.rows, station, plain, joined.get("device"), joined.get("row_name")
+    return QueryPlaces(sheet.source, ends, *of_rows, tuple(sheet.notes), table)

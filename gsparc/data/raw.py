@@ -320,15 +320,13 @@ def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None
     name, (shape, size) = max(stated.items(), key=lambda item: item[1][1], default=("", ((), 0)))
     total, packed, disk = sum(one for _, one in stated.values()), path.stat().st_size, tempfile.gettempdir()
     copied = sum(one for _, one in stated.values() if one >= BIG) * to_disk
-    most, held = min(max(BIG, MOST_PACKED * packed), LARGEST), total - copied
+    most, room = min(max(BIG, MOST_PACKED * packed), LARGEST), max(BIG, machine_memory() / 2)
+    held = total - copied
     faults = {
         f"a file of {packed:,} bytes does not hold that": total > most,
         f"no other array has {shape[:1]} rows": size >= BIG and rows[shape[0]] < 2 and name[:5] != "path_",
-        f"{disk} has no room; set TMPDIR to a larger disk": bool(copied)
-        and copied + SPARE > disk_usage(disk).free,
-        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": BIG
-        < held
-        > machine_memory() / 2,
+        f"{disk} has no room; set TMPDIR to a larger disk": copied > max(disk_usage(disk).free - SPARE, 0),
+        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": held > room,
     }
     for fault in (text for text, holds in faults.items() if holds):
         raise DataError(f"{path}, {name}: shape {shape}, {size:,} bytes: {fault}")

@@ -379,11 +379,9 @@ class Measurements:
         """Return the given rows as one batch."""
         rows = np.asarray(index)
         # One pose for the whole batch: kernels then plan the view once.
-        if self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1):
-            first = rows[:1]
-            rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
-        else:
-            rx = Pose(self._f32(self.rx_position[rows]), self._f32(self.rx_rotation[rows]))
+        one = self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1)
+        seen = rows[0] if one else rows
+        rx = Pose(self._f32(self.rx_position[seen]), self._f32(self.rx_rotation[seen]))
         optional = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))
         parts: dict[str, Any] = {name: torch.from_numpy(v[rows]) for name, v in optional if v is not None}
         return Batch(

@@ -380,9 +380,8 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
             f"split={s.name}: fold {fold} has {len(train)} training and {len(test)} test rows of "
             f"{len(positions)}; measure more, or change split.buffer_m or the shares"
         )
-    count = min(round(s.val_fraction * len(train)), len(train) - 1)
-    if s.val_fraction > 0 and len(train) > 1:
-        count = max(count, 1)
+    least = int(s.val_fraction > 0 and len(train) > 1)
+    count = max(min(round(s.val_fraction * len(train)), len(train) - 1), least)
     rng = np.random.default_rng([s.seed, fold, 2])
     if s.name == "grouped":
         # A stretch in one piece: single rows between training rows of a path would be too easy.

@@ -111,10 +111,8 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
         # Corners on a line span no plane, and their normal would be rounding.
         elif polygon_area(corners) < SMALLEST_M2:
             problems.add(where, "its corners lie on a line")
-        elif distance_from_plane(corners) > FLAT_M:
-            problems.add(
-                where, f"its corners lie up to {distance_from_plane(corners):.2g} m off a plane; split it"
-            )
+        elif (off := distance_from_plane(corners)) > FLAT_M:
+            problems.add(where, f"its corners lie up to {off:.2g} m off a plane; split it")
         else:
             faces.append(corners)
     return SceneWalls(tuple(faces), room.boxes)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.blocks import evenly_spaced, rows_by
 from gsparc.data.limits import SettingError, choice
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
@@ -81,13 +82,12 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         reach, near = IN_LINE, _neighbours(rows, IN_LINE * site.wavelength, pairs=False)
     if len(near) < FEWEST:
         return None
-    middle = values[near[:, 0]]
-    first, size = _correlation(middle, values[near[:, 1]])
+    a, b = values[near[:, 0]], values[near[:, 1]]
+    first, size = _correlation(a, b)
     measured = abs(first.mean())
     if reach == IN_LINE:  # in the next step the phase advances as in this one
-        second, _ = _correlation(values[near[:, 2]], middle)
+        second, _ = _correlation(values[near[:, 2]], a)
         measured = np.sqrt(abs((first * second.conj()).mean()))
-    a, b = middle, values[near[:, 1]]
     turned = a * align_factors(a, b, rows.tones, "phase+delay")[:, None]
     phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
     levels = 10 * np.log10(size[:, 0] / size[:, 1])
@@ -137,8 +137,7 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
     """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line, the middle one first."""
     found = [np.zeros((0, 2 if pairs else 3), np.int64)]
-    for run in np.unique(rows.run):
-        own = np.flatnonzero(rows.run == run)
+    for _, own in rows_by(rows.run):
         at = rows.places[own]
         near, index = (part.reshape(len(own), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(own))))
         good = (near <= reach) & (index != np.arange(len(own))[:, None])
@@ -156,4 +155,4 @@ def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
         third = opposite.argmax(1)
         found.append(own[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
     every = np.concatenate(found)
-    return every[np.unique(np.linspace(0, len(every) - 1, MOST).astype(int))] if len(every) else every
+    return every[evenly_spaced(len(every), MOST)]

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
 from gsparc.processes.level_field import LevelField, fit_level_field
 
@@ -142,8 +143,7 @@ def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np
     What is interpolated has no noise of its own: it differs far less from its neighbours than a measurement.
     """
     filled, apart = {}, np.full(len(links), np.nan)
-    for one in np.unique(links.station):
-        own = np.flatnonzero(links.station == one)
+    for _, own in rows_by(links.station):
         if len(own) > NEAR:
             near = cKDTree(links.place[own]).query(links.place[own], k=NEAR // 2 + 1)[1][:, 1:]
             apart[own] = links.level[own] - links.level[own][near].mean(1)
@@ -246,8 +246,7 @@ def _centred(value: np.ndarray, group: np.ndarray) -> np.ndarray:
 def _near_pairs(links: LevelsAtPlaces) -> np.ndarray:
     """Pairs (P, 2) of near rows of a station."""
     pairs = [np.zeros((0, 2), np.int64)]
-    for one in np.unique(links.station):
-        own = np.flatnonzero(links.station == one)
+    for _, own in rows_by(links.station):
         count = min(NEAR + 1, len(own))
         index = own[cKDTree(links.place[own]).query(links.place[own], k=count)[1].reshape(-1, count)]
         both = np.sort(np.c_[np.repeat(own, count), index.ravel()], axis=1)
@@ -257,8 +256,7 @@ def _near_pairs(links: LevelsAtPlaces) -> np.ndarray:
 
 def _far_pairs(links: LevelsAtPlaces, rng: np.random.Generator) -> np.ndarray:
     """Pairs (P, 2) of any rows of a station."""
-    own = [np.flatnonzero(links.station == one) for one in np.unique(links.station)]
-    pairs = np.concatenate([rng.choice(part, (4 * NEAR * len(part), 2)) for part in own])
+    pairs = np.concatenate([rng.choice(own, (4 * NEAR * len(own), 2)) for _, own in rows_by(links.station)])
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 

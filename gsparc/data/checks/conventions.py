@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsparc.data.blocks import rows_by
+from gsparc.data.checks.column_effects import LevelsAtPlaces
 from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_array, mask_zero_tones, traits
 from gsparc.data.errors import list_first
 from gsparc.data.moments import Snapshots
@@ -121,8 +123,7 @@ def _zeros(data: Measurements) -> list[str]:
 
 def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
-    kind, place = data.site.kind, np.hstack([data.tx, data.rx_position])
-    groups, declared = _groups(place), _score(data, labels)
+    kind, declared = data.site.kind, _score(data, labels)
     rivals: dict[str, Score] = {}
     for name in _tried(few):
         with suppress(ValueError):  # a grid turned beyond a pole
@@ -134,9 +135,7 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
                 if one.fit > FIT[kind] and (delayed or name != "delays_removed"):
                     rivals[name] = one
     best = max(rivals.values(), key=lambda one: one.log_likelihood, default=declared)
-    gain = best.rows - declared.rows
-    of_group = np.sort([gain[groups == group].sum() for group in np.unique(groups)])
-    if float(of_group[:-DROPPED].sum()) + (best.phases - declared.phases) / 2 <= RATIO:
+    if _of_most_groups(best.rows - declared.rows, data) + (best.phases - declared.phases) / 2 <= RATIO:
         return []
     how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better"
     return _mending(how, {name: one.log_likelihood for name, one in rivals.items()})
@@ -159,37 +158,41 @@ def _rivals_of_places(data: Measurements) -> list[str]:
 
     Beside a field of levels for each station: what is alike about near rows says nothing of distances.
     """
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
-    known = np.isfinite(np.hstack([data.tx, data.rx_position])).all(axis=1) & (data.target[:, 0] > 0)
-    rows = np.flatnonzero(known & (data.censored_side(np.arange(len(data))) == 0))
-    if data.site.static_end is None or len(rows) < FEWEST["spectrum"]:
+    links, rows = LevelsAtPlaces.of(data)
+    known = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
+    if data.site.static_end is None or len(known) < FEWEST["spectrum"]:
         return []
-    rows = np.sort(np.random.default_rng(0).permutation(rows)[:ROWS])
-    data, station = data.subset(rows), station[rows]
-    level = 10 * np.log10(data.target[:, 0].astype(np.float64))
+    drawn = np.sort(np.random.default_rng(0).permutation(known)[:ROWS])
+    data, links = data.subset(rows[drawn]), links.take(drawn)
 
     def score(placed: Measurements, least: float = 10 * EXPONENTS[0]) -> float:
         distance = np.linalg.norm(placed.tx - placed.rx_position, axis=1)
         nearest = float(np.ptp(placed.moving[:, :3], axis=0).max()) / 300
-        field = fit_level_field(placed.moving, level, station, [np.log10(np.maximum(distance, nearest))])
+        away = np.log10(np.maximum(distance, nearest))
+        field = fit_level_field(placed.moving, links.level, links.station, [away])
         return field.score if least < -field.slope[0] < 10 * EXPONENTS[1] else -math.inf
 
     rivals = {name: score(convert_conventions(data, [name])) for name in _tried(data)}
     best, declared = max(rivals.values(), default=-math.inf), score(data, -math.inf)
     if not best - declared > CLEAR_PLACES:
         return []
-    return _mending(f"{len(rows)} powers drawn fall with distance a million times likelier", rivals)
+    return _mending(f"{len(drawn)} powers drawn fall with distance a million times likelier", rivals)
 
 
 def _groups(place: np.ndarray) -> np.ndarray:
     """Numbers (S,) of parts of the site, halved again and again along their longest side."""
     part = np.zeros(len(place), np.int64)
     for _ in range(HALVINGS):
-        for number in np.unique(part):
-            inside = np.flatnonzero(part == number)
+        for number, inside in rows_by(part):
             along = place[inside, np.ptp(place[inside], axis=0).argmax()]
             part[inside] = 2 * number + (along > np.median(along))
     return part
+
+
+def _of_most_groups(gain: np.ndarray, data: Measurements) -> float:
+    """Sum of gains (S,) of all groups but those that speak most for a rival."""
+    groups = rows_by(_groups(np.hstack([data.tx, data.rx_position])))
+    return float(np.sort([gain[rows].sum() for _, rows in groups])[:-DROPPED].sum())
 
 
 def _score(data: Measurements, labels: np.ndarray) -> Score:
@@ -272,14 +275,11 @@ def _decibels(data: Measurements) -> list[str]:
     if data.target.dtype.kind != "f" or values.max() < LEAST_DB:
         return []
     gains = np.array([_lobe(one.ravel(), grid.directions().numpy().reshape(-1, 3)) for one in values])
-    groups, gains = _groups(np.hstack([data.tx, data.rx_position])), np.nan_to_num(gains)
-    of_group = np.sort([gains[groups == group].sum() for group in np.unique(groups)])
-    if of_group[:-DROPPED].sum() < RATIO or np.median(gains) < LOBE:
+    gains = np.nan_to_num(gains)
+    if _of_most_groups(gains, data) < RATIO or np.median(gains) < LOBE:
         return []
-    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g},"
-    return [
-        f"{how} fit a beam more than 1,000 times better as decibels: dataset.decibels=true makes them linear"
-    ]
+    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam"
+    return [f"{how} more than 1,000 times better as decibels: dataset.decibels=true makes them linear"]
 
 
 def _lobe(values: np.ndarray, directions: np.ndarray) -> float:

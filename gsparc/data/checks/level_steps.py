@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsparc.data.blocks import evenly_spaced
 from gsparc.processes.level_field import NUGGETS, fit_level_field
 
 MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
@@ -65,7 +66,7 @@ def detect_level_steps(
     if station_position is not None:
         distance = np.linalg.norm(places - np.asarray(station_position)[: places.shape[1]], axis=1)
         mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
-    some = np.unique(np.linspace(0, len(level) - 1, LIKELIHOOD_BLOCKS).astype(int))
+    some = evenly_spaced(len(level), LIKELIHOOD_BLOCKS)
     # Medians of rows hold less noise than rows do.
     of_some = places[some], level[some], np.zeros(len(some)), [one[some] for one in mean]
     field = fit_level_field(*of_some, nuggets=NUGGETS[:-1])

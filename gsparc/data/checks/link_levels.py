@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import FROM_ROW
 
@@ -41,8 +42,7 @@ class LinkLevels:
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each station, and its rows (k,) with a value."""
-        for t in np.unique(self.station):
-            yield int(t), np.flatnonzero((self.station == t) & np.isfinite(self.level_db))
+        yield from ((t, own[np.isfinite(self.level_db[own])]) for t, own in rows_by(self.station))
 
 
 def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkLevels | None:

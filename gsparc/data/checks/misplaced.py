@@ -38,21 +38,16 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     strong = [levels.position[rows[: len(rows) // STRONG]].mean(axis=0) for rows in heard.values()]
     shift = np.median(strong - where[[*heard]], axis=0) * [1, 1, 0] if heard else np.zeros(3)
     shifts = shift * np.array(SHARES)[:, None]
-    gains, thousandfold, shifted = (
-        np.full((len(where),) * 2, -np.inf),
-        where * [1e3, 1e3, 1],
-        np.zeros(len(SHARES)),
-    )
+    gains, shifted = np.full((len(where),) * 2, -np.inf), np.zeros(len(SHARES))
     names, kilometres = [levels.names[t] for t in first], list[str]()
     for one, rows in heard.items():
         some = np.random.default_rng(0).permutation(rows)[:MOST]
-        places = np.vstack([where[one], thousandfold[one], where[one] + shifts, where[known]])
+        places = np.vstack([where[one], where[one] * [1e3, 1e3, 1], where[one] + shifts, where[known]])
         gain = _gains(levels.position[some], levels.level_db[some], places)
         kilometres += [names[one]] * bool(gain[0] > LIKELY)
         shifted += np.maximum(gain[1 : 1 + len(SHARES)], -LIKELY)
-        gains[one, known] = gain[1 + len(SHARES) :] - math.log(
-            len(where)
-        )  # each that is tried may fit by chance
+        # Each that is tried may fit by chance.
+        gains[one, known] = gain[1 + len(SHARES) :] - math.log(len(where))
     gains[np.diag_indices(len(where))] = 0
     who = list_first(kilometres)
     said = f"levels of {who} fall with distance from a place a thousand times as far: is it in kilometres?"
@@ -60,9 +55,8 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     warnings, moved = [said] * bool(kilometres), np.flatnonzero(stated != likely)
     exchanged = gains[stated, likely].sum()
     if shifted.max() > max(CLEAR, exchanged) and len(heard) >= FEW:
-        said = "fall with distance from places ({:+.0f}, {:+.0f}) m beside the stated ones".format(
-            *shifts[shifted.argmax()]
-        )
+        x, y, _ = shifts[shifted.argmax()]
+        said = f"fall with distance from places ({x:+.0f}, {y:+.0f}) m beside the stated ones"
         warnings.append(f"levels of all {len(heard)} sites {said}: is their list about another origin?")
     elif len(moved) >= FEW and exchanged > CLEAR:
         pairs = list_first([f"{names[i]} from that of {names[likely[i]]}" for i in moved])

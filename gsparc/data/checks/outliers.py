@@ -86,11 +86,9 @@ def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
 
 def outlier_warnings(data: Measurements) -> list[str]:
     """Say each kind of outlier in one sentence, with the names of the first rows."""
-    names = {
-        what: list_first([data.row_names[i] for i in rows]) for what, rows in find_outliers(data).items()
-    }
     advice = "if they are wrong, leave them out with split.leave_out=outliers"
-    return [f"{who}: {what}; {advice}" for what, who in names.items()]
+    found = find_outliers(data).items()
+    return [f"{list_first([data.row_names[i] for i in rows])}: {what}; {advice}" for what, rows in found]
 
 
 WIDTHS = 30.0  # of the rows' box
@@ -129,16 +127,14 @@ def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeferenc
         hint = f"are {axes} swapped?" if swapped else "are both in one system and unit?"
         fault = f"a static end {distance[far] / 1e3:.4g} km from all rows, which reach over {width:.4g} m"
         return f"{fault}; {hint}", swapped or bool(distance[far] > TOO_DISTANT_M)
-    below, above = float(low[2] - still[:, 2].min()), float(still[:, 2].max() - high[2])
+    lowest = float(still[:, 2].min())
+    below, above = float(low[2]) - lowest, float(still[:, 2].max() - high[2])
     if max(below, above) > APART_M:
         side = "below" if below > above else "above"
         fault = f"a static end {max(below, above):.4g} m {side} all rows"
         return f"{fault}: heights above the sea beside heights above the ground?", False
     if 0 < np.abs(still[:, 2]).max() < LOW_M < low[2]:
         return f"static ends at heights of {np.abs(still[:, 2]).max():.2g} m at most: in kilometres?", False
-    if below > BENEATH_M and still[:, 2].min() < 0 <= low[2]:
-        return (
-            f"a static end at a height of {still[:, 2].min():.4g} m, below 0 and all rows: its sign?",
-            False,
-        )
+    if below > BENEATH_M and lowest < 0 <= low[2]:
+        return f"a static end at a height of {lowest:.4g} m, below 0 and all rows: its sign?", False
     return "", False

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
 
+from gsparc.data.blocks import rows_by
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.data.checks.link_levels import UNNAMED, LinkLevels
 from gsparc.data.checks.misplaced import misplaced_warnings
@@ -96,10 +97,8 @@ def two_unit_warnings(levels: LinkLevels) -> list[str]:
     far, between = int((rows > APART_DB).sum()), int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum())
     if far <= max(REPEATS, FEW_APART * len(rows), between):
         return []
-    said = (
-        f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row, {between} over"
-    )
-    return [f"{said} {APART_DB / 2:g}: in two units?"]
+    said = f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row"
+    return [f"{said}, {between} over {APART_DB / 2:g}: in two units?"]
 
 
 def floor_warnings(levels: LinkLevels) -> list[str]:
@@ -281,14 +280,12 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
 def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Return stations and their steps, which name rows of `levels`."""
     steps = []
-    stations = np.unique(levels.station)
-    blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
-    for t in stations:
-        used = np.flatnonzero(levels.station == t)
+    blocks = int(np.clip(20 * MOST_BLOCKS / max(len(np.unique(levels.station)), 1), 200, MOST_BLOCKS))
+    for t, used in rows_by(levels.station):
         where = None if levels.station_position is None else levels.station_position[t]
         where = where if where is not None and np.isfinite(where).all() else None
         for step in detect_level_steps(levels.position[used], levels.level_db[used], where, blocks):
-            steps.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
+            steps.append((t, replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return steps
 
 
@@ -301,8 +298,8 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
     names, rows, warnings = levels.names, levels.rows, list[str]()
     outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)  # by first row, last row, length
     silent, faint, plain = list[str](), dict[str, int](), dict[str, int]()  # how many, by station
-    for t in np.unique(levels.station):
-        used, name = np.flatnonzero(levels.station == t), str(names[t])
+    for t, used in rows_by(levels.station):
+        name = str(names[t])
         level = levels.level_db[used]
         missing = ~np.isfinite(level)
         if missing.all() or not missing.any():

@@ -20,7 +20,6 @@ HERTZ = 3e6, 1e12  # of carriers that links are measured at
 def unit_warnings(data: Measurements) -> list[str]:
     """Warn of readable but implausible values: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position]) + data.site.origin
-    hints = []
     if not np.ptp(data.moving, axis=0).any():
         hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
     elif site.georeference is not None:  # degrees became metres: no unit to mistake

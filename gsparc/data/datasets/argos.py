@@ -133,10 +133,8 @@ def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndar
     key = f"base_station_{count}" if f"base_station_{count}" in description else "base_station"
     places = finite_array(description.get(key))
     if places.shape != (count, 3):
-        raise DataError(
-            f"{root / 'base-station.yml'}: {key} has shape {places.shape}; expected {count} x 3 metres, "
-            "one antenna per line"
-        )
+        fault = f"{key} has shape {places.shape}; expected {count} x 3 metres, one antenna per line"
+        raise DataError(f"{root / 'base-station.yml'}: {fault}")
     return places
 
 

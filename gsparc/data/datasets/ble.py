@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text
+from gsparc.data.limits import parse_numbers
 from gsparc.data.raw import Raw
 
 CARRIER_HZ = 2.44e9  # the middle of the three frequencies that beacons use in turns
@@ -47,7 +48,7 @@ def _of_release(root: Path, hall: int) -> Raw:
         name, _, place = file.stem.partition("_")
         if name not in sensors:
             problems.add(file, f"no sensor of cnf/tetam.dev is called {name!r}")
-        elif len(_numbers(place.split("_"))) != 3:
+        elif len(parse_numbers(place.split("_"))) != 3:
             problems.add(file, "expected a name like sensor10_X_Y_Z.mbd with a place in metres")
         elif (mean := problems.attempt(lambda file=file: read_mean_level(file))) is not None:  # type: ignore[misc]
             levels[name, place] = mean
@@ -85,19 +86,10 @@ def read_mean_level(path: Path) -> float:
     DataError where a line is no packet.
     """
     lines = read_text(path, "missing").splitlines()
-    levels = _numbers([line.rpartition(",")[2] for line in lines])
+    levels = parse_numbers([line.rpartition(",")[2] for line in lines])
     if not lines or len(levels) != len(lines) or any(line.count(",") != 3 for line in lines):
         raise DataError(f"{path}: expected lines of time, sensor, beacon and dBm")
     return float(levels.mean())
-
-
-def _numbers(words: list[str]) -> np.ndarray:
-    """Words as numbers; (0,) where one is none."""
-    try:
-        numbers = np.array(words, np.float64)
-    except ValueError:
-        return np.zeros(0)
-    return numbers if np.isfinite(numbers).all() else np.zeros(0)
 
 
 class BLE(Campaign):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -205,9 +206,7 @@ def _read_index(path: Path, count: int | None, problems: Problems, first: int) -
     """Rows (n,) from 0, sorted."""
     lines = (problems.attempt(lambda: read_text(path, "missing")) or "").split("\n")
     words = [(n, word.removesuffix(".png")) for n, line in enumerate(lines, 1) for word in line.split()]
-    plain = [
-        word if word.isascii() and word.isdigit() and len(word) <= LONGEST else "-1" for _, word in words
-    ]
+    plain = [word if re.fullmatch(f"[0-9]{{1,{LONGEST}}}", word) else "-1" for _, word in words]
     rows = np.array(plain, np.int64) - first
     wrong = (rows < 0) | (rows >= (np.inf if count is None else count))
     again = ~np.isin(np.arange(len(rows)), np.unique(rows, return_index=True)[1]) & ~wrong

@@ -97,9 +97,8 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         numbers[NUMBERS[name]] = np.broadcast_to(checked[name], count).astype(np.int64)
     names = checked.get("access_point", np.arange(level.shape[1])).astype(str)
     if len(np.unique(names)) < len(names):
-        raise DataError(
-            f"{path}, access_point: a name twice in {list_first(list(names))}; expected each once"
-        )
+        twice = f"a name twice in {list_first(list(names))}"
+        raise DataError(f"{path}, access_point: {twice}; expected each once")
     return Fingerprints(
         level=level, position=np.pad(position, ((0, 0), (0, 3 - dimensions))), **numbers,
         test=checked.get("test", np.zeros(count)).astype(bool),

@@ -30,7 +30,7 @@ NO_VALUE_DB = -101.0
 # Above ground: a radio in a hand; a wall or mast, which the release does not say.
 WALKER_M, STATION_M = 1.5, 10.0
 STATIONS = "location_coordinates.json"
-LATITUDE, LONGITUDE, TIME = "tx_x_coord", "tx_y_coord", "timestamp"
+PLACE, TIME = {"tx_latitude": "tx_x_coord", "tx_longitude": "tx_y_coord"}, "timestamp"
 
 
 def read_powder(
@@ -60,7 +60,7 @@ def read_powder(
     for name, height in (("tx_height", tx_height), ("station_height", station_height)):
         number(-np.inf).check(f"dataset.{name}", height)
     if path.suffix.lower() == ".csv":
-        raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
+        raw = _of_csv(path, Path(station_table or path.with_name(STATIONS)))
     else:
         raw = _of_npz(path)
     heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
@@ -89,23 +89,21 @@ def _of_csv(path: Path, table: Path) -> Raw:
     from gsparc.data.tables.opening import read_sheet
     from gsparc.data.tables.places import read_places
 
-    (sheet, _), stations = read_sheet(path), read_station_places(table)
-    missing = [head for head in (LATITUDE, LONGITUDE) if head not in sheet.heads]
+    sheet, stations = read_sheet(path), read_station_places(table)
+    missing = [head for head in PLACE.values() if head not in sheet.heads]
     if missing:
         raise DataError(f"{path}, line 1: no column {' and '.join(missing)}; expected those of single_tx.csv")
-    chosen: dict[str, tuple[Column, ...]] = {
-        "tx_latitude": (Column("tx_latitude", head=LATITUDE),),
-        "tx_longitude": (Column("tx_longitude", head=LONGITUDE),),
-    }
+
     columns = [head for head in sheet.heads if head in stations]
     if not columns:
         example = next(iter(stations), "none")
         raise DataError(f"{path}, line 1: no column is a station of {table}, e.g. {example}")
-    walk, levels = read_places(sheet, chosen, "tx_"), [sheet.numbers(name) for name in columns]
+    walk = read_places(sheet, {role: (Column(role, head=head),) for role, head in PLACE.items()}, "tx_")
+    levels = [sheet.numbers(name) for name in columns]
     sheet.problems.raise_if_any()
     assert walk is not None
     rssi = np.stack([level for level in levels if level is not None], axis=1)
-    rest = [head for head in sheet.heads if head not in (*columns, LATITUDE, LONGITUDE, TIME)]
+    rest = [head for head in sheet.heads if head not in (*columns, *PLACE.values(), TIME)]
     notes = (shorten(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}"),) if rest else ()
     where = np.array([stations[name] for name in columns])
     arrays = {

@@ -32,7 +32,7 @@ from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.campaign import Release, read_split
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_text, read_yaml
-from gsparc.data.limits import finite_array
+from gsparc.data.limits import finite_array, parse_numbers
 from gsparc.data.links.stations import number_places
 from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
 from gsparc.data.schema import LIGHT, End, Measurements, Site, Stations, TrainTest
@@ -89,9 +89,8 @@ def load_rfid(
     count = None if positions is None else len(positions)
     spectra = _read_spectra(root / "spectrum", f"{moving}_pos.csv", count, problems)
     if moving == "rx" and (root / "freq.txt").exists():
-        problems.add(
-            root / "freq.txt", "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
-        )
+        said = "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
+        problems.add(root / "freq.txt", said)
     carriers = _read_carriers(root / "freq.txt", f"{moving}_pos.csv", count, problems)
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
@@ -148,9 +147,8 @@ def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, 
         return np.zeros(0, np.int64), None
     part = sheet.words("split")
     wrong = np.flatnonzero(~(np.isin(number, np.arange(1, count + 1)) & np.isin(part, SPLITS)))
-    sheet.refuse_rows(
-        "spectrum", wrong, f"expected the number of a spectrum, 1 to {count}, and train or test"
-    )
+    expected = f"expected the number of a spectrum, 1 to {count}, and train or test"
+    sheet.refuse_rows("spectrum", wrong, expected)
     return number.astype(np.int64) - 1, (np.flatnonzero(part == "train"), np.flatnonzero(part == "test"))
 
 
@@ -158,7 +156,7 @@ def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
     """A table of these columns; `DataError` where it is none, or has others."""
     from gsparc.data.tables.opening import read_sheet  # here, as pandas takes half a second to import
 
-    sheet, _ = read_sheet(path, problems)
+    sheet = read_sheet(path, problems)
     sheet = replace(sheet, frame=sheet.frame.rename(columns=str.lower))
     if sorted(sheet.heads) != sorted(heads):
         found = ",".join(sheet.heads)
@@ -216,10 +214,7 @@ def _read_carriers(path: Path, positions: str, count: int | None, problems: Prob
     if not path.exists() or count is None:
         return None
     words = (problems.attempt(lambda: read_text(path, "missing")) or "").split()
-    try:
-        carriers = 1e9 * np.array(words, np.float64)
-    except ValueError:
-        carriers = np.zeros(0)
+    carriers = 1e9 * parse_numbers(words)
     if carriers.shape != (count,) or not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
         expected = f"expected the carrier of each of the {count} rows of {positions} [GHz], one number a line"
         return problems.add(path, f"{len(words)} words; {expected}")

@@ -46,9 +46,8 @@ def with_true_targets(data: Measurements, truth: Measurements, named: str) -> Me
     splits = (data.release_split, truth.release_split)
     same = data.target.shape == truth.target.shape and data.target.dtype == truth.target.dtype
     if not same or not np.allclose(data.rx_position, truth.rx_position, atol=1e-6):
-        raise DataError(
-            f"{named}: not the receivers or targets of dataset.file; simulate both with one scene"
-        )
+        other = "not the receivers or targets of dataset.file"
+        raise DataError(f"{named}: {other}; simulate both with one scene")
     if splits[0] is None or splits[1] is None or not np.array_equal(splits[0][1], splits[1][1]):
         raise DataError(f"{named}: both files must name the same test rows (scene.test_share)")
     test, target = splits[0][1], data.target.copy()

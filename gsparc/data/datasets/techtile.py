@@ -67,9 +67,7 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
     hosts = variables["hostname"].astype(str)
     places = variables.get("rx_antenna_position")
     if places is None:
-        places = read_antenna_positions(
-            path.with_name(ANTENNAS) if antennas is None else Path(antennas), hosts
-        )
+        places = read_antenna_positions(Path(antennas or path.with_name(ANTENNAS)), hosts)
     # Stored is reference minus received phase: the conjugate of a channel that follows exp(-j k d).
     csi = variables["csi_real"].astype(np.float64) - 1j * variables["csi_imag"].astype(np.float64)
     heard = np.isfinite(csi) & (variables.get("csi_available", np.ones(csi.shape)) == 1)
@@ -122,9 +120,8 @@ def read_antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
 def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
     channels: Any = entry.get("channels")
     try:
-        place = finite_array(
-            [channels[CHANNEL][axis] for axis in "xyz"]
-        )  # of a list, or of a table with numbers
+        # Of a list, or of a table with numbers.
+        place = finite_array([channels[CHANNEL][axis] for axis in "xyz"])
     except (TypeError, KeyError, IndexError):
         place = np.zeros(0)
     if not len(place):

@@ -76,14 +76,12 @@ def read_wifi_csi(
     carrier = carrier_hz or logs[0].carrier_hz
     if carrier is None:
         raise DataError(f"{path}: neither it nor the places name the channel; say dataset.carrier_hz")
-    time, sender, csi, rssi, position = (
-        np.concatenate([getattr(one, name) for one in logs])
-        for name in ("time_s", "sender", "csi", "rssi_dbm", "position")
-    )
-    heard = (csi != 0).any(axis=(1, 2))  # a packet of zeros has no level in dB
+    of_packets = ("time_s", "sender", "csi", "rssi_dbm", "position")
+    joined = [np.concatenate([getattr(one, name) for one in logs]) for name in of_packets]
+    heard = (joined[2] != 0).any(axis=(1, 2))  # a packet of zeros has no level in dB
     if not heard.all():
         log.warning("%s: %d packets whose channels are zero are left out", path, (~heard).sum())
-        time, sender, csi, rssi, position = (one[heard] for one in (time, sender, csi, rssi, position))
+    time, sender, csi, rssi, position = (one[heard] for one in joined)
     tone, csi = _filled(logs[0].tone, csi, path)
     csi, unit = _levelled(csi, rssi, path)
     names, station = np.unique(sender, return_inverse=True)

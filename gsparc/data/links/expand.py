@@ -26,9 +26,8 @@ from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import MEASUREMENTS, OTHER, Links, Stations
 from gsparc.data.selection import Selection, select, take_rows
 
-STATION_FIELDS = (
-    *("station", "station_position", "station_name", "station_label", "station_orientation", *SECTOR),
-)
+_OF_STATIONS = ("position", "name", "label", "orientation")
+STATION_FIELDS = ("station", *(f"station_{name}" for name in _OF_STATIONS), *SECTOR)
 
 
 def expand_links(check: Checker, measured: str, part: Selection) -> Links | None:
@@ -146,9 +145,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
                 check.notes.append(f"{name}: {said}")
     for name in STATION_FIELDS[1:]:
         check.raw.arrays.pop(name, None)
-    stations = split_by_carrier(
-        check, _selected(check, measured, stations, part) or stations, measured in POWERS
-    )
+    stations = _selected(check, measured, stations, part) or stations
+    stations = split_by_carrier(check, stations, measured in POWERS)
     if measured == "rssi_db":
         forget_unknown(check, ends[0])  # before lists are looked for, in which they would be strong
     absent = check.raw.attributes.get("absent", "auto")

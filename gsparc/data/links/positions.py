@@ -88,20 +88,15 @@ def _heights(check: Checker) -> bool:
     for end in ("rx", "tx", "station"):
         name, height = f"{end}_position", f"{end}_height"
         flat = name in arrays and arrays[name].shape[-1] == 2
-        if not flat:
-            if height in arrays:
-                check.refuse(height, f"given, but {name} has three coordinates or is missing")
-            continue
-        if height not in arrays:
+        if height in arrays and not flat:
+            check.refuse(height, f"given, but {name} has three coordinates or is missing")
+        elif height not in arrays and flat:
             check.refuse(name, f"two coordinates; expected three, or the height above ground as {height} [m]")
-            continue
-        above = check.read_real(height, (), (len(arrays[name]),) if arrays[name].ndim == 2 else ())
-        if above is None:
-            continue
-        place = arrays[name].astype(np.float64)
-        column = np.broadcast_to(above, place.shape[:-1])[..., None]
-        arrays[name] = np.concatenate([place, column], axis=-1)
-        arrays.pop(height)
+        elif flat and (above := check.read_real(height, (), arrays[name].shape[:-1])) is not None:
+            place = arrays[name].astype(np.float64)
+            column = np.broadcast_to(above, place.shape[:-1])[..., None]
+            arrays[name] = np.concatenate([place, column], axis=-1)
+            arrays.pop(height)
     return len(check.problems) == before
 
 

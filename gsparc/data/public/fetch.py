@@ -146,12 +146,10 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
     Raises:
         DataError: unknown, fetched by hand only, not accepted, no network, a wrong file, or no room.
     """
-    known = public_sets()
-    if name not in known:
-        raise DataError(
-            f"no public set is called {name!r}{suggest_name(name, known)}; `gsparc data` lists them"
-        )
-    wanted = known[name]
+    wanted = public_sets().get(name)
+    if wanted is None:
+        hint = suggest_name(name, public_sets())
+        raise DataError(f"no public set is called {name!r}{hint}; `gsparc data` lists them")
     if not wanted.sources and wanted.hub is None:
         raise DataError(f"{name} is not fetched by this program; get it from {wanted.by_hand}")
     if wanted.sources and all(_is_right(path, source) for path, source in wanted.files().items()):

@@ -6,10 +6,9 @@ import json
 import logging
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 from gsparc.data.errors import DataError, explain_error
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_whole
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +36,7 @@ def fetch_from_hub(repository: str, part: str, folder: Path) -> Path:
         what = f"{size:,} bytes, SHA-256 {found}, are not those of the first fetch ({first['sha256']})"
         raise DataError(f"{place}: {what}; delete {folder} and fetch again")
     log.info("%s at %s: %s bytes, SHA-256 %s", repository, first["revision"][:10], f"{size:,}", found)
-    _write(facts, {**first, "bytes": size, "sha256": found})
+    write_whole(facts, json.dumps({**first, "bytes": size, "sha256": found}) + "\n")
     return place
 
 
@@ -54,7 +53,7 @@ def _download(repository: str, part: str, folder: Path, revision: str | None, fa
         if not sizes or about.sha is None:
             raise DataError(f"{repository} has no folder {part} any more; what it has is listed at the hub")
         log.info("%s: %s files, %.0f MB", repository, f"{len(sizes):,}", sum(sizes) / 1e6)
-        _write(facts, {"revision": about.sha})
+        write_whole(facts, json.dumps({"revision": about.sha}) + "\n")
         snapshot_download(
             repository,
             repo_type="dataset",
@@ -66,11 +65,6 @@ def _download(repository: str, part: str, folder: Path, revision: str | None, fa
         why = f"{explain_error(error)}; what is there is kept: say it again"
         raise DataError(f"{repository}: {why}") from None
     return about.sha
-
-
-def _write(facts: Path, content: dict[str, Any]) -> None:
-    with whole_file(facts) as partial:
-        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 def _sum_of(folder: Path) -> tuple[int, str]:

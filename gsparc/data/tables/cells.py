@@ -21,15 +21,13 @@ LIST = re.compile(r"\s*\[(.+)\]\s*", re.DOTALL)
 PLACES = LISTS["place"] | LISTS["vector"] | set(AXIS_WORDS)
 LOGGED = "CSI_DATA"  # begins the rows of an ESP32, whose lists hold imaginary parts before real ones
 NUMBER = r"[-+]?\d*\.?\d+(?:e[-+]?\d+)?"
-PAIR = re.compile(rf"(?i)\s*[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?\s*")
-POINT = re.compile(
-    rf"(?i)\s*(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)\s*"
-)
+PAIR = re.compile(rf"(?i)[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?")
+POINT = re.compile(rf"(?i)(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)")
 FINE = re.compile(r"\.\d{4}")  # digits of degrees that tell streets apart
 
 
-def unfold_cells(sheet: Sheet) -> tuple[Sheet, list[str]]:
-    """Return lists of one length as NAME_1, ..., complex numbers as csi_re_1, ..., named ones, and a note."""
+def unfold_cells(sheet: Sheet) -> Sheet:
+    """Return lists of one length as NAME_1, ..., complex numbers as csi_re_1, ..., and named ones; noted."""
     logged = bool((sheet.frame.iloc[:, :1] == LOGGED).all(axis=None))
     parts: list[pd.DataFrame] = []
     unfolded: list[str] = []
@@ -53,8 +51,9 @@ def unfold_cells(sheet: Sheet) -> tuple[Sheet, list[str]]:
         unfolded.append(head)
     frame = pd.concat(parts, axis=1) if unfolded else sheet.frame
     if not unfolded or frame.columns.has_duplicates:
-        return sheet, []
-    return replace(sheet, frame=frame), [f"a column for each number of a cell: {list_first(unfolded, 3)}"]
+        return sheet
+    sheet.notes.append(f"a column for each number of a cell: {list_first(unfolded, 3)}")
+    return replace(sheet, frame=frame)
 
 
 def _records(sheet: Sheet, head: str) -> pd.DataFrame | None:

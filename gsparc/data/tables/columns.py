@@ -17,8 +17,7 @@ from gsparc.data.tables.heads import CHANNELS, ENDS, KINDS, LISTS, POLAR, Head, 
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.units import SCHEMA, UNITS, Unit, list_units
 
-LEVELS = ("rssi_db", "rssi")
-MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in LEVELS), CHANNELS, POLAR)
+MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)
 # Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
 ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
 LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
@@ -50,6 +49,16 @@ class Column(Head):
     def by_row(self) -> bool:
         """Whether it is the number of the row."""
         return self.head is None and not self.value
+
+    @property
+    def schema_unit(self) -> str:
+        """Unit of its values once they are read."""
+        unit, own = SCHEMA.get(KINDS[self.role], "deg"), self.unit
+        if (own is None or not own.name) and "rsrp" in words_of(self.head or ""):
+            return unit  # dBm by definition (3GPP TS 36.214)
+        # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
+        relative = own is None or (own.name != "dBm" and (own.times or not own.changes))
+        return "dB" if unit == "dBm" and relative else unit
 
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
         """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
@@ -84,8 +93,8 @@ def choose_columns(
     settings: Mapping[str, object],
     labelled: Mapping[str, str] = {},
     only: Container[str] | None = None,
-) -> tuple[Chosen, list[str]]:
-    """Choose the columns of each quantity, with a note for each that was guessed.
+) -> Chosen:
+    """Choose the columns of each quantity; what was guessed is noted.
 
     Args:
         sheet: the table.
@@ -100,7 +109,7 @@ def choose_columns(
             # Settings come first: what is said needs no guess, and its column is not guessed again.
             chosen[columns[0].role] = columns
     if sheet.problems:
-        return chosen, []
+        return chosen
     said = used_heads(chosen)
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
@@ -121,7 +130,6 @@ def choose_columns(
         guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
     # First of all, as a second measurement is no second candidate for the first one.
     _one_way(sheet, guesses)
-    notes = []
     for role, found in guesses.items():
         # Columns whose head says less than others of the quantity count only where there is nothing better.
         candidates = [column for column in found if not column.less] or found
@@ -140,29 +148,28 @@ def choose_columns(
             _ambiguous(sheet, role, candidates)
             continue
         # `rssi_delta` or `predicted_rssi` are levels by their words and not what was received.
-        if role in LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled.values()):
+        if role in heads.LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled.values()):
             fault = "a received level or power, or something else? if it is one, say "
             sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
             continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact or several:
-            notes.append(_note(chosen[role]))
+            sheet.notes.append(_note(chosen[role]))
     for column in (columns[0] for columns in chosen.values()):
         if not column.word and column.unit is not None and column.unit.changes:
-            notes.append(_turned(column, column.unit))
+            sheet.notes.append(_turned(column, column.unit))
     _one_unit(sheet, chosen)
     # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
-        notes += _wide_survey(sheet, chosen)
+        _wide_survey(sheet, chosen)
     used = used_heads(chosen)
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
         timed = heads.SHEET["times"] * any(LISTS["time"] & set(words_of(head)) for head in unused)
-        notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
-    return chosen, [
-        *notes,
-        *(() if only is not None else _more_levels(sheet, chosen.get("rssi_db", ()), used)),
-    ]
+        sheet.notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
+    if only is None:
+        _warn_of_levels(sheet, chosen.get("rssi_db", ()), used)
+    return chosen
 
 
 def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
@@ -200,17 +207,16 @@ MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f]
 NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
 
 
-def _wide_survey(sheet: Sheet, chosen: Chosen) -> list[str]:
-    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels; the notes."""
+def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
+    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels."""
     used = used_heads(chosen)
     rest = [head for head in sheet.heads if head not in used]
     named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
     alike = named or [head for head in rest if _may_be_levels(sheet, head)]
-    if not alike or "station" in chosen:
-        return []
-    chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
-    note = _note(chosen["rssi_db"])
-    return [note if named else Caution(f"{note}: by their values, as no head says so")]
+    if alike and "station" not in chosen:
+        chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
+        note = _note(chosen["rssi_db"])
+        sheet.notes.append(note if named else Caution(f"{note}: by their values, as no head says so"))
 
 
 def _may_be_levels(sheet: Sheet, head: str) -> bool:
@@ -225,18 +231,18 @@ def _may_be_levels(sheet: Sheet, head: str) -> bool:
 BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
 
 
-def _more_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> list[str]:
+def _warn_of_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> None:
     """Warn of columns that are not used, with values like those of several `columns` of levels."""
     if len(columns) < 2:
-        return []
+        return
     rest = [h for h in sheet.heads if h not in used and not LISTS["no_level"] & set(words_of(h))]
     numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
     levels = numbers[[column.head for column in columns]].stack()
     low, high = levels.min(), min(levels.max(), 0)
     alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
-    said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and " if alike else ""
-    advice = f"are not used: of stations, too? call them as {columns[0].head!r} is called"
-    return [Caution(said + advice)] if alike else []
+    if alike:
+        said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
+        sheet.notes.append(Caution(f"{said}of stations, too? call them as {columns[0].head!r} is called"))
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
@@ -279,15 +285,11 @@ def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
     """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`, `rssi-tx_power`."""
     for cut in [len(text), *(found.start() for found in re.finditer(r"[-+]", text))]:
         times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text[:cut].strip())
-        factor = times[2] if times else ""
         head = _head(sheet, times[1].strip() if times else text[:cut].strip()) if cut else None
         if head is None:
             continue
-        unit, rest = _unit(head, role), text[cut + 1 :].strip()
-        if times:
-            unit = unit or Unit("", KINDS[role])
-            unit = replace(unit, times=factor, factor=unit.factor * float(factor))
-        column = Column(role, unit=unit, head=head)
+        column, rest = Column(role, unit=_unit(head, role), head=head), text[cut + 1 :].strip()
+        column = _times(column, times[2]) if times else column
         if cut == len(text):
             return column
         if re.fullmatch(r"\d*\.?\d+", rest):
@@ -295,16 +297,16 @@ def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
         more = _sum_of_columns(sheet, role, rest)
         if more is not None:
             first = replace(more, plus=())
-            return replace(column, plus=(_signed(first, text[cut]), *more.plus))
+            first = _times(first, "-1") if text[cut] == "-" else first
+            return replace(column, plus=(first, *more.plus))
     return None
 
 
-def _signed(column: Column, sign: str) -> Column:
-    """The same, taken off where the sign says so."""
-    if sign == "+":
-        return column
+def _times(column: Column, factor: str) -> Column:
+    """The same times a number, or, where it already is, times -1."""
     unit = column.unit or Unit("", KINDS[column.role])
-    return replace(column, unit=replace(unit, times=f"-{unit.times or 1}", factor=-unit.factor))
+    said = f"-{unit.times}" if unit.times else factor
+    return replace(column, unit=replace(unit, times=said, factor=unit.factor * float(factor)))
 
 
 def _head(sheet: Sheet, text: str) -> str | None:
@@ -381,13 +383,9 @@ def say_column(role: str, text: str) -> str:
     >>> print(say_column("rssi_db", "RSRP*-1"), say_column("station", "Cell id"))
     dataset.columns.rssi_db=RSRP*-1 'dataset.columns.station="Cell id"'
     """
-    plain, name = re.fullmatch(r"[\w.*+-]+", text), setting_name(role)
+    name = role.replace("latitude", "lat").replace("longitude", "lon")
+    plain = re.fullmatch(r"[\w.*+-]+", text)
     return f"dataset.columns.{name}={text}" if plain else f"'dataset.columns.{name}=\"{text}\"'"
-
-
-def setting_name(role: str) -> str:
-    """Return what `dataset.columns` calls a quantity."""
-    return role.replace("latitude", "lat").replace("longitude", "lon")
 
 
 def _choice(column: Column) -> str:
@@ -395,7 +393,7 @@ def _choice(column: Column) -> str:
 
 
 def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
-    stations = role in LEVELS and all(c.label for c in columns)
+    stations = role in heads.LEVELS and all(c.label for c in columns)
     more = f", or dataset.columns.{role}='NAME_*' where they are stations" if stations else ""
     sheet.refuse(f"{_names(columns)} could each be {role}; say which: {_choice(columns[0])}{more}")
 
@@ -411,7 +409,7 @@ def _names(columns: Iterable[Column]) -> str:
 def _note(columns: tuple[Column, ...]) -> str:
     first = columns[0]
     kind = KINDS[first.role]
-    unit = f" [{schema_unit(first)}]" if kind in SCHEMA else ""
+    unit = f" [{first.schema_unit}]" if kind in SCHEMA else ""
     what = f"{_names(columns)} taken as {first.role}{unit}"
     if first.label == JOINED:
         return f"{what}: their values together name one"
@@ -421,12 +419,12 @@ def _note(columns: tuple[Column, ...]) -> str:
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
         what += "; if they are dBm: unit=dBm of map" if unit == " [dB]" else ""
     turned = first.unit is not None and first.unit.changes
-    return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
+    return what + (f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else "")
 
 
 def _turned(column: Column, unit: Unit) -> str:
     """What becomes of a column that a setting chose; with a caution where its unit is counted twice."""
-    factor, bare, wanted = unit.times, unit.name, schema_unit(column)
+    factor, bare, wanted = unit.times, unit.name, column.schema_unit
     if not factor:
         return f"column {column.head!r}: {bare} turned into {wanted}"
     then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
@@ -435,16 +433,6 @@ def _turned(column: Column, unit: Unit) -> str:
     if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
         return Caution(f"{said}; twice? {_choice(column)} turns {bare} alone")
     return said
-
-
-def schema_unit(column: Column) -> str:
-    """Return the unit of the column's values once they are read."""
-    unit, own = SCHEMA.get(KINDS[column.role], "deg"), column.unit
-    if (own is None or not own.name) and "rsrp" in heads.words_of(column.head or ""):
-        return unit  # dBm by definition (3GPP TS 36.214)
-    # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
-    relative = own is None or (own.name != "dBm" and (own.times or not own.changes))
-    return "dB" if unit == "dBm" and relative else unit
 
 
 def rename_for_stations(column: Column) -> Column:

@@ -20,9 +20,8 @@ PERCENT = (
 # Quantities a column can hold: of an end (the moving one when it is not named), and of a row.
 ENDS = ("", "rx_", "tx_", "station_")
 AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longitude": "angle"}
-CHANNELS, POLAR = ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
-# May be several columns: stations, or frequencies.
-MANY = ("rssi_db", "rssi", "csi_re", "csi_im", "csi_amp", "csi_phase")
+LEVELS, CHANNELS, POLAR = ("rssi_db", "rssi"), ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
+MANY = (*LEVELS, *CHANNELS, *POLAR)  # may be several columns: stations, or frequencies
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
@@ -85,7 +84,7 @@ def station_in_head(text: str) -> str:
     ['101', '101', '101', '']
     """
     head = parse_head(text)
-    if head.role in ("rssi_db", "rssi"):
+    if head.role in LEVELS:
         return head.label
     return re.sub(rf"(?i)^[\W_]*(?:{'|'.join(STATION_WORDS)})[\W_]+", "", unit_of(text)[0]).strip()
 

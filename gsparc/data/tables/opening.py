@@ -45,7 +45,7 @@ def read_frame(path: Path, kind: str) -> Sheet:
         raise DataError(f"{source}: two columns are named {name!r}; rename one")
     if frame.empty:
         raise DataError(f"{source}: no rows")
-    return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))), problems=Problems(source))
+    return Sheet(source, frame, tuple(f"row {i}" for i in range(len(frame))))
 
 
 RECORDS = "JSON, GPX or KML"
@@ -69,21 +69,20 @@ MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
 Lines = dict[int, str]  # those with something in them, by their numbers from 1
 
 
-def read_text(path: Path) -> tuple[Sheet, list[str]]:
+def read_text(path: Path) -> Sheet:
     """Read the cells of a text file, with notes on what was recognised.
 
     Raises:
         DataError: empty, not text, no heads, ragged lines or two columns of one name.
     """
-    source, notes = str(path), []
+    source, notes = str(path), list[str]()
     text, encoding = _decoded(path)
     if encoding != "UTF-8":
         notes.append(f"read as {encoding}")
     lines, comment = _lines(MINUS.sub("-", text), source)
     if not lines:
         raise DataError(f"{source}: empty; expected a line of heads and rows below it")
-    lines, banner_notes = _without_banner(lines)
-    notes += banner_notes
+    lines = _without_banner(lines, notes)
     if re.fullmatch("sep=.", lines[min(lines)].strip()) and len(lines) > 1:  # Excel's own hint
         del lines[min(lines)]
     delimiter = _delimiter([*lines.values()], comment)
@@ -96,9 +95,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
         how = "write Parquet, of means by cells of places where rows are many"
         raise DataError(f"{source}: {fault} cells are read: {how}")
     lines = _with_heads(lines, comment, delimiter, source)
-    lines, again_notes = _heads_once(lines, delimiter)
-    lines, comment_notes = _without_comments(lines, delimiter, source)
-    notes += comment_notes + again_notes
+    lines = _without_comments(_heads_once(lines, delimiter, notes), delimiter, source, notes)
     heads, *rows = _rectangular(lines, delimiter, source)
     heads = [cell.strip() for cell in heads]
     for i, head in enumerate(heads):
@@ -109,12 +106,11 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if not rows:
         raise DataError(f"{source}: line {min(lines)} names columns, but there are no rows below it")
     frame = pd.DataFrame(rows, dtype=object)
-    decimal, decimal_notes = _decimal(text, frame, delimiter)
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
-    notes += decimal_notes
+    decimal = _decimal(text, frame, delimiter, notes)
     named = frame.set_axis(heads, axis=1)[[head for head in heads if head]]
-    return Sheet(source, named, tuple(f"line {n}" for n in lines)[1:], decimal), notes
+    return Sheet(source, named, tuple(f"line {n}" for n in lines)[1:], decimal, notes=notes)
 
 
 def _decoded(path: Path) -> tuple[str, str]:
@@ -178,8 +174,8 @@ MINUS = re.compile(r"(?<![^\s,;|\"'])[\u2212\u2013\u2010\u2011\ufe63\uff0d](?=\s
 MOST_ABOVE = 10  # lines above the heads
 
 
-def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
-    """The lines from the heads on, where lines above them that hold something else leave no doubt; a note."""
+def _without_banner(lines: Lines, notes: list[str]) -> Lines:
+    """The lines from the heads on, where lines above them that hold something else leave no doubt."""
     numbers = list(lines)[:LOOKED_AT]
     for delimiter in DELIMITERS:
         cells = [_cells(lines[n], delimiter) for n in numbers]
@@ -189,25 +185,25 @@ def _without_banner(lines: Lines) -> tuple[Lines, list[str]]:
         first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
         above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
         if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
-            kept = {n: line for n, line in lines.items() if n >= numbers[first]}
-            note = f"the heads stand in line {numbers[first]}; left out above: {lines[numbers[0]][:40]!r}"
-            return kept, [note]
-    return lines, []
+            above_them = f"left out above: {lines[numbers[0]][:40]!r}"
+            notes.append(f"the heads stand in line {numbers[first]}; {above_them}")
+            return {n: line for n, line in lines.items() if n >= numbers[first]}
+    return lines
 
 
-def _heads_once(lines: Lines, delimiter: str) -> tuple[Lines, list[str]]:
-    """The lines without those that repeat the heads, with what is written above, and a note."""
+def _heads_once(lines: Lines, delimiter: str, notes: list[str]) -> Lines:
+    """The lines without those that repeat the heads, with what is written above."""
     (first, *below), again, above = lines, set[int](), list[int]()
     for n in below:
         text = lines[n].strip("\ufeff \t")
         again |= {n, *above} if text == lines[first].strip() else set()
         titled = text.startswith(COMMENTS) or len(_cells(text, delimiter)) == 1
         above = [*above, n] if titled else []
-    if not again:
-        return lines, []
-    where = name_row_ranges([f"line {n}" for n in sorted(again)])
-    what = Caution(f"{where}: the heads again; left out: are these files joined that belong together?")
-    return {n: text for n, text in lines.items() if n not in again}, [what]
+    if again:
+        where = name_row_ranges([f"line {n}" for n in sorted(again)])
+        asked = "the heads again; left out: are these files joined that belong together?"
+        notes.append(Caution(f"{where}: {asked}"))
+    return {n: text for n, text in lines.items() if n not in again}
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -254,8 +250,8 @@ def _is_number(cell: str) -> bool:
     return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
 
 
-def _without_comments(lines: Lines, delimiter: str, source: str) -> tuple[Lines, list[str]]:
-    """The lines without comments below the heads, and a note.
+def _without_comments(lines: Lines, delimiter: str, source: str, notes: list[str]) -> Lines:
+    """The lines without comments below the heads.
 
     A line that begins like a comment and has as many cells as there are heads is a row, as stations may be
     called #1; it is refused where it may be a row that somebody took out.
@@ -263,12 +259,12 @@ def _without_comments(lines: Lines, delimiter: str, source: str) -> tuple[Lines,
     heads, *below = lines
     marked = [n for n in below if lines[n].lstrip().startswith(COMMENTS)]
     if not marked:
-        return lines, []
+        return lines
     cells = {n: _cells(line, delimiter) for n, line in lines.items()}
     like = [_cells(lines[n].lstrip(" #%/"), delimiter) for n in marked]  # between spaces a mark may be a cell
     if all(len(cells[heads]) != len(row) for row in (*like, *(cells[n] for n in marked))):
-        note = f"{len(marked)} comments below the heads, the first in line {marked[0]}"
-        return {n: line for n, line in lines.items() if n not in set(marked)}, [note]
+        notes.append(f"{len(marked)} comments below the heads, the first in line {marked[0]}")
+        return {n: line for n, line in lines.items() if n not in set(marked)}
     first = {n: row[0].strip() for n, row in cells.items()}
     plain = [first[n] for n in below if n not in set(marked)]
     numbers = bool(plain) and all(map(_is_number, plain))
@@ -280,8 +276,9 @@ def _without_comments(lines: Lines, delimiter: str, source: str) -> tuple[Lines,
             begin = (first[n] or lines[n].strip())[:20]
             fault = f"begins with {begin!r}: a row, or a comment? quote the cell or take the line out"
             raise DataError(f"{source}, line {n}: {fault}")
-    at = f"the first in line {marked[0]}"
-    return lines, [f"{len(marked)} rows begin with {first[marked[0]]!r} or the like, {at}"]
+    like_it = f"{first[marked[0]]!r} or the like, the first in line {marked[0]}"
+    notes.append(f"{len(marked)} rows begin with {like_it}")
+    return lines
 
 
 def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
@@ -301,10 +298,8 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
     problems, below = Problems(source), list(lines)[1:]
     for n, row in zip(below, cells[1:], strict=True):
         if len(row) != count and sum(parse_head(cell).role is not None for cell in row) > 1:
-            fault = (
-                f"heads of another table than that of line {min(lines)}: write each into a file of its own"
-            )
-            raise DataError(f"{source}, line {n}: {fault}")
+            fault = f"heads of another table than that of line {min(lines)}"
+            raise DataError(f"{source}, line {n}: {fault}: write each into a file of its own")
     names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
@@ -312,29 +307,28 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
     return cells
 
 
-def _decimal(text: str, frame: pd.DataFrame, delimiter: str) -> tuple[str, list[str]]:
-    """The mark that most numbers have that have one, and a note where it is a comma.
+def _decimal(text: str, frame: pd.DataFrame, delimiter: str, notes: list[str]) -> str:
+    """The mark that most numbers have that have one; a comma is noted.
 
     Between commas it can be one in quoted cells alone; where all cells with a comma may be marked between
     thousands, the note asks.
     """
     if delimiter == "," and '"' not in text:
-        return ".", []
+        return "."
     cells = pd.concat([frame[i] for i in frame.columns])
     marked = cells[cells.str.fullmatch(DECIMAL_COMMA)]
     thousands = bool(marked.str.fullmatch(THOUSANDS).all())
     some = pd.concat([frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)] for i in frame.columns])
     commas, points = (some.str.fullmatch(mark).sum() for mark in (DECIMAL_COMMA, DECIMAL_POINT))
     if (delimiter == "," and thousands) or commas <= points:
-        return ".", []
-    if not thousands:
-        return ",", ["decimal commas"]
+        return "."
     first = marked.iloc[0].strip()
-    hint = f"{first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
-    return ",", [f"decimal commas: {hint}"]
+    hint = f": {first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
+    notes.append("decimal commas" + hint * thousands)
+    return ","
 
 
-def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Sheet, list[str]]:
+def read_sheet(path: str | Path, problems: Problems | None = None) -> Sheet:
     """Read the cells of a table, a column for each number of one, with notes on what was recognised.
 
     Args:
@@ -356,6 +350,5 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> tuple[Shee
     kind = "Parquet" if path.suffix.lower() == ".parquet" else kind
     if kind == RECORDS and path.stat().st_size > MOST_BYTES:
         raise DataError(f"{path}: records of more than {MOST_BYTES:,} bytes; write them as Parquet")
-    sheet, notes = read_text(path) if kind is None else (read_frame(path, kind), [])
-    sheet, of_cells = unfold_cells(sheet)
-    return replace(sheet, problems=Problems(path) if problems is None else problems), [*notes, *of_cells]
+    sheet = unfold_cells(read_text(path) if kind is None else read_frame(path, kind))
+    return replace(sheet, problems=Problems(path) if problems is None else problems)

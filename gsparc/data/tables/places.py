@@ -13,7 +13,7 @@ from gsparc.data.errors import Caution, DataError, list_first, name_row_ranges
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.links.stations import PER_STATION, SECTOR
 from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations, say_column
-from gsparc.data.tables.heads import AXES, LISTS, OTHER_NAMES, STATION_WORDS, TOGETHER, parse_head, words_of
+from gsparc.data.tables.heads import AXES, ENDS, LISTS, OTHER_NAMES, TOGETHER, parse_head, words_of
 from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.data.tables.sheet import Sheet
@@ -65,8 +65,7 @@ def read_places(
         if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
             found = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
-            fault = f"{found}; say {say_column(missing, 'COLUMN')}"
-            return sheet.refuse(fault)
+            return sheet.refuse(f"{found}; say {say_column(missing, 'COLUMN')}")
         absent = np.zeros(len(sheet), bool)
         if unknown:
             present = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
@@ -82,20 +81,27 @@ def read_places(
     return None
 
 
-def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> tuple[Sheet, list[str]]:
+def read_ends(sheet: Sheet, chosen: Chosen, strict: bool = True) -> dict[str, Places]:
+    """Read the coordinates that a table has of rows, `rx_` and `tx_`; see `read_places`."""
+    read = {end: read_places(sheet, chosen, end, strict=strict) for end in ENDS[:-1]}
+    return {end: where for end, where in read.items() if where is not None}
+
+
+def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
     """Leave out rows in which both coordinates of an end are empty, as loggers write them between fixes."""
     lost = np.zeros(len(sheet), bool)
-    for end in ("", "rx_", "tx_"):
+    for end in ENDS[:-1]:
         for pair in (("x", "y"), ("latitude", "longitude")):
             heads = [chosen[f"{end}{axis}"][0].head for axis in pair if f"{end}{axis}" in chosen]
             if len(heads) == 2 and None not in heads:
                 lost |= np.all([sheet.words(head or "") == "" for head in heads], axis=0)
     if not lost.any() or lost.all():
-        return sheet, []
-    rows = [name for name, out in zip(sheet.rows, lost, strict=True) if out]
-    said = f"{name_row_ranges(rows)}: no place; these {len(rows)} of {len(sheet)} rows are left out"
-    kept = tuple(name for name, out in zip(sheet.rows, lost, strict=True) if not out)
-    return replace(sheet, frame=sheet.frame[~lost].reset_index(drop=True), rows=kept), [Caution(said)]
+        return sheet
+    named = np.array(sheet.rows)
+    said = f"{name_row_ranges(named[lost].tolist())}: no place; these {lost.sum()} of {len(sheet)} rows are"
+    sheet.notes.append(Caution(f"{said} left out"))
+    frame = sheet.frame[~lost].reset_index(drop=True)
+    return replace(sheet, frame=frame, rows=tuple(named[~lost].tolist()))
 
 
 def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> dict[str, object]:
@@ -109,11 +115,11 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
     Raises:
         DataError: rows are of one station each, and no column of times says which are of one moment.
     """
-    sheet, _ = read_sheet(path)
-    roles = [f"{before}{axis}" for before in ("", "rx_", "tx_") for axis in AXES]
+    sheet = read_sheet(path)
+    roles = [f"{before}{axis}" for before in ENDS[:-1] for axis in AXES]
     said = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
     here = {key: head for key, head in said.items() if head in sheet.heads}
-    chosen, _ = choose_columns(sheet, here, {}, [*roles, "station"])
+    chosen = choose_columns(sheet, here, {}, [*roles, "station"])
     if any(role in chosen for role in roles):
         return {}
     apart = BY_ROW
@@ -134,9 +140,8 @@ def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
     alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
     # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
     if empty or alone or 2 * links < len(moment):
-        raise DataError(
-            f"{asked} {named} has {moments} values in {len(moment)} rows, {empty} empty; {wanted}"
-        )
+        found = f"{named} has {moments} values in {len(moment)} rows, {empty} empty"
+        raise DataError(f"{asked} {found}; {wanted}")
     return heads
 
 
@@ -196,10 +201,9 @@ def place_per_station(
         return row_places.take(first)
     if not ask:
         row = moved[0]
-        here, there = first[station[row]], row
-        at = [f"({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in (here, there)]
-        fault = f"station {names[station[row]]!r} is at {at[0]} and at {at[1]}; expected one place for each"
-        sheet.refuse(fault)
+        both = (first[station[row]], row)
+        at = [f"at ({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in both]
+        sheet.refuse(f"station {names[station[row]]!r} is {' and '.join(at)}; expected one place for each")
     return None
 
 
@@ -260,15 +264,16 @@ class StationList:
         # One head alone may be called like a station by chance, unless by its own name.
         return (renamed, found) if len(found) > 1 or renamed.label is None else (self, {})
 
-    def add_missing(self, words: np.ndarray) -> tuple[StationList, list[str], list[str]]:
-        """Add those of words (S,) that it lacks, if few, at unknown places; return it, these, and a note."""
+    def add_missing(self, words: np.ndarray, notes: list[str]) -> StationList:
+        """Add those of words (S,) that it lacks, if few, at unknown places, with a note; return it."""
         names = [word for word in dict.fromkeys(words.tolist()) if word]
         lost = [word for word in names if word not in self.names]
         # Of few stations, or with a third of them missing, it is the wrong list rather than an old one.
         if not lost or len(names) < LEAST_LISTED or len(names) < 3 * len(lost):
-            return self, [], []
+            return self
         rows, more = int(np.isin(words, lost).sum()), len(lost)
         said = f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
+        notes.append(Caution(f"{said}: {list_first(lost)}; their places are unknown"))
         height = None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
         across = np.concatenate([self.places.across, np.full((more, 2), np.nan)])
         extra = {
@@ -278,11 +283,10 @@ class StationList:
         }
         where = Places(across, height, self.places.degrees)
         label = None if self.label is None else (*self.label, *lost)
-        grown = replace(self, names=(*self.names, *lost), places=where, extra=extra, label=label)
-        return grown, lost, [Caution(f"{said}: {list_first(lost)}; their places are unknown")]
+        return replace(self, names=(*self.names, *lost), places=where, extra=extra, label=label)
 
 
-def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
+def read_stations(sheet: Sheet) -> StationList | None:
     """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
     naming = [head for head in sheet.heads if parse_head(head).role == "station"]
@@ -291,21 +295,17 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     # What is of a beam, or a carrier, is no measurement, whatever its head says besides.
     own = {*SECTOR, *TILTS, "carrier_hz"}
     others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in own]]
-    chosen, notes = choose_columns(
-        replace(sheet, frame=others), {"station": called[0]} if len(called) == 1 else {}
-    )
-    chosen = {
-        columns[0].role: columns for columns in (tuple(map(rename_for_stations, c)) for c in chosen.values())
-    }
-    said = ["not used", *(f"column {head!r} speaks of" for head in sheet.heads if sector_quantity(head))]
-    notes = [type(note)(f"{sheet.source}: {note}") for note in notes if not note.startswith(tuple(said))]
+    plain = replace(sheet, frame=others, notes=[])
+    columns = choose_columns(plain, {"station": called[0]} if len(called) == 1 else {}).values()
+    chosen = {rename_for_stations(own[0]).role: tuple(map(rename_for_stations, own)) for own in columns}
+    told = (note for note in plain.notes if not note.startswith("not used"))
+    sheet.notes.extend(type(note)(f"{sheet.source}: {note}") for note in told)
     if "station" not in chosen:
-        return sheet.refuse("no column of names; expected one called name or station"), notes
+        return sheet.refuse("no column of names; expected one called name or station")
     coordinates = read_places(sheet, chosen, "station_", unknown=True)
     used = {column.head for columns in chosen.values() for column in columns}
     aliases = _aliases(sheet, used)
-    sectors, more = read_sectors(sheet, {head for head in used if head} | {pair[0] for pair in aliases})
-    notes += more
+    sectors = read_sectors(sheet, used | {pair[0] for pair in aliases})
     sites = number_sites(sheet)
     if sites is not None:
         sectors["station_site"] = sites[1]
@@ -314,7 +314,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     if coordinates is None:
         if not sheet.problems:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
-        return None, notes
+        return None
     names = sheet.joined(c.head for c in chosen["station"])
     every = {"+".join(heads): tuple(sheet.joined(heads).tolist()) for heads in aliases}
     unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
@@ -324,7 +324,7 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
     if unique and len(set(names.tolist())) < len(names) and (names != "").all():
         names, by = np.array(unique[by[1]]), by[1:]
     of_sites = "" if sites is None else f", sites by {sites[0]!r}"
-    notes.append(f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}")
+    sheet.notes.append(f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}")
     for i in np.flatnonzero(names == ""):
         sheet.problems.add(f"{sheet.source}, {sheet.rows[i]}", "no name; expected the station's")
     values, counts = np.unique(names, return_counts=True)
@@ -333,15 +333,14 @@ def read_stations(sheet: Sheet) -> tuple[StationList | None, list[str]]:
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
     facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
     extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
-    listed = StationList(tuple(map(str, names)), coordinates, extra, None, tuple(unique.values()), repeated)
-    return listed, notes
+    return StationList(tuple(map(str, names)), coordinates, extra, None, tuple(unique.values()), repeated)
 
 
 def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
     """Columns, alone and with those that make them unique, that may name the stations of a list besides."""
     result: list[tuple[str, ...]] = []
     for head in sheet.heads:
-        words = set(words_of(head)) & STATION_WORDS
+        words = set(words_of(head)) & LISTS["station"]
         if not words:
             continue
         result += [(head,)] if head not in used else []

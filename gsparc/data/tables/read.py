@@ -20,36 +20,10 @@ from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ
 from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
-from gsparc.data.tables.columns import (
-    JOINED,
-    LEVELS,
-    Chosen,
-    Column,
-    choose_columns,
-    say_column,
-    schema_unit,
-    used_heads,
-)
-from gsparc.data.tables.heads import (
-    AXES,
-    CHANNELS,
-    LISTS,
-    PERCENT,
-    POLAR,
-    TOGETHER,
-    station_in_head,
-    words_of,
-)
+from gsparc.data.tables import heads, places
+from gsparc.data.tables.columns import JOINED, Chosen, Column, choose_columns, say_column, used_heads
 from gsparc.data.tables.opening import read_sheet
-from gsparc.data.tables.places import (
-    UNKNOWN_HEIGHT,
-    Places,
-    StationList,
-    drop_rows_without_place,
-    place_per_station,
-    read_places,
-    read_stations,
-)
+from gsparc.data.tables.places import Places, StationList
 from gsparc.data.tables.sheet import MEASURED, Sheet
 from gsparc.data.tables.slots import unfold_slots, unfold_tones
 from gsparc.data.tables.unused import say_effects
@@ -72,37 +46,31 @@ def parse_table(
     Raises:
         DataError: all problems, with row and column.
     """
-    sheet, notes = read_sheet(path)
-    sheet, of_slots = unfold_slots(sheet, {str(value) for value in columns.values()})
-    sheet, of_tones = unfold_tones(sheet)
-    notes = [*notes, *of_slots, *of_tones]
+    sheet = unfold_tones(unfold_slots(read_sheet(path), {str(value) for value in columns.values()}))
     listed = None
     if stations_file is not None:
-        second, _ = read_sheet(stations_file, sheet.problems)
-        listed, list_notes = read_stations(second)
-        notes += list_notes
+        listed = places.read_stations(replace(read_sheet(stations_file, sheet.problems), notes=sheet.notes))
         sheet.problems.raise_if_any()
     # The list of stations comes before the columns: heads that hold its names are levels of stations.
     labelled: dict[str, str] = {}
     if listed is not None:
-        parts = {head: station_in_head(head) for head in sheet.heads}
+        parts = {head: heads.station_in_head(head) for head in sheet.heads}
         listed, labelled = listed.match_heads(parts)
-    chosen, guessed = choose_columns(sheet, columns, labelled)
+    chosen = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
-    sheet, without = drop_rows_without_place(sheet, chosen)
-    builder = Builder(sheet, chosen, listed)
-    arrays = builder.build()
+    sheet = places.drop_rows_without_place(sheet, chosen)
+    arrays = Builder(sheet, chosen, listed).build()
     sheet.problems.raise_if_any()
-    power = next((chosen[role][0] for role in LEVELS if role in chosen), None)
+    power = next((chosen[role][0] for role in heads.LEVELS if role in chosen), None)
     about = {}
     if power is not None and "rssi_db" in chosen:
-        about["level_unit"] = schema_unit(power)
+        about["level_unit"] = power.schema_unit
     # A column that is scaled has the schema's unit.
     if power is not None and power.unit is not None and power.unit.name in WATTS and not power.unit.times:
         about["unit"] = power.unit.name
     explain = partial(say_effects, sheet, chosen)
-    return Raw(arrays, about, notes=(*notes, *guessed, *without, *builder.notes), explain=explain)
+    return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain)
 
 
 UNKNOWN_ASU, MOST_GSM = 99, 31  # arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
@@ -114,8 +82,7 @@ class Builder:
 
     def __init__(self, sheet: Sheet, chosen: Chosen, listed: StationList | None) -> None:
         self.sheet, self.chosen, self.listed = sheet, chosen, listed
-        self.refuse = sheet.refuse
-        self.notes: list[str] = []
+        self.refuse, self.notes = sheet.refuse, sheet.notes
         self.arrays: dict[str, np.ndarray] = {}
         self.tones = np.zeros(1, int)
 
@@ -138,27 +105,27 @@ class Builder:
 
     def _measurement(self) -> str | None:
         """Add the measurement; its quantity."""
-        role = next((name for name in (*LEVELS, *CHANNELS, *POLAR) if name in self.chosen), None)
+        role = next((name for name in heads.MANY if name in self.chosen), None)
         if role is None:
             fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
             for head in self.sheet.heads:
-                if {"loss", "pathloss", "pl"} & set(words_of(head)):
+                if {"loss", "pathloss", "pl"} & set(heads.words_of(head)):
                     how = say_column("rssi_db", f"{head}*-1")
                     return self.refuse(f"{fault}; {how} takes losses for levels")
-                if "asu" in words_of(head):
+                if "asu" in heads.words_of(head):
                     asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
                     how = f"of LTE: {say_column('rssi_db', f'{head}-140')}"
                     if (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all():  # of LTE these would all be weak
                         how = f"of GSM: {say_column('rssi_db', f'{head}*2-113')}; if weak, {how}"
                     return self.refuse(f"{fault}; {head!r} is ASU, {how}")
-                if {"quality", "percent", "pct"} & set(words_of(head)):
-                    return self.refuse(f"{fault}; {head!r} is {PERCENT}")
+                if {"quality", "percent", "pct"} & set(heads.words_of(head)):
+                    return self.refuse(f"{fault}; {head!r} is {heads.PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
             family, count = numbered.most_common(1)[0]
             alike = f"'{family}' (levels) or .csi_amp='{family}' (amplitudes)" if count > 1 else "COLUMN"
             return self.refuse(f"{fault}; say dataset.columns.rssi_db={alike}")
-        if role not in LEVELS:
-            self._channels(CHANNELS if role in CHANNELS else POLAR)
+        if role not in heads.LEVELS:
+            self._channels(heads.CHANNELS if role in heads.CHANNELS else heads.POLAR)
             return role
         columns = self.chosen[role]
         levels = [column.numbers(self.sheet) for column in columns]
@@ -175,7 +142,7 @@ class Builder:
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         # Received levels in dBm are below 0: a column without one is a power, a share, or lost its sign.
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
-            choices = " or ".join(say_column(name, first.head or "") for name in LEVELS)
+            choices = " or ".join(say_column(name, first.head or "") for name in heads.LEVELS)
             fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
             self.refuse(f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or "")
         size = np.median(np.abs(np.unique(values[np.isfinite(values)])))  # a mark counts once
@@ -189,7 +156,7 @@ class Builder:
         """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
         pairs = [self._tones(part) for part in names]
         # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
-        amplitudes = names == POLAR and not pairs[1]
+        amplitudes = names == heads.POLAR and not pairs[1]
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         for name, own, other in zip(names, pairs, pairs[::-1], strict=True):
             for tone in [] if amplitudes else sorted(set(other) - set(own)):
@@ -206,7 +173,7 @@ class Builder:
             return
         first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
         csi = first + 1j * second
-        if names == POLAR:
+        if names == heads.POLAR:
             csi, said = join_polar(first, second, [pair[self.tones[0]].unit for pair in pairs])
             self.notes += said
         csi = csi[:, 0] if csi.shape[1] == 1 else csi
@@ -233,10 +200,11 @@ class Builder:
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
-        by_end = {end: read_places(self.sheet, self.chosen, end, strict=False) for end in ("", "rx_", "tx_")}
-        ends = {end: where for end, where in by_end.items() if where is not None}
+        every = places.read_ends(self.sheet, self.chosen, strict=False)
+        ends = dict(every)
         # Said beside what is wrong with levels: one look at the file mends both.
-        if {f"{end}{axis}" for end in by_end for axis in AXES if axis != "z"}.isdisjoint(self.chosen):
+        coordinates = {f"{end}{axis}" for end in heads.ENDS[:-1] for axis in heads.AXES if axis != "z"}
+        if coordinates.isdisjoint(self.chosen):
             fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
             return self.refuse(f"{fault}, or .lat, .lon")
         if self.sheet.problems:
@@ -248,7 +216,7 @@ class Builder:
         stations = self._stations(measured, ends)
         if self.sheet.problems:
             return
-        stay = next((end for end, where in by_end.items() if where is not None and end not in ends), "")
+        stay = next((end for end in every if end not in ends), "")
         moving, where = self._moving(ends, stay)
         others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
         if stations is not None:
@@ -275,15 +243,13 @@ class Builder:
             # The end without a name is whichever the named one is not; unsaid, it is the receiver.
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
-            if not named and station and station[0].word in LISTS["hearing"]:
+            if not named and station and station[0].word in heads.LISTS["hearing"]:
                 moving = "tx"
             if not named:
                 other = "tx" if moving == "rx" else "rx"
                 axis = "latitude" if ends[""].degrees else "x"
-                rename = (
-                    f"if not, name them {other}_{axis}, ..., or say {say_column(f'{other}_{axis}', '...')}"
-                )
-                self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; {rename}")
+                rename = f"name them {other}_{axis}, ..., or say {say_column(f'{other}_{axis}', '...')}"
+                self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; if not, {rename}")
             return moving, ends.pop("")
         # Both ends are named and the receiver never moves: the rows are places of the transmitter.
         if len(named) == 2 and len(np.unique(ends["rx_"].all(), axis=0)) == 1:
@@ -292,8 +258,8 @@ class Builder:
 
     def _stations(self, measured: str | None, end_places: dict[str, Places]) -> StationList | None:
         """The stations, where there are; an end that is their place is taken out of `end_places`."""
-        where = read_places(self.sheet, self.chosen, "station_")
-        labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
+        where = places.read_places(self.sheet, self.chosen, "station_")
+        labels = tuple(c.label for c in self.chosen[measured]) if measured in heads.LEVELS else ()
         for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
             self.refuse(f"two columns of the station {label!r}; rename one")
         if len(labels) > 1:
@@ -330,23 +296,23 @@ class Builder:
         index, distinct = pd.factorize(words)  # in the order of their first rows
         names = tuple(map(str, distinct))
         if where is not None:
-            each = place_per_station(self.sheet, where, index, names)
+            each = places.place_per_station(self.sheet, where, index, names)
             return None if each is None else StationList(names, each, index=index)
         if self.sheet.problems:
             return None
         ends = [end for end in ("tx_", "rx_") if end in end_places] if len(end_places) > 1 else []
         for end in ends:
             # A place that differs among a station's rows is no error yet: the other end may be the station's.
-            each = place_per_station(self.sheet, end_places[end], index, names, ask=True)
+            each = places.place_per_station(self.sheet, end_places[end], index, names, ask=True)
             if each is not None:
                 end_places.pop(end)
                 return StationList(names, each, index=index)
         if ends:
-            place_per_station(self.sheet, end_places[ends[0]], index, names)
+            places.place_per_station(self.sheet, end_places[ends[0]], index, names)
             return None
-        if measured not in LEVELS and len(names) == 1:
+        if measured not in heads.LEVELS and len(names) == 1:
             return None  # the only transmitter: dataset.tx_position says where it is
-        if measured in LEVELS:
+        if measured in heads.LEVELS:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
         fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
@@ -355,8 +321,8 @@ class Builder:
         """The setting of columns that name a station in every row, for messages; empty without any."""
         full = [head for head in self.sheet.heads if (self.sheet.words(head) != "").all()]
         for head in full:
-            for parts in [TOGETHER[word] for word in words_of(head) if word in TOGETHER]:
-                names = [head, *[other for other in full if parts & {*words_of(other)}]]
+            for parts in [heads.TOGETHER[word] for word in heads.words_of(head) if word in heads.TOGETHER]:
+                names = [head, *[other for other in full if parts & {*heads.words_of(other)}]]
                 if len(names) > 1:
                     return f", or {say_column('station', '+'.join(names))}, which no row lacks"
         return ""
@@ -396,11 +362,9 @@ class Builder:
         assert self.listed is not None
         if (wrong := self.listed.shared_name_problem(words)) is not None:
             return self.refuse(wrong)
-        lacking: list[str] = []
         if head is not None:
-            self.listed, lacking, said = self.listed.add_missing(words)
-            self.notes += said
-        known = {"", *self.listed.names, *lacking}
+            self.listed = self.listed.add_missing(words, self.notes)
+        known = {"", *self.listed.names}
         unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in known]
         place = f"{self.sheet.source}, " + ("the heads" if head is None else f"column {head!r}")
         if len(unlisted) > MOST_NAMED:
@@ -435,14 +399,13 @@ class Builder:
 
     def _add_places(self, name: str, where: Places, still: bool = False) -> None:
         """Add positions [m], or degrees and heights."""
-        height = where.height
-        if height is None:
-            said = f"no height of the {ENDS.get(name, 'stations')}: taken as {UNKNOWN_HEIGHT:g} m"
+        height = places.UNKNOWN_HEIGHT if where.height is None else where.height
+        if where.height is None:
+            said = f"no height of the {ENDS.get(name, 'stations')}: taken as {places.UNKNOWN_HEIGHT:g} m"
             self.notes.append(said if name in ENDS else Caution(said))
         # Equal heights are kept as one: schema arrays of shape () hold for all rows.
-        elif len(np.unique(height)) == 1:
-            height = height[:1]
-        flat = np.array(UNKNOWN_HEIGHT) if height is None else height[0] if len(height) == 1 else height
+        elif len(np.unique(where.height)) == 1:
+            height = where.height[0]
         if where.degrees:
             before = "station_" if name == "station" else ""
             self.arrays[f"{before}latitude"] = where.across[:, 0]
@@ -450,8 +413,8 @@ class Builder:
         else:
             values = where.all()
             self.arrays[f"{name}_position"] = values[0] if still else values
-        if where.degrees or height is None:
-            self.arrays[f"{name}_height"] = np.asarray(flat)
+        if where.degrees or where.height is None:
+            self.arrays[f"{name}_height"] = np.asarray(height)
 
     def _of_rows(self, role: str) -> np.ndarray | None:
         """Numbers (S,) of rows, () where all are one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Container
 
 import numpy as np
 import pandas as pd
@@ -32,9 +33,8 @@ USUAL = {
 UNSAID_DBM = 30  # a lower power, where nobody says its unit, may be in watts
 FEW, LEAST = 0.2, 3  # share of a column up to which values are single ones; radians beside degrees
 CELL = re.compile(r"(?i)^\s*[bn]?([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)(?:\s.*)?$")
-FIRST_NR = (
-    100_000  # channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1)
-)
+# Channel numbers of LTE are below; of NR 600,000 is 3 GHz (3GPP TS 38.104, table 5.4.2.1-1).
+FIRST_NR = 100_000
 WIDEST = 2000  # channels of a band of LTE, at most
 NR_MHZ = np.array([[410, 7125], [24250, 71000]])  # where NR has bands (3GPP TS 38.104, 5.1)
 MOST_BAND = 90  # numbers beyond are frequencies [MHz]
@@ -69,16 +69,15 @@ def band_hz(band: np.ndarray) -> np.ndarray:
     return np.where(band > MOST_BAND, np.where(names, band, np.nan), known) * MHZ
 
 
-def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them, and notes.
+def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndarray]:
+    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them; with notes.
 
     Args:
         sheet: the list.
         used: heads that are read as something else.
     """
     found: dict[str, np.ndarray] = {}
-    notes: list[str] = []
-    unread, heads = [], []
+    notes, unread, heads = sheet.notes, [], []
     for head in [head for head in sheet.heads if head not in used]:
         name = sector_quantity(head)
         values, written, unit = _read_cells(sheet, head, name)
@@ -92,15 +91,14 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
             notes.append(Caution(f"{sheet.source}: column {head!r}: {cells}: no {name}; unknown"))
         if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
             values, said = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
-        zero = name == "station_power_db" and (
-            np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
-        )
-        if (zero or name in ("station_width", "station_thickness")) and (values == 0).any():
+        high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
+        empty = "station_width", "station_thickness", *["station_power_db"] * bool(high)
+        if name in empty and (values == 0).any():
             values, said = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
             values = -values
-        notes += _doubt(sheet, head, name, values, written, unit is None)
+        _doubt(sheet, head, name, values, written, unit is None)
         found[name] = values
         heads.append(f"{head!r} as {said}")
     parts = [found.pop(name) for name in TILTS if name in found]
@@ -121,7 +119,7 @@ def read_sectors(sheet: Sheet, used: set[str]) -> tuple[dict[str, np.ndarray], l
     if unread:
         heads_ = f"column{'s' * (len(unread) > 1)} {list_first(unread, 8)}"
         notes.append(Caution(f"{sheet.source}: not read: {heads_}"))
-    return found, notes
+    return found
 
 
 def _read_cells(sheet: Sheet, head: str, name: str | None) -> tuple[np.ndarray, np.ndarray, Unit | None]:
@@ -155,12 +153,10 @@ def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
     return not own.any() or bool(((own >= low) & (own <= high)).all() and np.abs(own).max() >= least)
 
 
-def _doubt(
-    sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool
-) -> list[str]:
+def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool) -> None:
     """Refuse values (T,) that cannot be (DataError), doubt rare ones, and name the unit that fits."""
     if name not in RANGES or np.isnan(values).all():
-        return []
+        return
     (least, most, _, kind), (low, high, apart) = RANGES[name], USUAL.get(name, (*RANGES[name][:2], np.inf))
     low, middle = UNSAID_DBM if unsaid and kind == "power" else low, np.nanmedian(values)
     refused, off = not _fits(UNITS["m"], values, name), (values < least) | (values > most)
@@ -171,17 +167,14 @@ def _doubt(
         single = np.abs(values - middle) > apart
         off |= single & (single.sum() <= FEW * len(values))
     if not off.any():
-        return []
+        return
     rest = values[~off & np.isfinite(values)]
     middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
     others = [one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")]
     least_usual, written = USUAL.get(name, (least,))[0], written[off]
     own = {one.name: _convert(one, written) for one in others}
-    fitting = [
-        unit
-        for unit, v in own.items()
-        if ((v >= least_usual) & (v <= high) & ~(abs(v - middle) > apart)).all()
-    ]
+    usual = {one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > apart) for one, v in own.items()}
+    fitting = [one for one, holds in usual.items() if holds.all()]
     shown = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
     said = f"{sheet.source}: column {head!r} holds {list_first(shown, 3)}; expected {name} of "
     said += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
@@ -193,7 +186,7 @@ def _doubt(
         said += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
     if refused:
         raise DataError(said)
-    return [Caution(said)]
+    sheet.notes.append(Caution(said))
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:

@@ -38,6 +38,7 @@ class Sheet:
         decimal: `.` or `,`, of numbers that are text.
         problems: takes what is wrong.
         marks: texts that stand for "not heard" among levels that were read, and how often each does.
+        notes: how it was understood, for the user, one line each.
     """
 
     source: str
@@ -46,6 +47,7 @@ class Sheet:
     decimal: str = "."
     problems: Problems = field(default_factory=lambda: Problems(""))
     marks: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -28,8 +28,8 @@ def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     return slots if len(slots) >= LEAST else {}
 
 
-def unfold_slots(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
-    """Return a row per slot with a cell and its level, rows of one moment together, and a note.
+def unfold_slots(sheet: Sheet, said: Container[str]) -> Sheet:
+    """Return a row per slot with a cell and its level, rows of one moment together; noted.
 
     Args:
         sheet: the table.
@@ -38,7 +38,7 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
     slots = find_slots(sheet.heads)
     used = [head for parts in slots.values() for head in parts.values()]
     if not slots or any(head in said for head in used):
-        return sheet, []
+        return sheet
     # A channel that only one slot has is the moment's.
     shared = next((parts["EARFCN"] for parts in slots.values() if "EARFCN" in parts), None)
     level = next(iter(slots.values()))["RSRP"]
@@ -54,36 +54,37 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> tuple[Sheet, list[str]]:
         parts.append(sheet.frame.loc[held, [*kept, *of_slot]].rename(columns=of_slot))
     whole = pd.concat(parts).sort_index(kind="stable")
     rows = tuple(sheet.rows[i] for i in whole.index)
-    result = replace(sheet, frame=whole.reset_index(drop=True), rows=rows)
-    return result, [f"slots {list_first([*map(repr, slots)], 3)}: {len(rows)} rows of {len(sheet)} moments"]
+    named = list_first([*map(repr, slots)], 3)
+    sheet.notes.append(f"slots {named}: {len(rows)} rows of {len(sheet)} moments")
+    return replace(sheet, frame=whole.reset_index(drop=True), rows=rows)
 
 
-def unfold_tones(sheet: Sheet) -> tuple[Sheet, list[str]]:
-    """Return one row, with columns of all tones, for rows of one place that are of a tone each; a note."""
+def unfold_tones(sheet: Sheet) -> Sheet:
+    """Return one row, with columns of all tones, for rows of one place that are of a tone each; noted."""
     roles = {head: parse_head(head) for head in sheet.heads}
     parts = {head: read.role for head, read in roles.items() if str(read.role).startswith("csi_")}
     if len(parts) != 2 or any(roles[head].label for head in parts):
-        return sheet, []
+        return sheet
     tones = [head for head in sheet.heads if LISTS["tone"] & {*words_of(unit_of(head)[0])}]
     tone = next((head for head in tones if sheet.frame[head].nunique() > 1), None)
     rest = [head for head in sheet.heads if head not in {*parts, *tones}]
     placed = [h for h in rest if KINDS.get(str(roles[h].role)) in ("length", "angle", "text")]
     values = None if tone is None or not placed else sheet.numbers(tone, roles[tone].unit)
     if values is None or not (values.round() == values).all():
-        return sheet, []
+        return sheet
     place = pd.factorize(sheet.joined(placed))[0]
     long = sheet.frame.assign(**{BY: place, str(tone): values.astype(int)})
     # Radios that hop have a tone for each row, and few rows at a place.
     if long.duplicated([BY, tone]).any() or 2 * len(set(place)) > len(place):
-        return sheet, []
+        return sheet
     wide = long.pivot(index=BY, columns=tone, values=list(parts))
     units = {head: f" [{read.unit.name}]" if read.unit else "" for head, read in roles.items()}
     wide.columns = [f"{parts[head]}_{number}{units[head]}" for head, number in wide.columns]
     first = long.drop_duplicates(BY).index
     rows = tuple(sheet.rows[i] for i in first)
     frame = sheet.frame.loc[first, rest].reset_index(drop=True).join(wide)
-    said = f"rows of one place are tones by {tone!r}: {len(rows)} of {len(sheet)}"
-    return replace(sheet, frame=frame, rows=rows), [said]
+    sheet.notes.append(f"rows of one place are tones by {tone!r}: {len(rows)} of {len(sheet)}")
+    return replace(sheet, frame=frame, rows=rows)
 
 
 BY = "\0place"

@@ -41,9 +41,7 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
         notes.append(Caution(f"{said}: filled in, not measured? {how}"))
     for effect in find_effects(links, row, words):
         head = effect.head
-        said = (
-            f"column {head!r} is not used and explains {effect.share:.0%} of what places and stations leave"
-        )
+        left = f"{effect.share:.0%} of what places and stations leave"
         if effect.kind == "number":
             factor = f"*{abs(effect.size):g}" * (abs(effect.size) != 1)
             power_text += f"{'+' if effect.size < 0 else '-'}{head}{factor}"
@@ -61,5 +59,5 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
             how = f"{say_column('station', '+'.join(names))} tells them apart"
             what = "another transmitter for each value"
             how = "a file for each value takes them apart" if wide else how
-        notes.append(Caution(f"{said}: {what}? {how}"))
+        notes.append(Caution(f"column {head!r} is not used and explains {left}: {what}? {how}"))
     return notes
