@@ -326,6 +326,7 @@ SPOILT = {
     "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
     "JSON": ('[{"x": 1}, {"x"', {}, "damaged or not a JSON, GPX or KML file"),
     "zeros": (b"x,y\0,rssi\n1,2,-80\n", {}, "not text (byte 3 is zero"),
+    "a planner's raster": (b"II*\0\x08\0\0\0", {}, "a raster (TIFF), squares of a map; give the table"),
     "UTF-16 cut short": (PLAIN.encode("utf-16")[:-1], {}, "damaged UTF-16"),
 }  # fmt: skip
 
