@@ -78,11 +78,10 @@ def read_walls(path: str | Path | None) -> SceneWalls:
     if path is None:
         raise DataError(f"init.file is missing; expected a file of {EXPECTED}")
     path, problems = Path(path), Problems(path)
-    walls = SceneWalls((), np.zeros((0, 2, 3)))
-    if path.suffix.lower() in (".yaml", ".yml"):
-        walls = _table(path, problems)
-    else:
-        problems.add(path, "walls are read from *.yaml; write a mesh's faces as `walls`: corners_m of each")
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        meshes = "write a mesh's faces as `walls`: corners_m of each"
+        raise DataError(f"{path}: walls are read from *.yaml; {meshes}")
+    walls = _table(path, problems)
     if not problems and not len(walls):
         problems.add(path, f"no walls in it; expected {EXPECTED}")
     problems.raise_if_any()

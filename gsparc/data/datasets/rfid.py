@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,7 +31,7 @@ from gsparc.data.assemble import centre_positions, check_positions
 from gsparc.data.blocks import allocate
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.campaign import Release, read_split
-from gsparc.data.errors import DataError, Problems
+from gsparc.data.errors import DataError, Problems, readable
 from gsparc.data.files import read_text, read_yaml
 from gsparc.data.limits import finite_array, parse_numbers
 from gsparc.data.links.stations import number_places
@@ -240,42 +241,33 @@ def _read_spectra(folder: Path, positions: str, count: int | None, problems: Pro
     spectra = allocate((count, HEIGHT, WIDTH), np.uint8 if suffix == ".png" else np.float32)
     read = _read_image if suffix == ".png" else _read_numbers
     for i, name in enumerate(expected):
-        fault = read(folder / name, spectra[i])
-        if fault:
-            problems.add(folder / name, fault)
+        problems.attempt(partial(read, folder / name, spectra[i]))
     return spectra
 
 
-def _read_image(path: Path, into: np.ndarray) -> str | None:
-    """Read one PNG into (90, 360) uint8; returns what is wrong with it."""
+def _read_image(path: Path, into: np.ndarray) -> None:
+    """Read one PNG into (90, 360) uint8, or raise `DataError`."""
     expected = f"expected an 8-bit grey PNG of {WIDTH} x {HEIGHT} pixels"
-    try:
-        # The format is fixed: Pillow would otherwise run any of its decoders on a damaged file.
-        with Image.open(path, formats=["PNG"]) as image:
-            if image.mode != "L":
-                return f"{expected}, found mode {image.mode}"
-            if image.size != (WIDTH, HEIGHT):
-                return f"{expected}, found {image.size[0]} x {image.size[1]}"
-            into[:] = np.asarray(image)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        return f"{expected}, not readable ({error})"
-    return None
+    errors = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+    # The format is fixed: Pillow would otherwise run any of its decoders on a damaged file.
+    with readable(path, f"{expected}, not readable", errors), Image.open(path, formats=["PNG"]) as image:
+        if image.mode != "L" or image.size != (WIDTH, HEIGHT):
+            size = f"{image.size[0]} x {image.size[1]}" if image.mode == "L" else f"mode {image.mode}"
+            raise DataError(f"{path}: {expected}, found {size}")
+        into[:] = np.asarray(image)
 
 
-def _read_numbers(path: Path, into: np.ndarray) -> str | None:
-    """Read one array into (90, 360) float32 from 0 to 1; returns what is wrong with it."""
+def _read_numbers(path: Path, into: np.ndarray) -> None:
+    """Read one array into (90, 360) float32 from 0 to 1, or raise `DataError`."""
     expected = f"expected an array of {HEIGHT} x {WIDTH} numbers from 0 to 1, or of 8 bits"
-    try:
+    with readable(path, f"{expected}, not readable", (OSError, ValueError, EOFError)):
         image = np.load(path, allow_pickle=False).squeeze()
-    except (OSError, ValueError, EOFError) as error:
-        return f"{expected}, not readable ({error})"
     if image.shape != (HEIGHT, WIDTH) or image.dtype.kind not in "fu":
-        return f"{expected}, found {image.dtype} {image.shape}"
+        raise DataError(f"{path}: {expected}, found {image.dtype} {image.shape}")
     values = image / 255 if image.dtype == np.uint8 else image
     if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
-        return f"{expected}, found {values.min():g} to {values.max():g}"
+        raise DataError(f"{path}: {expected}, found {values.min():g} to {values.max():g}")
     into[:] = values
-    return None
 
 
 class RFID(Release):

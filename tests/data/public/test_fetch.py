@@ -53,7 +53,7 @@ def test_what_is_damaged_is_fetched_again_and_alone(mirror, monkeypatch, tmp_pat
         monkeypatch, tmp_path, *(mirror.serve(f"release/{n}", c) for n, c in (("1.bin", ONE), ("2.csv", TWO)))
     )
     folder = fetch("room")
-    (folder / "1.bin").write_bytes(ONE[:-1] + b"?")
+    (folder / "1.bin").write_bytes(ONE[:-1] + bytes([ONE[-1] ^ 1]))
     assert (fetch("room") / "1.bin").read_bytes() == ONE
     assert [mirror.asked[f"/makers/data/0123abc/release/{n}"] for n in ("1.bin", "2.csv")] == [2, 1]
 
