@@ -60,6 +60,7 @@ COMMANDS = {
         Command("compare", "every method under the same data, metrics and clock"),
         Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
         Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
+        Command("update", "a model with rows that came later, and what changed: ckpt=FILE data=FILE"),
         Command("export", "the model for other programs: ckpt=FILE to=c, taps, deepmimo"),
         Command("serve", "answers over HTTP: ckpt=FILE"),
         Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),

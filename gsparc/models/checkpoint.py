@@ -103,8 +103,10 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     _write(Path(path), content)
 
 
-def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
+def update_extra(path: str | Path, extra: Mapping[str, Any], out: str | Path | None = None) -> None:
     """Add to (or replace in) the `extra` of a checkpoint; everything else in the file stays as it is.
+
+    With `out` the result is another file, and `path` stays.
 
     Raises:
         CheckpointError: as `read` and `save` do; the file is then as it was.
@@ -113,7 +115,7 @@ def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
     content = _read_content(path)
     _stored_from_content(content, path)  # refuses what is incomplete
     content["extra"] = {**content["extra"], **_to_plain(dict(extra), "extra")}
-    _write(path, content)
+    _write(path if out is None else Path(out), content)
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:

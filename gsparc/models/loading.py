@@ -13,6 +13,7 @@ from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import all_methods, build
 from gsparc.models.splat.method import LearnedField
+from gsparc.models.updated import stored_changes, with_changes
 
 
 def method_from_checkpoint(stored: checkpoint.StoredModel) -> Method:
@@ -53,13 +54,13 @@ def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Me
 
 
 def load(path: str | Path) -> tuple[Method, checkpoint.StoredModel]:
-    """Return `restore(read(path))`, with what else the file holds.
+    """Return `restore(read(path))` with rows that came later, and what else the file holds.
 
     Raises:
         CheckpointError: as these two.
     """
     stored = checkpoint.read(path)
-    return method_from_checkpoint(stored), stored
+    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra)), stored
 
 
 def load_module(path: str | Path) -> GaussianModule:

@@ -34,6 +34,7 @@ from gsparc.prediction.gradients import predict_with_gradients
 from gsparc.prediction.jointly import JointMixin
 from gsparc.prediction.query import DegreesMixin, Queries, match_input
 from gsparc.prediction.timing import Call
+from gsparc.prediction.updating import UpdateMixin, read_versions
 
 if TYPE_CHECKING:
     from gsparc.data.site_objects import GaussianCloud
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from gsparc.prediction.operating_point import Operating
 
 
-class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
+class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     """A fitted method in world coordinates.
 
     Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
@@ -85,6 +86,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin):
         self.method, self.site, self.point = method, site, point
         # A reduced method answers means alone: what states variance or confidence asks the whole one.
         self._whole = whole or method
+        self.versions = read_versions(self.extra)
         self.queries = Queries(site)
         self._unit = unit
         self.unit = self._answer_unit(None).name  # "1" of channels and spectra

@@ -185,6 +185,8 @@ class Tiny:
             words["init_from"] = str(before / "model.ckpt")
         if name == "export":
             words |= {"station": "west", "out": f"{run}-c"}
+        if name == "update":
+            words |= {"data": self.data("city"), "out": f"{run}.ckpt"}
         if name == "predict":
             words |= {"places": "places.csv", "out": f"{run}.csv"}
         if name == "locate" and words.get("dataset") == "fingerprints":
@@ -224,7 +226,18 @@ class Tiny:
 
 
 # Commands about a model.
-ASKING = ("evaluate", "predict", "calibrate", "tradeoff", "map", "place", "link", "locate", "export")
+ASKING = (
+    "evaluate",
+    "predict",
+    "calibrate",
+    "tradeoff",
+    "map",
+    "place",
+    "link",
+    "locate",
+    "export",
+    "update",
+)
 OF_EXPERIMENT = {  # datasets that an experiment is of, where it is not rfid
     "sionna": "sionna", "paper/coverage": "argos_sim", "paper/snr_brackets": "argos_sim",
     "paper/argos": "argos", "paper/sionna_room": "sionna",

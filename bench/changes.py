@@ -1,0 +1,192 @@
+"""Maps that are told of later rows, beside what else could be done: docs/results/changes.csv.
+
+    python bench/changes.py [rooms] [networks] [detections] [months] [rounds]
+
+Room and network are simulated here; months of a library and rounds of a garage are looked for in
+../shared/data/change. Errors are of places that nobody told of, rmse [dB].
+"""
+
+import csv
+import logging
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+import gsparc
+from gsparc.prediction.drift import Watch
+from gsparc.processes.changes import LaterRows
+
+MEASURED = Path(__file__).parents[2] / "shared/data/change"
+OUT = Path(__file__).parents[1] / "docs/results/changes.csv"
+SIDE, STATIONS, KEPT = 40.0, 30, 80
+DRAWS, READINGS, BEGINS = 200, 1000, 300
+
+
+def field(places, seed, length=8.0):
+    """Levels (n,) of a smooth random field with deviation 4 dB."""
+    rng = np.random.default_rng(seed)
+    waves, phase = rng.normal(size=(60, 2)) * 1.4 / length, rng.uniform(0, 2 * np.pi, 60)
+    return 4 * np.sqrt(2 / 60) * np.cos(places[:, :2] @ waves.T + phase).sum(1)
+
+
+def draw(count, seed, side=SIDE):
+    """Places (count, 3) on a floor."""
+    return np.c_[np.random.default_rng(seed).uniform(0, side, (count, 2)), np.full(count, 1.5)]
+
+
+def network(places, seed, later):
+    """Levels (n, T) of an office; later a quarter changed power, moved or failed, and another phone reads."""
+    rng = np.random.default_rng(seed)
+    posts, shift = rng.uniform(0, SIDE, (STATIONS, 2)), np.zeros(STATIONS)
+    fields = np.arange(STATIONS) + 1000 * seed
+    if later:
+        shift[:4] = rng.normal(0, 8, 4)
+        posts[4:7], fields[4:7] = rng.uniform(0, SIDE, (3, 2)), fields[4:7] + 500
+        shift[7] = -60
+    apart = np.linalg.norm(places[:, None, :2] - posts, axis=2)
+    level = -40 - 30 * np.log10(np.maximum(apart, 1)) + np.stack([field(places, s) for s in fields], 1)
+    level += shift - 3 * later + np.random.default_rng(seed + 7 + later).normal(0, 2.5, level.shape)
+    return np.where(level > -95, level, np.nan)
+
+
+def rmse(predicted, truth):
+    """Over what was heard."""
+    return round(float(np.sqrt(np.nanmean((predicted - truth) ** 2))), 3)
+
+
+def judge(name, model, places, levels, told):
+    """Rows of results of one later survey: told of some places, asked about the others."""
+    at, which = np.unique(places, axis=0, return_inverse=True)
+    which, static = which.reshape(-1), model.rssi(rx=places)
+    miss, order = np.ma.masked_invalid(levels - static), np.random.default_rng(0).permutation(len(at))
+    for count in told:
+        new = np.isin(which, order[:count])
+        began = time.monotonic()
+        model.update(rx=places[new], rssi=levels[new])
+        seconds = time.monotonic() - began
+        ways = {
+            "old map": static, "updated": model.rssi(rx=places),
+            "one constant each, of the places told": static + miss[new].mean(0).filled(0),
+            "one constant each, of all later rows": static + miss.mean(0).filled(0),
+        }  # fmt: skip
+        for way, said in ways.items():
+            spent = round(seconds, 3) if way == "updated" else ""
+            yield name, f"{count} places", way, rmse(said[~new], levels[~new]), spent
+        model.undo()
+
+
+def networks():
+    """Offices of 30 access points, 120 places before and 100 later; with and without changes."""
+    for seed in (1, 2, 3):
+        before, later = draw(120, seed), draw(100, 50 + seed)
+        unknown = np.full((STATIONS, 3), np.nan)
+        fit = {"rx": before, "rssi": network(before, seed, False), "station_position": unknown}
+        model = gsparc.fit(**fit, model="gp")
+        yield from judge(f"office {seed}, changed", model, later, network(later, seed, True), (5, 20))
+        yield from judge(f"office {seed}, as before", model, later, network(later, seed, False), (5, 20))
+
+
+def rooms():
+    """One transmitter, 300 rows; then a screen of 12 dB in a disc of 4 m, and rows in and around it."""
+    before, asked, near = draw(300, 0, 20.0), draw(3000, 11, 20.0), draw(4000, 6, 20.0)
+
+    def level(places, later=True):
+        disc = np.linalg.norm(places[:, :2] - 5, axis=1) < 4
+        return -60 + field(places, 1, 4.0) - 12 * (disc & later), disc
+
+    def measure(places, seed, later=True):
+        return level(places, later)[0] + np.random.default_rng(seed).normal(size=len(places))
+
+    near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6]
+    truth, disc = level(asked)
+    rows, heard, right = before, measure(before, 2, False), ~level(before)[1]
+    post = {"tx": [9.0, 9.0, 2.6], "model": "gp"}
+    model = gsparc.fit(rx=rows, rssi=heard, **post)
+    for count in (5, 10, 20, 50):
+        new, told = near[:count], measure(near, 3)[:count]
+        old, began = model.rssi(rx=asked)[:, 0], time.monotonic()
+        model.update(rx=new, rssi=told)
+        spent = round(time.monotonic() - began, 3)
+        ways = {"old map": old, "updated": model.rssi(rx=asked)[:, 0]}
+        sets = {"retrained on all": slice(None), "retrained on the right rows": right}
+        for way, kept in sets.items():
+            part = {"rx": np.r_[rows[kept], new], "rssi": np.r_[heard[kept], told]}
+            ways[way] = gsparc.fit(**part, **post).rssi(rx=asked)[:, 0]
+        ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=told, **post).rssi(rx=asked)[:, 0]
+        for way, said in ways.items():
+            for part, where in (("in the disc", disc), ("elsewhere", ~disc)):
+                figure = rmse(said[where], truth[where])
+                yield f"room, {part}", f"{count} rows", way, figure, spent if way == "updated" else ""
+        model.undo()
+
+
+def readings(kind, seed, count):
+    """Rows of one station as they miss a map, whose error is .7 dB and noise 2 dB; changed from BEGINS on."""
+    rng = np.random.default_rng(seed)
+    places = np.c_[rng.uniform(-10, 10, (count, 2)), np.zeros(count)]
+    later, level = np.arange(count) >= BEGINS, 1.5 * field(places, seed + 1, 5.0)
+    missed = 0.175 * field(places, seed, 2.0) + rng.normal(0, 2, count)
+    missed -= 6 * (later & (kind == "offset"))
+    missed -= 12 * (later & (kind == "local") & (np.linalg.norm(places[:, :2] - 2, axis=1) < 4))
+    missed -= np.where(later & (kind == "moved"), level - 1.5 * field(places, seed + 2, 5.0), 0)
+    parts = places, level - 60, missed, np.full(count, 0.49), np.full(count, 4.0), np.zeros(count)
+    number = torch.arange(count)
+    return LaterRows(number, 0 * number, *map(torch.from_numpy, parts), number < 0)
+
+
+def detections():
+    """Alarms of sequences without change, then delays, and what was named, for three kinds."""
+    site = SimpleNamespace(stations=None, moving_box=np.array([[-10.0, -10, 0], [10, 10, 0]]))
+
+    def alarms(kind, seed, count):
+        return Watch.from_site(site).look({0: readings(kind, seed, count)}, 0, 28.0)[0].alarms
+
+    false = sum(len(alarms("none", seed, READINGS)) for seed in range(DRAWS))
+    yield "alarms without change", f"{DRAWS} x {READINGS} readings", "e-detector", false, ""
+    for kind in ("offset", "local", "moved"):
+        found = [alarms(kind, 5000 + seed, BEGINS + 300) for seed in range(DRAWS)]
+        first = [next((one for one in each if one.at >= BEGINS), None) for each in found]
+        delay = [BEGINS + 300 if one is None else one.at - BEGINS + 1 for one in first]
+        names = [one.kind for one in first if one is not None]
+        for way, figure in (("median", np.median(delay)), ("90 %", np.quantile(delay, 0.9))):
+            yield f"delay, {kind}", f"{DRAWS} sequences", way, float(figure), ""
+        yield f"named, {kind}", f"{DRAWS} sequences", "rightly", names.count(kind) / DRAWS, ""
+
+
+def measured(file, epoch):
+    """Months of a library, rounds of a garage: the first learns, later ones tell of 5 places, a fifth."""
+    data = np.load(MEASURED / file)
+    places, levels, of = data["position"].astype(float), data["rss_dbm"].astype(float), data[epoch]
+    places = np.c_[places, np.full(len(places), 1.5)][:, :3]
+    visit, first, at = np.unique(np.c_[of, places], axis=0, return_index=True, return_inverse=True)
+    # Several readings of a place in an epoch are their mean.
+    sums = [np.zeros((len(visit), levels.shape[1])) for _ in range(2)]
+    for total, values in zip(sums, (np.nan_to_num(levels), np.isfinite(levels)), strict=True):
+        np.add.at(total, at.reshape(-1), values)
+    levels = np.where(sums[1] > 0, sums[0] / np.maximum(sums[1], 1), np.nan)
+    places, of = places[first], of[first]
+    heard = np.isfinite(levels[of == 1]).sum(0) >= KEPT
+    levels, unknown = levels[:, heard], np.full((heard.sum(), 3), np.nan)
+    first = {"rx": places[of == 1], "rssi": levels[of == 1], "station_position": unknown}
+    model = gsparc.fit(**first, model="gp")
+    for number in np.unique(of)[1:]:
+        own = of == number
+        fifth = len(np.unique(places[own], axis=0)) // 5
+        yield from judge(f"{epoch} {number}", model, places[own], levels[own], (5, fifth))
+
+
+PARTS = {
+    "networks": networks, "rooms": rooms, "detections": detections,
+    "months": lambda: measured("library-months.npz", "month"),
+    "rounds": lambda: measured("garage-rounds.npz", "round"),
+}  # fmt: skip
+
+if __name__ == "__main__":
+    logging.disable(logging.WARNING)
+    for name in sys.argv[1:] or PARTS:
+        with OUT.open("a", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(PARTS[name]())

@@ -1,0 +1,85 @@
+"""`gsparc update ckpt=FILE data=NEW out=FILE`: a model with rows that came later, and what changed."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+from typing import Any
+
+from omegaconf import DictConfig
+
+from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.data.errors import DataError
+from gsparc.data.files import write_whole
+from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
+from gsparc.evaluation.open_runs import read_like_stored
+from gsparc.evaluation.table import Column, Table
+from gsparc.models import checkpoint
+from gsparc.prediction.operating_point import load
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.updating import level_rows, versions_extra
+from gsparc.training.stopwatch import Stopwatch
+
+log = logging.getLogger(__name__)
+
+LIMITS = {
+    "window": whole(1), "fade_db": number(0), "undo": whole(0), "false_alarm": POSITIVE,
+    "batch": or_null(whole(1)),
+}  # fmt: skip
+COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Condition a model on a file's rows, or go back; return the facts of `summary.json`."""
+    run_dir, settings = begin_run(config)
+    check_arguments(config, **LIMITS)
+    if (config.data is None) == (config.undo == 0):
+        raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
+    stored = checkpoint.read(config.ckpt)
+    predictor = load(config.ckpt)
+    known, watch = len(predictor.alarms), Stopwatch()
+    if config.undo:
+        predictor.undo(config.undo)
+    else:
+        data, placed = read_like_stored(stored, config.data)
+        if not placed:
+            raise DataError(f"{config.data}: has no places; later rows need them")
+        how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
+        rows = level_rows(data, predictor.site)
+        for start in range(0, len(rows), config.batch or len(rows)):
+            predictor.update(rows[start : start + (config.batch or len(rows))], **how)
+    seconds, out = watch.seconds, config.out or config.ckpt
+    checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
+    table = alarm_rows(predictor)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(table)
+    write_whole(run_dir / "changes.csv", text.getvalue())
+    facts = {
+        "ckpt": str(config.ckpt), "out": str(out), "model/name": predictor.method.name,
+        "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - known,
+        "update/versions": len(predictor.versions), "time/update_s": seconds,
+    }  # fmt: skip
+    before = (
+        f"{predictor.journal[-1] if predictor.journal else 'as it was learned'}; model in {out}; summary "
+    )
+    return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
+
+
+def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:
+    """Return alarms as rows of `changes.csv`: names of stations, places in world coordinates."""
+    origin, rows = predictor.site.origin, []
+    for one in predictor.alarms:
+        name = "all" if one.station < 0 else (predictor.stations or ["the station"])[one.station]
+        x, y = (round(float(a + b), 2) for a, b in zip(one.place, origin[:2], strict=True))
+        told = name, one.kind, one.since, one.at, round(one.change_db, 2), x, y
+        rows.append(dict(zip(COLUMNS, told, strict=True)))
+    return rows
+
+
+def changes_table(rows: list[dict[str, Any]]) -> Table:
+    """Return what changed, as people read it."""
+    columns = [Column(name, ".1f" if name in ("change_db", "x", "y") else "", of=name) for name in COLUMNS]
+    return Table.from_rows("What changed: kind, numbers of rows, dB, about where [m]", columns, rows[-20:])

@@ -1,0 +1,152 @@
+"""A map of powers with what later rows say of it; what it was learned from stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsparc.data.query import Query
+from gsparc.data.schema import Site
+from gsparc.models.method import HasProcess, Method, MethodFactory, Prediction
+from gsparc.models.per_station import PerStation
+from gsparc.models.reduced import View
+from gsparc.models.target_rows import linear_moments
+from gsparc.processes.changes import TINY, Belief, LaterRows, correct
+from gsparc.processes.stored import Stored, from_plain
+
+STORED = "updates"  # in what a checkpoint holds besides
+UNSAID = 1.0  # variance of powers, of their square, where a method states none
+SIGNAL = 0.2  # share of a stated variance that counts as the map's own error where nothing tells it apart
+
+
+@dataclass(frozen=True)
+class Changes(Stored):
+    """What came after a map was learned.
+
+    Attributes:
+        belief: see there.
+        rows: later rows, a pair of station and rows each; 0 stands for a site with one station.
+        shifts: (station, dB) that was said of stations, not measured.
+        next_number, next_batch: of the row and of the update that come next.
+    """
+
+    belief: Belief
+    rows: tuple[tuple[int, LaterRows], ...] = ()
+    shifts: tuple[tuple[int, float], ...] = ()
+    next_number: int = 0
+    next_batch: int = 0
+
+    @property
+    def stations(self) -> dict[int, LaterRows]:
+        """Later rows by station."""
+        return dict(self.rows)
+
+
+@dataclass(frozen=True)
+class Level:
+    """A map's level (B,) [dB], the variance of its error, and that of a measurement's noise [dB^2]."""
+
+    mean: Tensor
+    doubt: Tensor
+    noise: Tensor
+
+    def __getitem__(self, chosen: Tensor) -> Level:
+        """Return the rows `chosen`."""
+        return Level(self.mean[chosen], self.doubt[chosen], self.noise[chosen])
+
+
+def map_level(method: Method, said: Prediction, site: Site) -> Level:
+    """Return what a map of powers of a site said, its variance told apart into its error and noise."""
+    spread = torch.full((len(said.mean),), UNSAID) * said.mean[:, 0].square()
+    spread = spread if said.variance is None else said.variance
+    moments = site.target.moments_in_error_unit(said.mean[:, 0], spread)
+    mean, variance = (part.detach().double() for part in moments)
+    process = method.process() if isinstance(method, HasProcess) else None
+    if process is None:
+        return Level(mean, SIGNAL * variance, (1 - SIGNAL) * variance)
+    noise = (variance * 0 + process.kernel.amplitude * process.kernel.noise).minimum(variance)
+    return Level(mean, variance - noise, noise)
+
+
+class Updated(View):
+    """Answers of `inner` with later rows.
+
+    Args:
+        inner: fitted to powers.
+        changes: of all stations.
+        own: the station that it answers for; None: as a query says.
+    """
+
+    no_gradient = "later rows were told to it: gradients are those of the map before, from its first file"
+
+    def __init__(self, inner: Method, changes: Changes, own: int | None) -> None:
+        super().__init__(inner)
+        self.changes, self.own, self.site = changes, own, inner.fitted_site
+
+    @property
+    def stored_class(self) -> type[MethodFactory]:
+        """That of the map: later rows are stored beside it."""
+        return self.inner.stored_class
+
+    @property
+    def label(self) -> str:
+        """The map's, and how many rows came later."""
+        return f"{self.inner.label}, updated"
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        said, site = self.inner.predict(query), self.fitted_site
+        before = map_level(self.inner, said, site)
+        mean, doubt = before.mean.clone(), before.doubt.clone()
+        rows, places, shifts = self.changes.stations, query.places(site), dict(self.changes.shifts)
+        number = query.station
+        if self.own is not None or number is None:
+            number = torch.full((len(query),), self.own or 0)
+        for station in number.unique().tolist():
+            at = (number == station).nonzero()[:, 0]
+            if len(later := rows.get(station, LaterRows.empty())) or self.changes.belief.common:
+                mean[at], doubt[at] = correct(
+                    self.changes.belief, station, later, places[at], mean[at], doubt[at]
+                )
+            mean[at] += shifts.get(station, 0.0)
+        unknown = None
+        if said.unknown is not None:
+            share = (doubt + before.noise) / (before.doubt + before.noise + TINY)
+            unknown = (said.unknown * share).clamp(0, 1).to(said.unknown.dtype)
+        power, variance = linear_moments(mean, doubt + before.noise)
+        kind = said.mean.dtype
+        return Prediction(power.to(kind), variance.to(kind), unknown)
+
+    def state(self) -> dict[str, Any]:  # type: ignore[override]
+        """Return that of the map: later rows are stored beside it."""
+        return self.inner.state()
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """Return those of the map."""
+        return self.inner.facts()
+
+
+def stored_changes(extra: Mapping[str, Any]) -> Changes | None:
+    """Return what came after the map of a checkpoint, of its last version; None: nothing."""
+    versions = extra.get(STORED)
+    changes = from_plain(versions[-1]["state"]["changes"]) if versions else None
+    return changes if changes is not None and (changes.rows or changes.shifts) else None
+
+
+def with_changes(method: Method, changes: Changes | None) -> Method:
+    """Return a method with later rows in place of what it had of them; None: as it was learned."""
+    if isinstance(method, PerStation):
+        result = copy(method)
+        result._copies = {number: _with_own(one, changes, number) for number, one in method}
+        return result
+    return _with_own(method, changes, 0 if method.site is None or method.site.stations is None else None)
+
+
+def _with_own(method: Method, changes: Changes | None, own: int | None) -> Method:
+    inner = method.inner if isinstance(method, Updated) else method
+    return inner if changes is None else Updated(inner, changes, None if own is not None and own < 0 else own)

@@ -1,0 +1,324 @@
+"""Later rows: told to a `Predictor`, forgotten, undone, and what they say of changes."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.links.stations import find_station
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.units import PowerUnit
+from gsparc.models.device_offsets import without_devices
+from gsparc.models.method import Method, predict_with_threads
+from gsparc.models.per_station import PerStation, station_site
+from gsparc.models.updated import STORED, Changes, Level, map_level, stored_changes, with_changes
+from gsparc.prediction.drift import ROWS, Alarm, Watch
+from gsparc.prediction.query import read_places
+from gsparc.processes.changes import Belief, LaterRows, learn
+from gsparc.processes.stored import Stored, from_plain, to_plain
+
+WINDOW = 1_000  # later rows of a station that are kept
+FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before
+VERSIONS = 11  # that are kept, the one that answers among them
+LOUD = 2.0  # deviations that a map must be above a level for silence to contradict it
+
+
+@dataclass(frozen=True)
+class Version(Stored):
+    """What later rows made of a map.
+
+    Attributes:
+        changes: rows, and what they say together.
+        watch: state of the sequential test.
+        journal: a line for each thing that was done, the last one last.
+    """
+
+    changes: Changes
+    watch: Watch
+    journal: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class LevelRows:
+    """Levels that were measured, as they came.
+
+    Attributes:
+        places: (n, 3) of the end that moves, local [m].
+        level: (n,) [dB] of stored powers.
+        station: (n,) int64.
+        side: (n,) int8, see `Measurements.censored`.
+    """
+
+    places: np.ndarray
+    level: np.ndarray
+    station: np.ndarray
+    side: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.level)
+
+    def __getitem__(self, chosen: slice) -> LevelRows:
+        """Return the rows `chosen`."""
+        return LevelRows(*(part[chosen] for part in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Found:
+    """What an update found.
+
+    Attributes:
+        rows: (n,) numbers of the new rows, for `forget`.
+        deviations: (n,) what each missed of map and earlier rows, over its standard deviation.
+        alarms: changes that were noticed with these rows.
+        skipped: rows that tell nothing: silence where little was expected, or of a station without a map.
+    """
+
+    rows: np.ndarray
+    deviations: np.ndarray
+    alarms: tuple[Alarm, ...]
+    skipped: int
+
+
+class UpdateMixin:
+    """What a `Predictor` of powers learns after its fit, at settings as they are."""
+
+    site: Site
+    method: Method
+    versions: tuple[Version, ...]
+    _whole: Method
+    _prepared: list[Method]
+    _answer_unit: Callable[[str | None], PowerUnit]
+
+    @property
+    @abstractmethod
+    def stations(self) -> list[str]:
+        """See `Predictor`."""
+
+    def update(
+        self, rows: Measurements | LevelRows | None = None, *, tx: Any = None, rx: Any = None,
+        rssi: Any = None, unit: str | None = None, window: int = WINDOW, fade_db: float = FADE_DB,
+        false_alarm: float = ROWS,
+    ) -> Found:  # fmt: skip
+        """Condition on rows that came later, and tell what changed.
+
+        The map that was fitted stays as it is; rows say what to add to it. See `docs/changes.md`.
+
+        >>> before = float(predictor.rssi(rx=[2.0, 1.0, 1.5])[0])
+        >>> found = predictor.update(rx=[[2.0, 1.0, 1.5]] * 4, rssi=[before - 20] * 4)
+        >>> bool(predictor.rssi(rx=[2.0, 1.0, 1.5])[0] < before - 5), len(found.rows)
+        (True, 4)
+        >>> predictor.undo()
+        >>> bool(predictor.rssi(rx=[2.0, 1.0, 1.5])[0] == before)
+        True
+
+        Args:
+            rows: measurements in the model's coordinates (`align_to_site`); None: the arrays that follow.
+            tx, rx: (n, 3) places of the end that moves, world [m].
+            rssi: (n,) or (n, T) powers; NaN is not measured.
+            unit: of `rssi`; None: that of the measurements.
+            window: later rows of a station that are kept, at least 1; the first ones are dropped.
+            fade_db: deviation that a hundred later rows of a station add to one that came before [dB].
+            false_alarm: readings to a false alarm without any change, at least, in the mean.
+
+        Raises:
+            ValueError: no powers, both ends move, or arrays that do not go together.
+        """
+        if self.site.kind != "rssi" or self.site.static_end is None:
+            raise ValueError("update: takes powers where one end stands still; train on all rows instead")
+        if rows is None:
+            rows = self._rows_of_arrays(tx, rx, rssi, unit)
+        rows = level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
+        if window < 1:
+            raise ValueError(f"update: window={window}: at least one row of a station is kept")
+        version, first = self._current, self._current.changes.next_number
+        changes, stations, extent = version.changes, version.changes.stations, version.changes.belief.extent
+        new = self._read_rows(rows, changes)
+        for name, later in new.items():
+            before = stations.get(name, later[:0])
+            stations[name] = before.fade(later, extent, fade_db).join(later)[-window:]
+        watch, deviations = version.watch.look(stations, first, extent, false_alarm)
+        numbers = np.arange(first, first + sum(map(len, new.values())))
+        alarms, skipped = watch.alarms[len(version.watch.alarms) :], len(rows) - len(numbers)
+        said = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
+        changes = replace(changes, next_number=first + len(numbers), next_batch=changes.next_batch + 1)
+        self._add_version(stations, said, changes, watch)
+        return Found(numbers, deviations, alarms, skipped)
+
+    def forget(self, rows: Any) -> None:
+        """Forget later rows by their numbers (see `measured`); what the map was learned from stays.
+
+        Raises:
+            ValueError: no later row has such a number.
+        """
+        gone, stations = np.atleast_1d(np.asarray(rows, np.int64)), self._current.changes.stations
+        if len(unknown := np.setdiff1d(gone, self.rows)):
+            raise ValueError(f"forget: no later row that is kept has number {unknown[0]}; see `measured`")
+        left = {n: one[~torch.isin(one.number, torch.from_numpy(gone))] for n, one in stations.items()}
+        self._add_version(left, f"forget: {len(gone)} rows")
+
+    def shift(self, change_db: float, station: str | int | None = None) -> None:
+        """Say that the level of a station, or of all, is so many decibels higher from now on.
+
+        Raises:
+            ValueError: no such station, or no finite number.
+        """
+        every = self.site.stations
+        number = None if station is None or every is None else find_station(station, every)
+        if station is not None and number is None:
+            raise ValueError(f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}")
+        if not np.isfinite(change_db):
+            raise ValueError(f"shift: change_db={change_db} is no finite number")
+        names = range(len(every or (0,))) if number is None else [number]
+        changes = self._current.changes
+        shifts = {n: dict(changes.shifts).get(n, 0.0) + float(change_db) for n in names}
+        shifts = dict(changes.shifts) | shifts
+        said = f"shift: {change_db:+g} dB of {'all stations' if station is None else station}"
+        self._add_version(changes.stations, said, replace(changes, shifts=tuple(sorted(shifts.items()))))
+
+    def undo(self, count: int = 1) -> None:
+        """Go back so many versions, bit for bit; `ValueError` where so many are not kept."""
+        if not 1 <= count < len(self.versions):
+            raise ValueError(f"undo: {count} back, {max(len(self.versions) - 1, 0)} are kept")
+        self._become(self.versions[:-count])
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Numbers (n,) of the later rows that are kept, in the order they came."""
+        return self.measured["number"]
+
+    @property
+    def measured(self) -> dict[str, np.ndarray]:
+        """Later rows that are kept, as they came: `number`, `batch`, `station`, `place`, `level`, `faded_db`.
+
+        Stations by number, places (n, 3) [m, world], levels in `site.level_unit`, and the deviation by which
+        each has faded since [dB].
+        """
+        pairs = self._current.changes.rows
+        parts = [one for _, one in pairs]
+        joined = reduce(LaterRows.join, parts, LaterRows.empty())
+        of = np.repeat([name for name, _ in pairs], [len(one) for one in parts]).astype(np.int64)
+        result = {
+            "number": joined.number, "batch": joined.batch, "station": torch.from_numpy(of),
+            "place": joined.places + torch.from_numpy(self.site.origin) if len(joined) else joined.places,
+            "level": joined.level + joined.missed + 10 * np.log10(self.site.target_scale),
+            "faded_db": joined.faded.sqrt(),
+        }  # fmt: skip
+        order = joined.number.argsort()
+        return {name: value[order].numpy() for name, value in result.items()}
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Changes that were noticed, in their order."""
+        return self._current.watch.alarms
+
+    @property
+    def journal(self) -> tuple[str, ...]:
+        """A line for each thing that was done since the fit."""
+        return self._current.journal
+
+    # -- versions --------------------------------------------------------------------------------------
+
+    @property
+    def _current(self) -> Version:
+        if self.versions:
+            return self.versions[-1]
+        extent = float(np.linalg.norm(np.ptp(self.site.moving_box[:, :3], axis=0)))
+        return Version(Changes(Belief(max(extent, 1e-3))), Watch.from_site(self.site))
+
+    def _add_version(
+        self, stations: dict[int, LaterRows], said: str, changes: Changes | None = None,
+        watch: Watch | None = None,
+    ) -> None:  # fmt: skip
+        """Learn from stations' rows together, and answer by it."""
+        now = self._current
+        changes = replace(
+            changes or now.changes, rows=tuple(sorted(stations.items())),
+            belief=learn(stations, now.changes.belief.extent),
+        )  # fmt: skip
+        version = Version(changes, watch or now.watch, (*now.journal, said))
+        self._become((*(self.versions or (now,)), version)[-VERSIONS:])
+
+    def _become(self, versions: tuple[Version, ...]) -> None:
+        told = stored_changes(versions_extra(versions[-1:]))
+        whole_is_same = self._whole is self.method
+        self.versions, self.method = versions, with_changes(self.method, told)
+        self._whole = self.method if whole_is_same else with_changes(self._whole, told)
+        self._prepared.clear()
+
+    # -- rows ------------------------------------------------------------------------------------------
+
+    def _rows_of_arrays(self, tx: Any, rx: Any, rssi: Any, unit: str | None) -> LevelRows:
+        """Rows of arrays of the API."""
+        places = {"tx": tx, "rx": rx}[self.site.moving_end]
+        count = len(self.site.stations or (0,))
+        if places is None or rssi is None:
+            raise ValueError(f"update: {self.site.moving_end}= and rssi= are needed")
+        at = np.atleast_2d(read_places(self.site.moving_end, places)) - self.site.origin
+        powers = np.asarray(rssi, np.float64).reshape(len(at), -1)
+        if powers.shape[1] != count:
+            raise ValueError(
+                f"update: rssi= of shape {np.shape(rssi)}, {len(at)} places and {count} stations"
+            )
+        stored = self._answer_unit(unit).stored(torch.from_numpy(powers)).numpy()
+        row, station = np.nonzero(np.isfinite(powers) & (stored > 0))
+        level = 10 * np.log10(stored[row, station])
+        return LevelRows(at[row], level, station, np.zeros(len(row), np.int8))
+
+    def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
+        """New rows of each station that has a map, as they miss it."""
+        method, site = with_changes(self.method, None), self.site
+        number, result, shifts = np.full(len(rows), -1), {}, dict(changes.shifts)
+        said: dict[int, tuple[np.ndarray, Level]] = {}
+        for name in np.unique(rows.station).tolist():
+            own = np.flatnonzero(rows.station == name)
+            try:
+                answers = method.station_method(name) if isinstance(method, PerStation) else method
+            except ValueError:  # it had too few rows to be learned
+                continue
+            there = station_site(site, name) if isinstance(method, PerStation) else site
+            query = Query.from_places(there, torch.from_numpy(rows.places[own]).float())
+            level = map_level(answers, predict_with_threads(answers, query), site)
+            missed = rows.level[own] - level.mean.numpy() - shifts.get(name, 0.0)
+            # Of silence only a level is known that the power is below.
+            tells = missed * -rows.side[own] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
+            used = np.flatnonzero((rows.side[own] == 0) | tells)
+            said[name] = own[used], level[torch.from_numpy(used)]
+            number[own[used]] = 0
+        number[number == 0] = changes.next_number + np.arange((number == 0).sum())
+        for name, (own, level) in said.items():
+            missed = torch.from_numpy(rows.level[own]) - level.mean - shifts.get(name, 0.0)
+            result[name] = LaterRows(
+                torch.from_numpy(number[own]), torch.full((len(own),), changes.next_batch),
+                torch.from_numpy(rows.places[own]), level.mean, missed, level.doubt, level.noise,
+                torch.zeros_like(missed), torch.from_numpy(rows.side[own] != 0),
+            )  # fmt: skip
+        return {name: one for name, one in result.items() if len(one)}
+
+
+def level_rows(data: Measurements, site: Site) -> LevelRows:
+    """Return measurements of powers, in a model's coordinates, as `update` takes them, in their order."""
+    data = without_devices(data, site)
+    rows = np.arange(len(data)) if data.sequence is None else np.argsort(data.sequence, kind="stable")
+    if data.mask is not None:
+        rows = rows[data.mask[rows].reshape(len(rows)) | (data.censored_side(rows) != 0)]
+    side = data.censored_side(rows)
+    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
+    return LevelRows(data.moving[rows], level, station, side)
+
+
+def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
+    """Return the versions that a checkpoint holds, the last one last; none where it was never updated."""
+    return tuple(map(from_plain, extra.get(STORED, ())))
+
+
+def versions_extra(versions: Sequence[Version]) -> dict[str, Any]:
+    """Return what a checkpoint holds of versions, for `checkpoint.update_extra`."""
+    return {STORED: [to_plain(one) for one in versions]}

@@ -1,0 +1,308 @@
+"""What rows that came later say of a map of levels: a mixture of kinds of change, each a process of its own.
+
+A later row misses the map by the map's own error, by what changed, and by noise. What changed is one of
+`KINDS`: nothing, one offset, a part of the place, or all of it. Every kind is a Gaussian process, so that
+what rows say of other places is in closed form; the answer is the mean over kinds, weighed by how likely they
+make the rows of a station (Bayesian model averaging), and shares of kinds follow from all stations together.
+Only systems of a station's nearest rows are solved, never one of all rows that a map was learned from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.processes.averages import MeanVariance
+from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.stored import Stored
+
+ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
+NEAR, LOOKED = 64, 40  # rows that tell of a place; latest ones of a station that tell its kind of change
+BLOCK = 64  # queries at a time where each has neighbours of its own: memory
+NOISES = (1.0, 2.0, 4.0)  # factors of the noise's variance that are tried
+STRENGTH = 10.0  # stations that shares of kinds before any row count as
+SETTLED, LEAST = 25, 0.02  # rounds of shares; weight below which a kind is not asked
+COMMON = 5  # stations that an offset of all of them is told from
+SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
+TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
+HUNDRED = 100.0  # later rows that a fading is stated for
+TINY = 1e-6  # [dB^2]
+
+
+class Kind(NamedTuple):
+    """A kind of change, as a process.
+
+    Attributes:
+        name: see `KINDS`.
+        offset, local: deviations [dB] of an offset, and of what differs by place.
+        size: length of the latter as a share of the site.
+        keeps: 1 where the map still tells, 0 where it does not.
+        share: of stations before any row.
+    """
+
+    name: str
+    offset: float
+    local: float
+    size: float
+    keeps: float
+    share: float
+
+
+KINDS = (
+    Kind("none", 0.0, 0.0, 0.1, 1.0, 0.8),
+    Kind("offset", 2.5, 0.0, 0.1, 1.0, 0.06),
+    Kind("offset", 10.0, 0.0, 0.1, 1.0, 0.04),
+    Kind("local", 0.5, 6.0, 1 / 10, 1.0, 0.04),
+    Kind("local", 3.0, 3.0, 1 / 4, 1.0, 0.04),
+    Kind("moved", 10.0, 8.0, 1 / 4, 0.0, 0.02),
+)
+OFFSET, LOCAL, SIZE, KEEPS, SHARE = (
+    torch.tensor(part).double() for part in zip(*(k[1:] for k in KINDS), strict=True)
+)
+
+
+@dataclass(frozen=True)
+class Belief(Stored):
+    """What all stations' rows say together.
+
+    Attributes:
+        extent: of the site [m].
+        common: offset that all stations share [dB].
+        noise: factor of the noise's variance.
+        share: (K,) of stations by kind of change.
+        weight: (T, K) of each kind, by station.
+        names: (T,) numbers of these stations.
+    """
+
+    extent: float
+    common: float = 0.0
+    noise: float = 1.0
+    share: Tensor = SHARE
+    weight: Tensor = SHARE[None, :0]
+    names: tuple[int, ...] = ()
+
+    def weights_of(self, station: int) -> Tensor:
+        """Return weights (K,) of the kinds of a station."""
+        return self.weight[self.names.index(station)] if station in self.names else self.share
+
+
+@dataclass(frozen=True)
+class LaterRows(Stored):
+    """Rows of one station that came after its map was learned.
+
+    Attributes:
+        number: (n,) int64 of each row, ascending as they came.
+        batch: (n,) int64, the update that it came with.
+        places: (n, D) float64 [m].
+        level: (n,) of the map there [dB].
+        missed: (n,) what was measured less that [dB].
+        doubt: (n,) variance of the map's error there [dB^2].
+        noise: (n,) variance of a measurement [dB^2].
+        faded: (n,) variance that was added since, as later rows contradict [dB^2].
+        silent: (n,) bool, where nothing was heard, and the level that it was below stands for the power.
+    """
+
+    number: Tensor
+    batch: Tensor
+    places: Tensor
+    level: Tensor
+    missed: Tensor
+    doubt: Tensor
+    noise: Tensor
+    faded: Tensor
+    silent: Tensor
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    @classmethod
+    def empty(cls) -> LaterRows:
+        """Return no rows."""
+        none, number = torch.zeros(0).double(), torch.zeros(0, dtype=torch.int64)
+        place = torch.zeros(0, 3).double()
+        return cls(number, number, place, none, none, none, none, none, none > 0)
+
+    def __getitem__(self, chosen: Tensor | slice) -> LaterRows:
+        """Return the rows `chosen`."""
+        return LaterRows(*(part[chosen] for part in vars(self).values()))
+
+    def join(self, later: LaterRows) -> LaterRows:
+        """Return these rows and later ones."""
+        pairs = zip(vars(self).values(), vars(later).values(), strict=True)
+        return LaterRows(*(torch.cat(pair) for pair in pairs))
+
+    @property
+    def middle(self) -> Tensor:
+        """What a map that tells nothing any more is taken for [dB]."""
+        return self.level.mean()
+
+    def fade(self, later: LaterRows, extent: float, fade_db: float) -> LaterRows:
+        """Return the rows with the variance that their age adds, and what later ones contradict of them.
+
+        Of what the means of both miss nearby, first of an offset of all, then of what is left, the square
+        counts beyond `SURE` deviations.
+        """
+        near = matern32(distances(later.places, self.places), extent / 10) + TINY
+        total, spread = near.sum(1), self.doubt + self.noise + self.faded
+        off = later.missed - near @ self.missed / total
+        error = later.doubt + later.noise + near.square() @ spread / total.square()
+        offset, unsure = off.mean(), SURE**2 * error.mean() / len(off)
+        added = (offset.square() - unsure).clamp_min(0.0)
+        left, total = off - offset * (added > 0), near.sum(0)
+        local = (left @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
+        aged = fade_db**2 * len(later) / HUNDRED
+        return replace(self, faded=self.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
+
+
+def _covariance(
+    a: Tensor, b: Tensor, doubt_a: Tensor, doubt_b: Tensor, extent: float, kinds: Tensor | slice = slice(None)
+) -> Tensor:
+    """Covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D), by kind."""
+    apart = distances(a, b)[..., None, :, :]
+    doubt = (doubt_a[..., :, None] * doubt_b[..., None, :]).sqrt()[..., None, :, :]
+    own = doubt * matern32(apart, extent * ERRORS)
+    each = (part[kinds, None, None] for part in (OFFSET.square(), LOCAL.square(), SIZE * extent, KEEPS))
+    offset, local, length, keeps = each
+    return keeps * own + offset + local * matern32(apart, length)
+
+
+def _values(rows: LaterRows, common: float) -> Tensor:
+    """What each kind has to explain (K, n) [dB]."""
+    return rows.missed + (1 - KEEPS)[:, None] * (rows.level - rows.middle) - common
+
+
+def evidence(stations: Sequence[LaterRows], extent: float, common: float) -> Tensor:
+    """Return log densities (T, len(NOISES), K) of the latest rows of each station [nats]."""
+    every = [rows[-LOOKED:] for rows in stations]
+    most = max(len(rows) for rows in every)
+    # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
+    missed = torch.stack([_padded(_values(rows, common).T, most) for rows in every]).mT
+    parts = (torch.stack([_padded(getattr(rows, n), most) for rows in every]) for n in ("places", "doubt"))
+    places, doubt = parts
+    noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in every])[:, None]
+    faded = torch.stack([_padded(rows.faded, most) for rows in every])[:, None]
+    noise = torch.tensor(NOISES).double()[:, None] * noise + faded + TINY
+    gram = _covariance(places, places, doubt, doubt, extent)[:, None].repeat(1, len(NOISES), 1, 1, 1)
+    gram.diagonal(dim1=-2, dim2=-1).add_(noise[:, :, None])
+    factor = Factor.from_gram(gram, "raise")
+    white = factor.whiten(missed[:, None, ..., None].expand(-1, len(NOISES), -1, -1, -1))
+    return -0.5 * (white.square().sum((-1, -2)) + factor.log_determinant)
+
+
+def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
+    """Values (n, ...) and as many more of `filling` as `length` lacks."""
+    return torch.cat([values, values.new_full((length - len(values), *values.shape[1:]), filling)])
+
+
+def learn(stations: Mapping[int, LaterRows], extent: float) -> Belief:
+    """Return what the stations' rows say together: the common offset, the noise, and kinds of change."""
+    names = tuple(sorted(name for name, rows in stations.items() if len(rows)))
+    if not names:
+        return Belief(extent)
+    common = _common_offset([stations[name] for name in names])
+    every = evidence([stations[name] for name in names], extent, common).movedim(1, 0)
+    best, result = -math.inf, Belief(extent)
+    for noise, log_density in zip(NOISES, every, strict=True):
+        share = SHARE
+        for _ in range(SETTLED):
+            weight = (share.log() + log_density).softmax(1)
+            share = (weight.sum(0) + STRENGTH * SHARE) / (len(names) + STRENGTH)
+        total = (share.log() + log_density).logsumexp(1).sum() + STRENGTH * (SHARE * share.log()).sum()
+        if total > best:
+            best, result = float(total), Belief(extent, common, noise, share, weight, names)
+    return result
+
+
+def _common_offset(stations: Sequence[LaterRows]) -> float:
+    """What all stations' latest rows miss alike, shrunk by how unsure it is: 0 of few stations."""
+    if len(stations) < COMMON:
+        return 0.0
+    mean = torch.stack([rows.missed[-LOOKED:].mean() for rows in stations])
+    middle = mean.median()
+    # A median's standard error, by the median absolute deviation of a normal variable.
+    error = 1.253 * 1.483 * (mean - middle).abs().median() / math.sqrt(len(mean))
+    return float(middle * (1 - SURE * (error / middle).square()).clamp_min(0.0)) if middle else 0.0
+
+
+@torch.no_grad()
+def correct(
+    belief: Belief, station: int, rows: LaterRows, places: Tensor, level: Tensor, doubt: Tensor
+) -> MeanVariance:
+    """Return means (B,) [dB] and variances (B,) [dB^2], noise excluded, at places of a station now.
+
+    Args:
+        belief: of all stations.
+        station: its number.
+        rows: its later rows; none: the common offset alone is added.
+        places: (B, D) float64 [m].
+        level, doubt: (B,) of the map there [dB, dB^2].
+    """
+    if not len(rows):
+        return MeanVariance(level + belief.common, doubt)
+    weight = belief.weights_of(station)
+    kept = (weight >= LEAST).nonzero()[:, 0]
+    weight = weight[kept] / weight[kept].sum()
+    noise, values = belief.noise * rows.noise + rows.faded + TINY, _values(rows, belief.common)[kept]
+    if len(rows) <= NEAR:
+        mean, left = _solve(belief.extent, rows, noise, values, kept, places[None], doubt[None])
+        mean, left = mean[0], left[0]
+    else:
+        near = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
+        blocks = zip(near.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
+        parts = [
+            _solve(
+                belief.extent, rows[index], noise[index], values[:, index].movedim(0, 1), kept,
+                place[:, None], own[:, None],
+            )
+            for index, place, own in blocks
+        ]  # fmt: skip
+        mean, left = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
+    keeps = KEEPS[kept, None]
+    mean = mean + belief.common + keeps * level + (1 - keeps) * rows.middle
+    middle = weight @ mean
+    return MeanVariance(middle, weight @ (left + (mean - middle).square()))
+
+
+def _solve(
+    extent: float, rows: LaterRows, noise: Tensor, values: Tensor, kept: Tensor, places: Tensor, doubt: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Means and variances (G, K', B) of groups of places (G, B, D) by rows (G or none, n)."""
+    gram = _covariance(rows.places, rows.places, rows.doubt, rows.doubt, extent, kept)
+    gram.diagonal(dim1=-2, dim2=-1).add_(noise.unsqueeze(-2))
+    cross = _covariance(places, rows.places, doubt, rows.doubt, extent, kept)
+    factor = Factor.from_gram(gram, "raise")
+    mean = (cross @ factor.solve(values[..., None]))[..., 0]
+    prior = KEEPS[kept, None] * doubt[:, None] + (OFFSET.square() + LOCAL.square())[kept, None]
+    told = factor.whiten(cross.mT.contiguous()).square().sum(-2)
+    return mean, (prior - told).clamp_min(0.0)
+
+
+@torch.no_grad()
+def innovations(rows: LaterRows, first: int, extent: float, kind: int = 0) -> MeanVariance:
+    """Return what rows from `first` on miss of map and earlier rows, and variances, given a kind of change.
+
+    Each is told of by its nearest earlier rows; such errors are independent where the kind is the right one.
+    """
+    count = len(rows)
+    new, order = torch.arange(first, count), torch.arange(count)
+    apart = distances(rows.places[first:], rows.places)
+    apart[order >= new[:, None]] = math.inf
+    near = apart.topk(min(TOLD, count), largest=False)
+    unknown = near.values.isinf()  # of the first rows there are fewer
+    at, index = rows[new], near.indices
+    known = rows[index]
+    one = slice(kind, kind + 1)
+    own = _covariance(known.places, known.places, known.doubt, known.doubt, extent, one)[:, 0]
+    own.diagonal(dim1=-2, dim2=-1).add_(known.noise + known.faded + torch.where(unknown, UNTOLD, TINY))
+    cross = _covariance(at.places[:, None], known.places, at.doubt[:, None], known.doubt, extent, one)[:, 0]
+    weights = Factor.from_gram(own, "raise").solve(cross.mT)[..., 0]
+    prior = KEEPS[kind] * at.doubt + OFFSET[kind].square() + LOCAL[kind].square()
+    variance = prior + at.noise - (weights * cross[:, 0]).sum(1)
+    return MeanVariance(at.missed - (weights * known.missed).sum(1), variance.clamp_min(TINY))

@@ -1,0 +1,88 @@
+"""Rows that came later: told to a model in a file, undone bit for bit, and never half of them."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from doors import knock
+from rooms_later import PLACES, SCREENED, levels, room_file
+
+import gsparc
+from gsparc.commands.listing import COMMANDS
+from gsparc.models import checkpoint
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("later")
+    gsparc.fit(rx=PLACES, tx=[9.0, 9.0, 2.6], rssi=levels(PLACES, 0), model="gp", save=folder / "before.ckpt")
+    return folder / "before.ckpt"
+
+
+def update(folder, *words):
+    """What the command says, and its figures."""
+    answer = knock(COMMANDS["update"].run, "update", [*words, f"hydra.run.dir={folder}"])
+    file = folder / "summary.json"
+    return answer, json.loads(file.read_text()) if file.exists() else {}
+
+
+def test_rows_of_a_file_are_told_and_taken_back(before, tmp_path):
+    new, out = room_file(tmp_path / "new.npz", 40, change=-12.0), tmp_path / "after.ckpt"
+    _, facts = update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=10")
+    assert facts["update/rows_kept"] == 40 and facts["update/versions"] == 5
+    old, after = gsparc.load(before), gsparc.load(out)
+    at = SCREENED
+    drop = after.rssi(rx=at) - old.rssi(rx=at)
+    assert drop.mean() < -8 and after.method.label.endswith("updated")
+    assert not old.versions and len(after.journal) == 4
+    assert update(tmp_path / "back", f"ckpt={out}", "undo=4")[0].status == 0
+    again = gsparc.load(out)
+    assert np.array_equal(again.rssi(rx=at), old.rssi(rx=at))
+
+
+def test_changes_are_listed_where_they_are(before, tmp_path):
+    new, out = room_file(tmp_path / "new.npz", 200, change=-12.0), tmp_path / "after.ckpt"
+    update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}")
+    with (tmp_path / "run" / "changes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    local = next(row for row in rows if row["kind"] == "local")
+    assert abs(float(local["x"]) - 5) < 3 and abs(float(local["y"]) - 5) < 3
+    assert float(local["change_db"]) < -6 and int(local["since"]) <= int(local["at"])
+
+
+def test_neither_rows_nor_steps_back_and_no_version(before, tmp_path):
+    for words, said in (([], "say data=FILE to add rows, or undo=COUNT"), (["undo=1"], "1 back, 0 are kept")):
+        answer, _ = update(tmp_path, f"ckpt={before}", *words)
+        assert answer.status != 0 and said in " ".join(answer.err + answer.out)
+
+
+@pytest.mark.slow
+def test_a_kill_leaves_a_whole_file(before, tmp_path):
+    out, new = tmp_path / "live.ckpt", room_file(tmp_path / "new.npz", 60, change=-12.0)
+    out.write_bytes(before.read_bytes())
+    script = (
+        "import gsparc\nfrom gsparc.models import checkpoint\n"
+        "from gsparc.prediction.updating import versions_extra\nimport numpy as np, sys\n"
+        f"new = np.load({str(new)!r})\npredictor = gsparc.load({str(out)!r})\nprint('ready', flush=True)\n"
+        "while True:\n"
+        "    predictor.update(rx=new['rx_position'][:3], rssi=new['rssi_db'][:3])\n"
+        f"    checkpoint.update_extra({str(out)!r}, versions_extra(predictor.versions))\n"
+    )
+    rng, kept = np.random.default_rng(0), 0
+    for _ in range(20):
+        process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
+        process.stdout.readline()
+        time.sleep(rng.uniform(0.0, 0.5))
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        rows = len(gsparc.load(out).rows)
+        assert rows >= kept
+        kept = rows
+    assert kept > 0 and torch.load(out, weights_only=True)["format"] == checkpoint.FORMAT

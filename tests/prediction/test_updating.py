@@ -1,0 +1,119 @@
+"""A predictor that is told of later rows, and goes back."""
+
+import time
+
+import numpy as np
+import pytest
+from rooms_later import PLACES, SCREENED, draw, levels, truth
+
+import gsparc
+from gsparc.prediction.updating import VERSIONS
+from gsparc.processes import factor
+
+POST = {"tx": [9.0, 9.0, 2.6], "model": "gp"}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    file = tmp_path_factory.mktemp("room") / "model.ckpt"
+    gsparc.fit(rx=PLACES, rssi=levels(PLACES, 0), **POST, save=file)
+    return file
+
+
+@pytest.fixture
+def predictor(fitted):
+    return gsparc.load(fitted)
+
+
+def changed(count, seed=5):
+    near = draw(40 * count, seed)
+    near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 5][:count]
+    return {"rx": near, "rssi": levels(near, seed, change=-12.0)}
+
+
+def miss(predictor, places=SCREENED, **world):
+    return float(np.sqrt(np.mean((predictor.rssi(rx=places)[:, 0] - truth(places, **world)) ** 2)))
+
+
+def test_twenty_rows_of_a_changed_part_undo_most_of_the_error(predictor):
+    before = miss(predictor, change=-12.0)
+    found = predictor.update(**changed(20))
+    assert len(found.rows) == len(found.deviations) == 20 and found.alarms
+    assert miss(predictor, change=-12.0) < 0.35 * before
+    assert predictor.std(rx=SCREENED).mean() < 6  # still a statement
+
+
+def test_rows_of_the_same_world_change_next_to_nothing(predictor):
+    asked = draw(400, 3)
+    before = miss(predictor, asked)
+    predictor.update(rx=draw(30, 8), rssi=levels(draw(30, 8), 8))
+    assert miss(predictor, asked) < 1.01 * before
+
+
+def test_ten_updates_and_ten_undos_are_bit_identical(predictor):
+    before = predictor.predict(rx=SCREENED)
+    for turn in range(10):
+        predictor.update(**changed(3, turn))
+    assert len(predictor.rows) == 30 and len(predictor.versions) == VERSIONS
+    for _ in range(10):
+        predictor.undo()
+    after = predictor.predict(rx=SCREENED)
+    assert (after.mean == before.mean).all() and (after.variance == before.variance).all()
+    with pytest.raises(ValueError, match="undo: 1 back, 0 are kept"):
+        predictor.undo()
+
+
+def test_forgotten_rows_say_nothing(predictor):
+    before = predictor.rssi(rx=SCREENED)
+    found = predictor.update(**changed(10))
+    predictor.forget(found.rows[:4])
+    assert predictor.rows.tolist() == found.rows[4:].tolist()
+    predictor.forget(predictor.rows)
+    assert np.array_equal(predictor.rssi(rx=SCREENED), before)
+    with pytest.raises(ValueError, match="has number 99"):
+        predictor.forget([99])
+
+
+def test_the_window_keeps_the_last_rows_as_they_were_measured(predictor):
+    rows = changed(30)
+    predictor.update(**rows, window=12)
+    kept = predictor.measured
+    assert kept["number"].tolist() == list(range(18, 30))
+    assert np.allclose(kept["place"], rows["rx"][18:]) and np.allclose(kept["level"], rows["rssi"][18:])
+
+
+def test_an_offset_that_is_said_is_added_to_what_rows_said(predictor):
+    predictor.update(**changed(10))
+    before = predictor.rssi(rx=SCREENED)
+    predictor.shift(-3.0)
+    assert np.allclose(predictor.rssi(rx=SCREENED), before - 3, atol=1e-3)
+    with pytest.raises(ValueError, match="no station 'roof'"):
+        predictor.shift(1.0, "roof")
+
+
+def test_no_factor_of_all_rows_is_made(predictor, monkeypatch):
+    predictor.rssi(rx=SCREENED[:1])
+    sizes, make = [], factor._cholesky
+    monkeypatch.setattr(factor, "_cholesky", lambda gram: sizes.append(gram.shape[-1]) or make(gram))
+    predictor.update(**changed(5))
+    assert sizes and max(sizes) < 100 < len(PLACES)
+
+
+def test_misuse_is_said(predictor):
+    with pytest.raises(ValueError, match="rx= and rssi= are needed"):
+        predictor.update(rx=SCREENED)
+    with pytest.raises(ValueError, match="4 places and 1 stations"):
+        predictor.update(rx=SCREENED[:4], rssi=np.zeros((4, 2)))
+
+
+@pytest.mark.slow
+def test_seconds_do_not_grow_with_rows_kept(predictor):
+    rows = draw(5000, 3)
+    predictor.update(rx=rows, rssi=levels(rows, 3), window=5000)
+    for count, most in ((1, 0.05), (50, 0.5)):
+        seconds = []
+        for turn in range(5):
+            began = time.process_time()
+            predictor.update(**changed(count, turn), window=5000)
+            seconds.append(time.process_time() - began)
+        assert min(seconds) < most, seconds

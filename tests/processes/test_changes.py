@@ -1,0 +1,70 @@
+"""Kinds of change: what later rows say of other places, by systems of few rows."""
+
+import numpy as np
+import pytest
+import torch
+from rooms_later import draw, later_rows
+
+from gsparc.processes import changes
+from gsparc.processes.changes import KINDS, LaterRows, correct, innovations, learn
+from gsparc.processes.factor import Factor
+
+EXTENT = 28.0
+
+
+def asked(belief, rows, places, level=-60.0):
+    at = torch.from_numpy(places)
+    flat = torch.full((len(at),), level).double()
+    return correct(belief, 0, rows, at, flat, 0.5 + 0 * flat)
+
+
+def test_without_change_the_map_stays():
+    rows = later_rows(40, 0)
+    belief = learn({0: rows}, EXTENT)
+    assert KINDS[int(belief.weights_of(0).argmax())].name == "none"
+    assert (asked(belief, rows, draw(50, 9)).mean + 60).abs().max() < 0.7
+
+
+def test_an_offset_reaches_everywhere_and_a_local_change_does_not():
+    far = np.array([[19.0, 19.0, 1.5]])
+    offset, local = later_rows(40, 1, offset=-10.0), later_rows(80, 2, change=-12.0)
+    assert asked(learn({0: offset}, EXTENT), offset, far).mean[0] == pytest.approx(-70, abs=1)
+    belief = learn({0: local}, EXTENT)
+    assert belief.weights_of(0)[[k.name == "local" for k in KINDS]].sum() > 0.9
+    assert asked(belief, local, far).mean[0] == pytest.approx(-60, abs=1.5)
+    assert asked(belief, local, np.array([[5.0, 5.0, 1.5]])).mean[0] < -66
+
+
+def test_an_offset_of_all_stations_is_told_of_those_without_rows():
+    rows = {station: later_rows(10, station, offset=-4.0) for station in range(12)}
+    belief = learn(rows, EXTENT)
+    assert belief.common == pytest.approx(-4, abs=0.8)
+    at = torch.zeros(1, 3).double()
+    none = correct(belief, 99, LaterRows.empty(), at, at[:, 0] - 60, at[:, 0] + 1)
+    assert none.mean[0] == -60 + belief.common
+
+
+def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):
+    sizes, rows = [], later_rows(3000, 3, offset=-5.0)
+    make = Factor.from_gram
+    spied = lambda gram, *rest: sizes.append(gram.shape[-1]) or make(gram, *rest)  # noqa: E731
+    monkeypatch.setattr(changes.Factor, "from_gram", spied)
+    belief = learn({0: rows}, EXTENT)
+    asked(belief, rows, draw(5, 9))
+    innovations(rows, 2990, EXTENT)
+    assert sizes and max(sizes) <= changes.NEAR
+
+
+def test_innovations_of_a_map_that_holds_are_white():
+    off, variance = innovations(later_rows(600, 4), 0, EXTENT)
+    surprise = off / variance.sqrt()
+    assert surprise.square().mean() == pytest.approx(1, abs=0.15)
+    assert abs(np.corrcoef(surprise[1:], surprise[:-1])[0, 1]) < 0.12
+
+
+def test_rows_that_are_contradicted_fade_and_others_keep_their_weight():
+    before, later = later_rows(100, 5), later_rows(100, 6, change=-12.0)
+    faded = before.fade(later, EXTENT, 0.0).faded
+    near = np.linalg.norm(before.places[:, :2].numpy() - 5, axis=1)
+    assert faded[near < 2].min() > 10 and faded[near > 8].median() < 0.1
+    assert before.fade(later_rows(100, 7), EXTENT, 1.0).faded.median() == pytest.approx(1, abs=0.2)
