@@ -155,6 +155,7 @@ def score_methods(
     every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
     own, before = learned or (data, split)
     limited = data.site.kind == "rssi" and (own.censored_side(before.folds[0].train) > 0).any()
+    are_lists = limited and strongest_lists(data) is not None
     for method, rows, fold, taught in zip(methods, every, split.folds, before.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
@@ -184,7 +185,7 @@ def score_methods(
                 level = power_in_decibels(scored["prediction"], variance)
             there, asked = own.subset(known), data.subset(rows)
             lists = strongest_lists(there)
-            if lists is not None and strongest_lists(data) is not None:
+            if lists is not None and are_lists:
                 scored["strongest_told"] = strongest_told(method, lists, asked)
             given = levels_given_heard(method, there, asked, *level, lists)
             # Who learned from heard rows alone predicts such levels.

@@ -95,7 +95,7 @@ class Updated(View):
 
     @property
     def label(self) -> str:
-        """The map's, and how many rows came later."""
+        """The map's, and that rows came later."""
         return f"{self.inner.label}, updated"
 
     def predict(self, query: Query) -> Prediction:
