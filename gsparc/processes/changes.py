@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -26,10 +27,15 @@ from gsparc.processes.stored import Stored
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
 NEAR, LOOKED = 64, 40  # rows that tell of a place; latest ones of a station that tell its kind of change
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
-NOISES = (1.0, 2.0, 4.0)  # factors of the noise's variance that are tried
+NOISES = torch.tensor((0.0, 1.0, 4.0, 12.0, 36.0)).double()  # what later rows of a station may have on top [dB^2]
+NOISY = torch.tensor((0.8, 0.05, 0.05, 0.05, 0.05)).double()  # shares of stations before any row
 STRENGTH = 10.0  # stations that shares of kinds before any row count as
 SETTLED, LEAST = 25, 0.02  # rounds of shares; weight below which a kind is not asked
-COMMON = 5  # stations that an offset of all of them is told from
+COMMON, OFFSETS = 5, 2.0  # stations that an offset of all of them is told from; its deviation [dB]
+ALIKE, COUNTS = (
+    1.0,
+    2,
+)  # prior variance of what all stations of a place miss alike [dB^2]; places it counts as
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
 TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
 HUNDRED = 100.0  # later rows that a fading is stated for
@@ -75,7 +81,7 @@ class Belief(Stored):
     Attributes:
         extent: of the site [m].
         common: offset that all stations share [dB].
-        noise: factor of the noise's variance.
+        noise: (T,) variance that a station's later rows have on top of their noise [dB^2].
         share: (K,) of stations by kind of change.
         weight: (T, K) of each kind, by station.
         names: (T,) numbers of these stations.
@@ -83,14 +89,15 @@ class Belief(Stored):
 
     extent: float
     common: float = 0.0
-    noise: float = 1.0
+    noise: Tensor | float = 0.0
     share: Tensor = SHARE
     weight: Tensor = SHARE[None, :0]
     names: tuple[int, ...] = ()
 
-    def weights_of(self, station: int) -> Tensor:
-        """Return weights (K,) of the kinds of a station."""
-        return self.weight[self.names.index(station)] if station in self.names else self.share
+    def of(self, station: int) -> tuple[Tensor, Tensor]:
+        """Return weights (K,) of the kinds of a station that has rows, and its noise on top [dB^2]."""
+        index = self.names.index(station)
+        return self.weight[index], torch.as_tensor(self.noise).expand(len(self.names))[index]
 
 
 @dataclass(frozen=True)
@@ -188,7 +195,7 @@ def evidence(stations: Sequence[LaterRows], extent: float, common: float) -> Ten
     places, doubt = parts
     noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in every])[:, None]
     faded = torch.stack([_padded(rows.faded, most) for rows in every])[:, None]
-    noise = torch.tensor(NOISES).double()[:, None] * noise + faded + TINY
+    noise = NOISES[:, None] + noise + faded + TINY
     gram = _covariance(places, places, doubt, doubt, extent)[:, None].repeat(1, len(NOISES), 1, 1, 1)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise[:, :, None])
     factor = Factor.from_gram(gram, "raise")
@@ -207,28 +214,37 @@ def learn(stations: Mapping[int, LaterRows], extent: float) -> Belief:
     if not names:
         return Belief(extent)
     common = _common_offset([stations[name] for name in names])
-    every = evidence([stations[name] for name in names], extent, common).movedim(1, 0)
-    best, result = -math.inf, Belief(extent)
-    for noise, log_density in zip(NOISES, every, strict=True):
-        share = SHARE
-        for _ in range(SETTLED):
-            weight = (share.log() + log_density).softmax(1)
-            share = (weight.sum(0) + STRENGTH * SHARE) / (len(names) + STRENGTH)
-        total = (share.log() + log_density).logsumexp(1).sum() + STRENGTH * (SHARE * share.log()).sum()
-        if total > best:
-            best, result = float(total), Belief(extent, common, noise, share, weight, names)
-    return result
+    log_density = evidence([stations[name] for name in names], extent, common)
+    share, noisy = SHARE, NOISY
+    for _ in range(SETTLED):
+        weight = (noisy.log()[:, None] + share.log() + log_density).flatten(1).softmax(1)
+        weight = weight.unflatten(1, log_density.shape[1:])
+        share = (weight.sum((0, 1)) + STRENGTH * SHARE) / (len(names) + STRENGTH)
+        noisy = (weight.sum((0, 2)) + STRENGTH * NOISY) / (len(names) + STRENGTH)
+    noise = weight.sum(2) @ NOISES
+    return Belief(extent, common, noise, share, weight.sum(1), names)
 
 
 def _common_offset(stations: Sequence[LaterRows]) -> float:
-    """What all stations' latest rows miss alike, shrunk by how unsure it is: 0 of few stations."""
+    """What all stations' latest rows miss alike [dB]: 0 of few stations, shrunk by how unsure it is.
+
+    Either it is 0, or normal with deviation `OFFSETS`. Its error has two parts: stations differ, and so do
+    places, as a phone that is turned misses all stations of a place alike.
+    """
     if len(stations) < COMMON:
         return 0.0
+    latest = reduce(LaterRows.join, (rows[-LOOKED:] for rows in stations))
     mean = torch.stack([rows.missed[-LOOKED:].mean() for rows in stations])
     middle = mean.median()
     # A median's standard error, by the median absolute deviation of a normal variable.
-    error = 1.253 * 1.483 * (mean - middle).abs().median() / math.sqrt(len(mean))
-    return float(middle * (1 - SURE * (error / middle).square()).clamp_min(0.0)) if middle else 0.0
+    error = (1.253 * 1.483 * (mean - middle).abs().median()).square() / len(mean)
+    which, count = latest.places.unique(dim=0, return_inverse=True, return_counts=True)[1:]
+    by_place = latest.missed.new_zeros(len(count)).index_add(0, which, latest.missed) / count
+    spread = (by_place - by_place.mean()).square().sum() + ALIKE * COUNTS
+    error = error + spread / (len(count) - 1 + COUNTS) / len(count)
+    total = OFFSETS**2 + error
+    odds = (error / total).sqrt() * (0.5 * middle.square() * (1 / error - 1 / total)).exp()
+    return float(middle * OFFSETS**2 / total * odds / (1 + odds))
 
 
 @torch.no_grad()
@@ -246,10 +262,10 @@ def correct(
     """
     if not len(rows):
         return MeanVariance(level + belief.common, doubt)
-    weight = belief.weights_of(station)
+    weight, added = belief.of(station)
     kept = (weight >= LEAST).nonzero()[:, 0]
     weight = weight[kept] / weight[kept].sum()
-    noise, values = belief.noise * rows.noise + rows.faded + TINY, _values(rows, belief.common)[kept]
+    noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kept]
     if len(rows) <= NEAR:
         mean, left = _solve(belief.extent, rows, noise, values, kept, places[None], doubt[None])
         mean, left = mean[0], left[0]

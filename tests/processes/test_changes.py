@@ -1,5 +1,7 @@
 """Kinds of change: what later rows say of other places, by systems of few rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,7 +23,7 @@ def asked(belief, rows, places, level=-60.0):
 def test_without_change_the_map_stays():
     rows = later_rows(40, 0)
     belief = learn({0: rows}, EXTENT)
-    assert KINDS[int(belief.weights_of(0).argmax())].name == "none"
+    assert KINDS[int(belief.of(0)[0].argmax())].name == "none"
     assert (asked(belief, rows, draw(50, 9)).mean + 60).abs().max() < 0.7
 
 
@@ -30,7 +32,7 @@ def test_an_offset_reaches_everywhere_and_a_local_change_does_not():
     offset, local = later_rows(40, 1, offset=-10.0), later_rows(80, 2, change=-12.0)
     assert asked(learn({0: offset}, EXTENT), offset, far).mean[0] == pytest.approx(-70, abs=1)
     belief = learn({0: local}, EXTENT)
-    assert belief.weights_of(0)[[k.name == "local" for k in KINDS]].sum() > 0.9
+    assert belief.of(0)[0][[k.name == "local" for k in KINDS]].sum() > 0.9
     assert asked(belief, local, far).mean[0] == pytest.approx(-60, abs=1.5)
     assert asked(belief, local, np.array([[5.0, 5.0, 1.5]])).mean[0] < -66
 
@@ -42,6 +44,28 @@ def test_an_offset_of_all_stations_is_told_of_those_without_rows():
     at = torch.zeros(1, 3).double()
     none = correct(belief, 99, LaterRows.empty(), at, at[:, 0] - 60, at[:, 0] + 1)
     assert none.mean[0] == -60 + belief.common
+
+
+def test_a_station_whose_stated_noise_is_too_small_is_not_taken_for_a_local_change():
+    rng, quiet = np.random.default_rng(3), {n: later_rows(20, n) for n in range(9)}
+    rows = later_rows(20, 9)
+    loud = replace(
+        rows, missed=torch.from_numpy(rng.normal(0, 4, 20)), noise=0 * rows.noise, doubt=0 * rows.doubt
+    )
+    belief = learn({**quiet, 9: loud}, EXTENT)
+    weight, added = belief.of(9)
+    assert added > 8 and weight[:3].sum() > 0.9
+    assert max(belief.of(n)[1] for n in quiet) < 3
+
+
+def test_a_common_offset_is_not_believed_where_places_differ():
+    """A phone that was held otherwise at each of five places misses all stations of a place alike."""
+    places, at = draw(5, 1), np.array([4.0, -4.0, -5.0, -3.0, -4.5])
+    rows = [replace(later_rows(5, n), places=torch.from_numpy(places)) for n in range(20)]
+    turned = [replace(one, missed=one.missed + torch.from_numpy(at)) for one in rows]
+    alike = [replace(one, missed=one.missed - 3) for one in rows]
+    assert abs(learn(dict(enumerate(turned)), EXTENT).common) < 0.6 * 2.5
+    assert learn(dict(enumerate(alike)), EXTENT).common == pytest.approx(-3, abs=0.8)
 
 
 def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):
