@@ -1,6 +1,6 @@
 """Maps that are told of later rows, beside what else could be done: docs/results/changes.csv.
 
-    python bench/changes.py [rooms] [networks] [detections] [months] [rounds]
+    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors]
 
 Room and network are simulated here; months of a library and rounds of a garage are looked for in
 ../shared/data/change. Errors are of places that nobody told of, rmse [dB].
@@ -9,12 +9,14 @@ Room and network are simulated here; months of a library and rounds of a garage 
 import csv
 import logging
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.prediction.drift import Watch
@@ -179,8 +181,47 @@ def measured(file, epoch):
         yield from judge(f"{epoch} {number}", model, places[own], levels[own], (5, fifth))
 
 
+def priors():
+    """Towns whose planned map misses shadowing, has 6 dB too little, lies 30 m off, or is another town's."""
+    axis = np.arange(5.0, 700, 10)
+    squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+
+    def planned(places, town):
+        return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, town, 60.0)
+
+    for count in (5, 10, 20, 50, 100):
+        errors, spent = [], 0.0
+        for town in range(1, 7):
+            places = draw(count + 400, 100 + town, 600.0) + np.array([50, 50, 0])
+            level = planned(places, town) + 0.75 * field(places, town + 20, 30.0)
+            level += np.random.default_rng(town).normal(0, 1, len(places))
+            known, truth = {"rx": places[:count], "tx": [0.0, 0, 20], "rssi": level[:count]}, level[count:]
+            maps = {
+                "misses shadowing": planned(squares, town), "6 dB too low": planned(squares, town) - 6,
+                "30 m off": planned(squares - [30, 0], town), "another town's": planned(squares, town + 50),
+            }  # fmt: skip
+            row = {"no map": rmse(gsparc.fit(**known).rssi(rx=places[count:])[:, 0], truth)}
+            for name, levels in maps.items():
+                with tempfile.TemporaryDirectory() as folder:
+                    file = Path(folder) / "map.npz"
+                    at = np.c_[squares, np.full(len(squares), 1.5)]
+                    np.savez(file, rx_position=at, tx_position=[0.0, 0, 20], rssi_db=levels)
+                    began = time.monotonic()
+                    found = gsparc.fit(**known, settings={"prior": file})
+                    spent = max(spent, time.monotonic() - began)
+                row[name] = rmse(found.rssi(rx=places[count:])[:, 0], truth)
+                near = cKDTree(squares).query(places[count:, :2])[1]
+                row[f"{name}, alone"] = rmse(levels[near], truth)
+            errors.append(row)
+        for name in errors[0]:
+            ratio = [row[name] / row["no map"] for row in errors]
+            mean = round(float(np.mean([row[name] for row in errors])), 3)
+            yield f"six towns, {name}", f"{count} rows", "mean", mean, round(spent, 2)
+            yield f"six towns, {name}", f"{count} rows", "most of no map's", round(max(ratio), 3), ""
+
+
 PARTS = {
-    "networks": networks, "rooms": rooms, "detections": detections,
+    "networks": networks, "rooms": rooms, "detections": detections, "priors": priors,
     "months": lambda: measured("library-months.npz", "month"),
     "rounds": lambda: measured("garage-rounds.npz", "round"),
 }  # fmt: skip

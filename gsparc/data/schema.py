@@ -28,6 +28,7 @@ End = Literal["rx", "tx"]
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
 LIGHT = 299_792_458.0  # [m/s]
+OF_STATION = ", station "  # before its name, in that of a site as one of several stations sees it
 TrainTest = tuple[np.ndarray, np.ndarray]  # rows (n,) to train and to test on
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -66,6 +67,8 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
         kind = next(kind for called, kind in table if called)
         if settings.own_terms and kind is not Powers:
             raise ValueError(f"model.terms are of received powers; the target is {site.kind} here")
+        if settings.prior is not None and kind is not Powers:
+            raise ValueError(f"model.prior is of received powers; the target is {site.kind} here")
         rendered = issubclass(kind, ImageProcess)
         if (rendered and hides is False) or (kind is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"
@@ -98,6 +101,7 @@ class Gsparc(LearnsTogether):
         effects: switches of terms.
         position_std: of each coordinate of training positions [m]; None: as the data say.
         terms: further `Columns` of one station's powers.
+        prior: a file of one station's powers from before any row, see `Powers`.
         name: as it appears in tables.
         **field: see `LearnedField`.
     """
@@ -105,19 +109,19 @@ class Gsparc(LearnsTogether):
     hands_on: ClassVar[type[Method]] = LearnedField  # whose settings `field` are
     resumable = uses_censored = True
     stored_names: ClassVar[dict[str, str]] = {
-        "steps": "", "position_std": "", "terms": "", "loss.snapshot": "init.snapshot",
+        "steps": "", "position_std": "", "terms": "", "prior": "", "loss.snapshot": "init.snapshot",
         "refit": "rendered.refit", "keep_best": "rendered.keep_best",
     }  # fmt: skip
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
-        terms: Sequence[Any] = (), name: str = "gsparc", **field: Any,
+        terms: Sequence[Any] = (), prior: str | Path | None = None, name: str = "gsparc", **field: Any,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)))
         self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std, self._field = effects, position_std, field
-        self.own_terms = to_terms(terms)
+        self.own_terms, self.prior = to_terms(terms), prior
 
     def learns_jointly(self, site: Site) -> bool:
         """See `LearnsTogether`; carriers of spectra share paths, too."""
@@ -147,7 +151,7 @@ class Gsparc(LearnsTogether):
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count
-            own = {"terms": self.own_terms} if solved[target] is Powers else {}
+            own = {"terms": self.own_terms, "prior": self.prior} if solved[target] is Powers else {}
             return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **own)
         rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
         if target not in rendered:

@@ -24,7 +24,7 @@ from gsparc.data import heeded
 from gsparc.data.errors import Caution, list_first
 from gsparc.data.executor import run_all
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
@@ -89,7 +89,7 @@ def station_site(site: Site, number: int) -> Site:
     place = stations.position[number]
     array = site.array if stations.array is None else stations.array[number]
     return replace(
-        site, name=f"{site.name}, station {stations.name[number]}", stations=None, carrier_hz=carrier,
+        site, name=f"{site.name}{OF_STATION}{stations.name[number]}", stations=None, carrier_hz=carrier,
         array=array, static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
     )  # fmt: skip
 

@@ -27,7 +27,9 @@ from gsparc.processes.stored import Stored
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
 NEAR, LOOKED = 64, 40  # rows that tell of a place; latest ones of a station that tell its kind of change
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
-NOISES = torch.tensor((0.0, 1.0, 4.0, 12.0, 36.0)).double()  # what later rows of a station may have on top [dB^2]
+NOISES = torch.tensor(
+    (0.0, 1.0, 4.0, 12.0, 36.0)
+).double()  # what later rows of a station may have on top [dB^2]
 NOISY = torch.tensor((0.8, 0.05, 0.05, 0.05, 0.05)).double()  # shares of stations before any row
 STRENGTH = 10.0  # stations that shares of kinds before any row count as
 SETTLED, LEAST = 25, 0.02  # rounds of shares; weight below which a kind is not asked

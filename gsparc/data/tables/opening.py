@@ -135,7 +135,8 @@ def _decoded(path: Path) -> tuple[str, str]:
             raise DataError(f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8") from None
     if content.startswith((b"II*\0", b"MM\0*")):
         raise DataError(
-            f"{path}: a raster (TIFF), squares of a map; give the table of the rows that were measured"
+            f"{path}: a raster (TIFF), squares of a map; give the table of the rows that were measured, "
+            f"and beside it model.prior={path}"
         )
     if b"\0" in content:
         why = f"byte {content.index(0)} is zero; UTF-16 without its mark?"

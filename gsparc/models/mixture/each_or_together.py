@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -25,6 +26,7 @@ class LearnsTogether(MethodFactory):
     takes_effort = True
     init: InitSettings
     own_terms: tuple[Columns, ...] = ()  # of one station's powers
+    prior: str | Path | None = None  # a file of these from before any row
 
     def learns_jointly(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
@@ -38,8 +40,8 @@ class LearnsTogether(MethodFactory):
 
         Channels share waves and where their stations really stand, powers a law that few rows of one tell.
         """
-        if self.own_terms:
-            return "each", "model.terms are of one station"
+        if self.own_terms or self.prior is not None:
+            return "each", "model.terms and model.prior are of one station"
         if not self.learns_jointly(data.site) or self.init.name == "scene":
             return "each", ""
         if data.site.kind == "spectrum":

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 from gsparc.data import heeded
-from gsparc.data.schema import Measurements
+from gsparc.data.prior_levels import read_prior_levels
+from gsparc.data.schema import OF_STATION, Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate, make_bearings
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.powers.own_terms import to_terms
+from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.terms import array_obstacle, phase_obstacle
 from gsparc.training.context import FitContext, FitReport
 
@@ -62,21 +65,32 @@ class Powers(Mixture):
     Args:
         *settings: of `Mixture`.
         terms: further `Columns` of one station's powers.
+        prior: a file of levels from before any row, see `read_prior_levels`; None: nothing was predicted.
         **named: see `settings`.
     """
 
     name = "powers"
     uses_censored = True
-    stored_names: ClassVar[dict[str, str]] = {**Mixture.stored_names, "terms": ""}
+    stored_names: ClassVar[dict[str, str]] = {**Mixture.stored_names, "terms": "", "prior": ""}
 
-    def __init__(self, *settings: Any, terms: Sequence[Any] = (), **named_settings: Any) -> None:
+    def __init__(
+        self,
+        *settings: Any,
+        terms: Sequence[Any] = (),
+        prior: str | Path | None = None,
+        **named_settings: Any,
+    ) -> None:
         super().__init__(*settings, **named_settings)
-        self.own_terms = to_terms(terms)
+        self.own_terms, self.prior = to_terms(terms), prior
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
         heeded.count_reads(*["model.terms"] * bool(self.own_terms))  # a tuple is not noted when it is read
-        return super().fit(data, fold, replace(context, terms=self.own_terms))
+        terms = self.own_terms
+        if self.prior is not None:
+            station = data.site.name.rpartition(OF_STATION)[2]
+            terms = (*terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
+        return super().fit(data, fold, replace(context, terms=terms))
 
     def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; `init=scene` is the process of one station that knows walls."""
@@ -87,8 +101,8 @@ class Powers(Mixture):
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        if self.own_terms and data.site.stations is not None and len(data.site.stations) > 1:
-            return "model.terms are of one station's model; say stations=each"
+        if (self.own_terms or self.prior) and data.site.stations is not None and len(data.site.stations) > 1:
+            return "model.terms and model.prior are of one station's model; say stations=each"
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 
 

@@ -21,6 +21,7 @@ from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
+from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.stack import best_weights
 from gsparc.processes import density
 from gsparc.processes.censored import ConditionalGaussian, PseudoValues
@@ -48,6 +49,7 @@ CHOSEN_ON = Effort.chosen_on
 COMPARED_ON = 500  # of them, constant and distance law; with little effort
 WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
+MAP_COST = 2.0  # nats that rows must say for a map that was there before
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
@@ -109,7 +111,8 @@ class KernelCandidate:
         """One line of the settings."""
         law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
-        return f"{self.kernel.description}, about {mean}"
+        known = any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
+        return f"{self.kernel.description}, about {mean}{' and a share of the map' * known}"
 
 
 def candidate_priors(
@@ -118,11 +121,15 @@ def candidate_priors(
     """Return the likeliest settings of each mean law, the best first, kriging's, and one for gaps.
 
     That for gaps is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or
-    very many rows the best law alone. Each law has further `terms`.
+    very many rows the best law alone. Each law has further `terms`, and stands there without a map, too.
     """
-    rest = subtract_means(rows, terms)
-    laws = _candidate_laws(rest, site, "auto")
-    trends = [MeanLaw(add_terms_to_trend(rest, trend, terms), cost, notes) for trend, cost, notes in laws]
+    sure = tuple(one for one in terms if not isinstance(one.term, PriorMap))
+    trends = [
+        MeanLaw(add_terms_to_trend(rest, trend, some), cost + MAP_COST * (some is not sure), notes)
+        for some in ((sure, terms) if len(sure) < len(terms) else (terms,))
+        for rest in (subtract_means(rows, some),)
+        for trend, cost, notes in _candidate_laws(rest, site, "auto")
+    ]
     if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
     found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)

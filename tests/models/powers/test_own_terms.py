@@ -80,7 +80,7 @@ def test_each_of_several_stations_has_the_term_of_paths_to_it(trees, caplog):
     caplog.set_level("INFO")
     groves = [trees(GROVE), trees([[x + 32, y] for x, y in GROVE])]
     given = gsparc.fit(rx=data["rx"], rssi=powers, station_position=where, terms=groves)
-    assert all(f"Trees {k}: " in caplog.text for k in (1, 2)) and caplog.text.count("of 2 stations") == 2
+    assert all(f"Trees {k}: " in caplog.text for k in (1, 2)) and caplog.text.count("(of 2 stations") == 2
     copies = dict(given.method)
     assert len(copies) == 2
     for number, copy in copies.items():

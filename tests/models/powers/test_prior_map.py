@@ -1,0 +1,107 @@
+"""A map from before any row: it helps where it is right, and is left out where it is not."""
+
+import numpy as np
+import pytest
+import rasterio
+import torch
+from rasterio.transform import from_origin
+from refusals import refused
+
+import gsparc
+from gsparc.models.powers.prior_map import PriorMap
+
+POST = [0.0, 0.0, 20.0]
+AXIS = np.arange(5.0, 700, 10)  # centres of squares
+
+
+def smooth(places, seed, length=60.0, waves=60):
+    rng = np.random.default_rng(seed)
+    wave, phase = rng.normal(size=(waves, 2)) * 1.4 / length, rng.uniform(0, 2 * np.pi, waves)
+    return np.sqrt(2 / waves) * np.cos(places[:, :2] @ wave.T + phase).sum(1)
+
+
+def planned(places, town=1):
+    """What a planning tool knows: distance, and the shadows of buildings."""
+    return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 8 * smooth(places, town)
+
+
+def draw(count, seed):
+    return np.c_[np.random.default_rng(seed).uniform(50, 650, (count, 2)), np.full(count, 1.5)]
+
+
+def measured(places, seed=0):
+    rng = np.random.default_rng(seed)
+    return planned(places) + 3 * smooth(places, 2, 30.0) + 6 + rng.normal(0, 1, len(places))
+
+
+@pytest.fixture
+def rasters(tmp_path):
+    """Files of the town, of another town, and of two stations."""
+    squares = np.stack(np.meshgrid(AXIS, AXIS), -1).reshape(-1, 2)
+    how = {"width": len(AXIS), "height": len(AXIS), "dtype": "float64", "driver": "GTiff"}
+    for name, towns in (("right", (1,)), ("wrong", (7,)), ("two", (7, 1))):
+        at = from_origin(0, 700, 10, 10)
+        with rasterio.open(tmp_path / f"{name}.tif", "w", count=len(towns), transform=at, **how) as file:
+            for band, town in enumerate(towns, 1):
+                file.write(planned(squares, town).reshape(len(AXIS), -1)[::-1], band)
+                if len(towns) > 1:
+                    file.set_band_description(band, f"power_db {'ba'[band - 1]}")
+    return tmp_path
+
+
+def fit(rows, prior=None, **more):
+    settings = {} if prior is None else {"prior": prior}
+    return gsparc.fit(**{"rx": rows, "tx": POST, "rssi": measured(rows), "settings": settings, **more})
+
+
+@pytest.mark.parametrize("count", [10, 40])
+def test_a_map_helps_where_it_is_right_and_is_left_out_where_it_is_not(rasters, count):
+    rows, asked = draw(count, 103), draw(400, 4)
+    found = [fit(rows, one and rasters / f"{one}.tif") for one in (None, "right", "wrong")]
+    error = [np.sqrt(np.mean((one.rssi(rx=asked)[:, 0] - measured(asked, 1)) ** 2)) for one in found]
+    assert error[1] < 0.7 * error[0] and error[2] < 1.05 * error[0], error
+
+
+def test_a_model_keeps_the_map_that_it_was_given(rasters):
+    rows, asked, path = draw(30, 3), draw(20, 4), rasters / "model.ckpt"
+    found = fit(rows, rasters / "right.tif", model="powers", save=path)
+    (rasters / "right.tif").unlink()
+    np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), found.rssi(rx=asked), atol=1e-4)
+
+
+def test_each_station_has_the_band_of_its_name(rasters, caplog):
+    rows = draw(12, 103)
+    both = {"rssi": np.c_[measured(rows), measured(rows)], "tx": None, "station_name": ["a", "c"]}
+    posts = {"station_position": np.array([POST, POST])}
+    refused(r"prior=.*two\.tif: of b, a, not of c", fit, rows, rasters / "two.tif", **both, **posts)
+    found = fit(rows, rasters / "two.tif", **{**both, "station_name": ["a", "b"]}, **posts)
+    own = [any(isinstance(one.term, PriorMap) for one in copy.member.trend.more) for _, copy in found.method]
+    assert own == [True, False]  # what was measured is of the town in a's band
+
+
+def test_places_and_powers_of_a_table_are_a_map_too(tmp_path, caplog):
+    caplog.set_level("INFO")
+    rows, known = draw(12, 103), draw(2000, 5)
+    table = np.c_[known[:, :2], planned(known)]
+    np.savetxt(tmp_path / "plan.csv", table, delimiter=",", header="x_m,y_m,rsrp_dbm", comments="")
+    fit(rows, tmp_path / "plan.csv")
+    assert "a share of the map" in caplog.text
+
+
+def test_levels_between_points_are_those_of_the_nearest_and_have_slopes():
+    corners = np.array([[0.0, 0], [10, 0], [0, 10], [10, 10]])
+    found = PriorMap.from_levels(corners, np.array([0.0, 4, 8, 12]))
+    at = torch.tensor([[0.0, 0, 1], [5, 5, 1]], dtype=torch.float64, requires_grad=True)
+    level = found.columns(at)[:, 0]
+    assert level.tolist() == pytest.approx([-6, 0], abs=1e-3)
+    assert torch.autograd.grad(level.sum(), at)[0][1, 1] > 0
+
+
+def test_maps_that_cannot_be_meant_are_refused(rasters):
+    rows, path = draw(30, 3), rasters / "right.tif"
+    refused(r"model\.prior=none\.tif: no such file", fit, rows, "none.tif")
+    refused(r"draw it first, gsparc map ckpt=a\.ckpt", fit, rows, "a.ckpt")
+    far = rows + np.array([5000.0, 0, 0])
+    refused(r"it is of x 5 to 695, .* all rows lie elsewhere: x 5\d\d\d", fit, far, path, rssi=measured(rows))
+    channels = {"rssi": None, "csi": np.ones(30) + 0j, "frequency_hz": 1e9}
+    refused(r"model\.prior is of received powers", fit, rows, path, **channels)
