@@ -85,7 +85,10 @@ class Powers(Mixture):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
-        heeded.count_reads(*["model.terms"] * bool(self.own_terms))  # a tuple is not noted when it is read
+        # A tuple is not noted when it is read, nor what the class that makes this was given.
+        heeded.count_reads(
+            *["model.terms"] * bool(self.own_terms), *["model.prior"] * (self.prior is not None)
+        )
         terms = self.own_terms
         if self.prior is not None:
             station = data.site.name.rpartition(OF_STATION)[2]
