@@ -103,7 +103,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         log.info(text, len(data), len(np.unique(place)))
     # From the lowest place on: where stations stand moves local coordinates, and would move squares.
     where = data.moving - data.moving.min(axis=0)
-    order = content_order(data) if settings.name == "none" else None
+    order = content_order(data) if settings.name == "none" else data.sequence
     return answerable(make_split(where, settings, data.release_split, wrong, place, unit, order), data)
 
 

@@ -17,7 +17,7 @@ from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent, thin_rows
 
 WHOLE = ("stations", "carriers", "runs")  # of which whole ones are held out
-NAMES = ("random", "grouped", "corner", "blocks", "sparse", *WHOLE, "none")
+NAMES = ("random", "grouped", "corner", "blocks", "sparse", "later", *WHOLE, "none")
 CORNERS = ("--", "-+", "+-", "++")
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
 
@@ -100,12 +100,12 @@ class SplitSettings(Checked):
     gsparc.data.limits.SettingError: test_fraction=1.5: a number above 0 and below 1 is needed
 
     Attributes:
-        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `stations`, `carriers` or `runs`; `none`
-            tests no row.
+        name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `later`, `stations`, `carriers` or
+            `runs`; `none` tests no row.
         seed: of every random choice below.
         val_fraction: share of each fold's training rows kept for validation.
-        test_fraction: share of the rows that `random` (without files) and `corner` hold out, and of the runs
-            that `runs` does, one at least.
+        test_fraction: share of the rows that `random` (without files), `corner` and, the last ones, `later`
+            hold out, and of the runs that `runs` does, one at least.
         redraw: `random` ignores the release's own files and draws anew.
         folds: number of folds of `grouped`.
         stretches_per_fold: `grouped` cuts the path into folds x this many stretches.
@@ -198,7 +198,8 @@ def make_split(
         outliers: (n,) rows that `leave_out=outliers` means.
         place: (S,) int64; rows of one place stay together. None where every row is one.
         station: (S,) int64, of which station, carrier or run a row is; needed by the splits of these names.
-        order: (S,) rows as `none` draws those that validate; None: by their numbers.
+        order: (S,) rows as `none` draws those that validate, or as `later` rows were taken; None: by their
+            numbers.
 
     Raises:
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
@@ -217,12 +218,15 @@ def make_split(
             # Rows were renumbered when some were left out: from numbers of the file to those that remain.
             train, test = (np.searchsorted(rows_left, np.intersect1d(part, rows_left)) for part in named)
             named = train, test
-        elif place is not None:
+        elif place is not None and settings.name != "later":
             # One row stands for each place: splits are made of places, so that no visit is on both sides.
             _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
         where = positions[rows_left][first]
         pairs = enumerate(_pairs(where, settings, named))
-        if order is not None and settings.name == "none":
+        if settings.name == "later":
+            taken = np.argsort(rows_left if order is None else order[rows_left], kind="stable")
+            pairs = enumerate([_cut_off(taken, settings.test_fraction)])
+        elif order is not None and settings.name == "none":
             drawn = np.argsort(np.argsort(order)[rows_left][first])
             pairs = enumerate([(drawn, drawn[:0])])
         local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
@@ -245,10 +249,13 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
         test = _blocks(positions, np.arange(rows), settings, settings.share, [settings.seed])
         return [(np.setdiff1d(np.arange(rows), test), test)]
     test_share = settings.test_fraction if settings.name == "random" else 1 - settings.train_fraction
-    order = np.random.default_rng(settings.seed).permutation(rows)
-    # At least one row on either side, as rounding may leave none of a small share.
-    train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
-    return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
+    return [_cut_off(np.random.default_rng(settings.seed).permutation(rows), test_share)]
+
+
+def _cut_off(order: np.ndarray, test_share: float) -> TrainTest:
+    """The last of ordered rows as test; one row on either side, as rounding may leave none of a small share."""
+    train_count = len(order) - min(max(round(test_share * len(order)), 1), max(len(order) - 1, 0))
+    return np.sort(order[:train_count]), np.sort(order[train_count:])
 
 
 def rows_to_leave_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:

@@ -364,3 +364,15 @@ def test_places_of_a_lift_were_told_to_take_smaller_squares(side_m):
     lift = np.tile([2.5, 4.0, 0.0], (40, 1)) + np.linspace(0, 60, 40)[:, None] * [0, 0, 1]
     with pytest.raises(DataError, match="all positions are one above the other, there are no squares"):
         make_split(lift, SplitSettings("blocks", side_m=side_m))
+
+
+def test_later_tests_on_the_rows_that_were_taken_last_at_any_place():
+    rng = np.random.default_rng(0)
+    positions, taken = np.repeat(rng.uniform(0, 9, (25, 3)), 4, 0), rng.permutation(100)
+    place = np.repeat(np.arange(25), 4)
+    (fold,) = make_split(positions, SplitSettings("later", leave_out=[5]), place=place, order=taken).folds
+    last = np.setdiff1d(np.argsort(taken), [5], assume_unique=True)[-20:]
+    assert set(fold.test) == set(last) and 5 not in np.r_[fold.train, fold.val]
+    assert len(fold.train) + len(fold.val) == 79
+    (fold,) = make_split(positions, SplitSettings("later", test_fraction=0.1)).folds
+    assert fold.test.tolist() == [*range(90, 100)]  # as they stand in the file
