@@ -253,7 +253,7 @@ def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | No
 
 
 def _cut_off(order: np.ndarray, test_share: float) -> TrainTest:
-    """The last of ordered rows as test; one row on either side, as rounding may leave none of a small share."""
+    """The last of ordered rows as test rows; rounding leaves one row on either side."""
     train_count = len(order) - min(max(round(test_share * len(order)), 1), max(len(order) - 1, 0))
     return np.sort(order[:train_count]), np.sort(order[train_count:])
 

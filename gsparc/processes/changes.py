@@ -97,7 +97,9 @@ class Belief(Stored):
     names: tuple[int, ...] = ()
 
     def of(self, station: int) -> tuple[Tensor, Tensor]:
-        """Return weights (K,) of the kinds of a station that has rows, and its noise on top [dB^2]."""
+        """Return weights (K,) of the kinds of a station, and its noise on top [dB^2]."""
+        if station not in self.names:
+            return self.share, torch.zeros(())
         index = self.names.index(station)
         return self.weight[index], torch.as_tensor(self.noise).expand(len(self.names))[index]
 

@@ -43,6 +43,14 @@ def test_twenty_rows_of_a_changed_part_undo_most_of_the_error(predictor):
     assert predictor.std(rx=SCREENED).mean() < 6  # still a statement
 
 
+def test_a_phone_that_reads_with_more_noise_is_no_change_after_change(predictor):
+    """Maps state the noise of their own survey: another phone's raised alarm after alarm."""
+    at, rng = draw(300, 8), np.random.default_rng(1)
+    for part in np.split(np.arange(300), 15):
+        predictor.update(rx=at[part], rssi=levels(at, 8)[part] + rng.normal(0, 4, 20))
+    assert len(predictor.alarms) <= 2
+
+
 def test_rows_of_the_same_world_change_next_to_nothing(predictor):
     asked = draw(400, 3)
     before = miss(predictor, asked)
