@@ -8,6 +8,7 @@ import os
 import resource
 from contextlib import suppress
 from dataclasses import fields
+from functools import partial
 from importlib.util import find_spec
 
 from omegaconf import DictConfig
@@ -16,9 +17,17 @@ from gsparc.commands.shared.settings import RunSettings
 from gsparc.data.errors import DataError
 from gsparc.data.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
+from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.updating import versions_extra
 
 OTHERS = 64  # files that are open beside connections: the log, libraries
+
+
+def keep_versions(ckpt: str, predictor: Predictor) -> None:
+    """Store what later rows made of a model in its file, whole or not at all."""
+    checkpoint.update_extra(ckpt, versions_extra(predictor.versions), ckpt)
 
 
 def is_loopback(host: str) -> bool:
@@ -51,7 +60,10 @@ def task(config: DictConfig) -> None:
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
-    app = build_application(predictor, limits, token)
+    keep = partial(keep_versions, config.ckpt, predictor) if config.updates else None
+    if keep is not None and (config.station is not None or predictor.site.kind != "rssi"):
+        raise DataError("updates=true: is of powers, and of all stations of the model")
+    app = build_application(predictor, limits, token, keep)
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then

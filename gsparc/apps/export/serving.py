@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 import hmac
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from threading import Lock
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
 
@@ -57,6 +58,12 @@ class PlacesBody(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     places: Annotated[list[tuple[float, float, float]], FailFast()]
+
+
+class RowsBody(PlacesBody):
+    """A request's body: the same, and levels there of each station; null is not measured."""
+
+    levels: Annotated[list[list[float | None]], FailFast()]
 
 
 class Connection(H11Protocol):
@@ -134,11 +141,12 @@ class Batcher:
         what: is asked, a method of it.
         delay_s: that the first request of a batch waits for others [s].
         most: places of a batch, beside those of the request that waits longest.
+        lock: held while the model is asked.
     """
 
-    def __init__(self, predictor: Predictor, what: str, delay_s: float, most: int) -> None:
+    def __init__(self, predictor: Predictor, what: str, delay_s: float, most: int, lock: Lock) -> None:
         self.predictor, self.delay_s, self.most = predictor, delay_s, most
-        self.what = what
+        self.what, self.lock = what, lock
         self.waiting: list[WaitingRequest] = []
         self.some = asyncio.Event()
 
@@ -179,7 +187,8 @@ class Batcher:
         site = self.predictor.site
         try:
             places = [np.zeros((0, 3)), *(_read(site.moving_end, one) for one in batch)]
-            values = getattr(self.predictor, self.what)(**{site.moving_end: np.concatenate(places)})
+            with self.lock:
+                values = getattr(self.predictor, self.what)(**{site.moving_end: np.concatenate(places)})
             values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
             parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
             return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
@@ -188,18 +197,25 @@ class Batcher:
             return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
 
 
-def build_application(predictor: Predictor, limits: Limits, token: str | None) -> ASGIApp:
-    """Return the routes: POST /predict, and /std for its deviations, GET /healthz.
+def build_application(
+    predictor: Predictor, limits: Limits, token: str | None, keep: Callable[[], object] | None = None
+) -> ASGIApp:
+    """Return the routes: POST /predict, and /std for its deviations, GET /healthz; POST /update where wanted.
 
     Args:
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
         token: that a request must bear (401) but for /healthz; None: none.
+        keep: stores the model after an update; None: there are none.
 
     Raises:
-        SettingError: an answer at one place holds more numbers than `limits` allow.
+        SettingError: updates without a token, or more numbers in the answer at one place than `limits` allow.
     """
-    site = predictor.site
+    site, lock = predictor.site, Lock()
+    if keep is not None and token is None:
+        raise SettingError(
+            "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say token=WORD"
+        )
     middle = getattr(predictor, site.kind)(**{site.moving_end: site.moving_box.mean(0) + site.origin})
     # Real and imaginary part count as two numbers.
     each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
@@ -209,7 +225,7 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
     most = min(limits.most, limits.numbers // each)
     # One thread writes for all: text of numbers holds the interpreter's lock anyhow.
     routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
-    batchers = {r: Batcher(predictor, what, limits.delay_ms / 1e3, most) for r, what in routes.items()}
+    batchers = {r: Batcher(predictor, what, limits.delay_ms / 1e3, most, lock) for r, what in routes.items()}
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -233,6 +249,41 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
             part = values, raw, predictor.unit, first, first + rows
             yield await loop.run_in_executor(writer, _written, *part)
 
+    async def read_body(request: Request, raw: bool, lists: int = 1) -> tuple[bytes, int]:
+        body, count = bytearray(), 0
+        try:
+            async for part in request.stream():
+                body += part
+                # A bracket opens each place and one all of them: enough to refuse a body before it is parsed.
+                count = len(body) // PLACE if raw else (body.count(b"[") - lists) // lists
+                if count > most or len(body) > most * BYTES * (1 if lists == 1 else 1 + each) + MORE:
+                    said = f"at most {most} places, {each} numbers each"
+                    raise HTTPException(413, said, {"connection": "close"})
+        except ClientDisconnect:
+            raise HTTPException(400, "the client left") from None
+        return bytes(body), count
+
+    def add_rows(body: bytes) -> dict[str, Any]:
+        rows = RowsBody.model_validate_json(body)
+        with lock:
+            levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
+            found = predictor.update(**{site.moving_end: np.array(rows.places)}, rssi=levels)
+            assert keep is not None
+            keep()
+        return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
+
+    async def update(request: Request) -> dict[str, Any]:
+        body, _ = await read_body(request, False, lists=2)
+        try:
+            return await asyncio.to_thread(add_rows, body)
+        except ValueError as error:  # of a body, too
+            wanted = '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
+            said = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
+            raise HTTPException(422, said) from error
+
+    if keep is not None:
+        app.post("/update")(update)
+
     @app.post("/std")
     @app.post("/predict")
     async def predict(request: Request) -> Response:
@@ -240,19 +291,10 @@ def build_application(predictor: Predictor, limits: Limits, token: str | None) -
         kinds = {one.partition(";")[0].strip().lower() for one in request.headers.getlist("content-type")}
         if len(kinds) > 1:
             raise HTTPException(422, f"Content-Type twice: {', '.join(sorted(kinds))}; say one")
-        body, raw = bytearray(), kinds == {RAW}
-        try:
-            async for part in request.stream():
-                body += part
-                # A bracket opens each place and one all of them: enough to refuse a body before it is parsed.
-                count = len(body) // PLACE if raw else body.count(b"[") - 1
-                if count > most or len(body) > most * BYTES + MORE:
-                    said = f"at most {most} places, {each} numbers each"
-                    raise HTTPException(413, said, {"connection": "close"})
-        except ClientDisconnect:
-            raise HTTPException(400, "the client left") from None
+        raw = kinds == {RAW}
+        body, count = await read_body(request, raw)
         request.scope["places"] = count = max(count, 1)
-        work = asyncio.ensure_future(batchers[request.url.path].ask(count, bytes(body), raw))
+        work = asyncio.ensure_future(batchers[request.url.path].ask(count, body, raw))
         gone = asyncio.ensure_future(request.receive())  # after a body nothing but the client's leaving
         await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
         gone.cancel()

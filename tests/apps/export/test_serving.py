@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import gsparc
+from gsparc.data.limits import SettingError
 from gsparc.models import checkpoint
 
 pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
@@ -52,9 +53,9 @@ def ask_http(port, method, path, body, headers):
 
 
 class Served:
-    def __init__(self, predictor, token=None, **limits):
+    def __init__(self, predictor, token=None, keep=None, **limits):
         limits = Limits(**{"most": 64, **limits})
-        app = build_application(predictor, limits, token)
+        app = build_application(predictor, limits, token, keep)
         self.server = LimitedServer(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
@@ -465,3 +466,29 @@ def test_raw_places_are_of_one_media_type_alone(served):
         while part := client.recv(65536):
             answer += part
     assert answer.startswith(b"HTTP/1.1 422") and b"Content-Type twice" in answer
+
+
+def test_levels_that_were_measured_change_the_answers_and_are_stored():
+    predictor, kept, rng = fitted(), [], np.random.default_rng(5)
+    at = rng.uniform([0, 0, 0], [20, 20, 2], (30, 3)).round(3)
+    before = predictor.rssi(rx=at)
+    rows = {"places": at.tolist(), "levels": [[float(level) - 10] for level in before[:, 0]]}
+    rows["levels"][0] = [None]
+    bearer = {"authorization": "Bearer word"}
+    with Served(predictor, "word", lambda: kept.append(len(predictor.versions))) as running:
+        post = partial(running.post, path="/update", **bearer)
+        assert running.post(json.dumps(rows), path="/update")[0] == 401
+        status, body, _ = post(json.dumps(rows))
+        said = json.loads(body)
+        assert status == 200 and said["rows"] == [*range(29)] and said["alarms"][0]["kind"] == "offset"
+        after = json.loads(running.post(as_json(at), **bearer)[1])["values"]
+        np.testing.assert_allclose(np.array(after), before - 10, atol=2)
+        assert post(json.dumps({**rows, "levels": rows["levels"][:5]}))[0] == 422
+        status, body, _ = post(b'{"places": [[1, 2, 3]]}')
+        assert status == 422 and b"levels" in body
+        assert post(json.dumps({name: part * 3 for name, part in rows.items()}))[0] == 413
+    assert kept == [2]
+    with pytest.raises(SettingError, match="updates=true: whoever reaches it"):
+        build_application(predictor, Limits(), None, kept.clear)
+    with Served(predictor) as running:
+        assert running.post(json.dumps(rows), path="/update")[0] == 404
