@@ -151,7 +151,8 @@ class Gsparc(LearnsTogether):
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count
-            own = {"terms": self.own_terms, "prior": self.prior} if solved[target] is Powers else {}
+            own: dict[str, Any] = {"terms": self.own_terms, "prior": self.prior}
+            own = own if solved[target] is Powers else {}
             return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **own)
         rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
         if target not in rendered:

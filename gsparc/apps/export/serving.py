@@ -267,7 +267,8 @@ def build_application(
         rows = RowsBody.model_validate_json(body)
         with lock:
             levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
-            found = predictor.update(**{site.moving_end: np.array(rows.places)}, rssi=levels)
+            where: dict[str, Any] = {site.moving_end: np.array(rows.places)}
+            found = predictor.update(**where, rssi=levels)
             assert keep is not None
             keep()
         return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
