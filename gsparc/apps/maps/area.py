@@ -98,8 +98,8 @@ def lay_grid(
     within = None if buildings is None else _drawn(site, buildings, "buildings")[1]
 
     def is_asked(places: np.ndarray) -> np.ndarray:
-        chosen = np.ones(len(places), bool) if contains is None else contains(places)
-        return chosen if within is None else chosen & ~within(places)
+        chosen: np.ndarray = np.ones(len(places), bool) if contains is None else contains(places)
+        return chosen if within is None else np.asarray(chosen & ~within(places))
 
     # By rows: a million places at once take memory.
     inside = np.array([is_asked(np.column_stack([x, np.full(nx, one)])) for one in y])
