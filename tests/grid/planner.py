@@ -1,7 +1,7 @@
 """What a planner is told of simulated networks, beside their truth, by seeds; FOLDER keeps their models.
 
 python tests/grid/planner.py covered FOLDER 0 1 2 >> docs/results/maps/covered.csv
-python tests/grid/planner.py planned FOLDER 0 1 2 >> docs/results/maps/planned.csv
+python tests/grid/planner.py planned FOLDER 0 1 2 3 4 >> docs/results/maps/planned.csv
 python tests/grid/planner.py azimuths FOLDER 10 11 >> docs/results/maps/azimuths.csv
 """
 
