@@ -42,6 +42,7 @@ def check(
     from gsparc.data.datasets.campaign import find_implausible
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
+    from gsparc.models.powers.together.network import check_azimuths
 
     try:
         reading = read_any(path, columns=columns, stations_file=stations_file, **settings)
@@ -51,10 +52,11 @@ def check(
             _line(console, line)
         return False
     implausible, levels, steps = find_implausible(reading.data, reading.file_row, most=math.inf)
-    warnings = outlier_warnings(reading.data) + [note for note in reading.notes if isinstance(note, Caution)]
+    notes = [*reading.notes, *check_azimuths(reading.data)]
+    warnings = outlier_warnings(reading.data) + [note for note in notes if isinstance(note, Caution)]
     warnings += layout_warnings(reading.data) + carrier_warnings(reading.data) + implausible
     topics = describe(reading.data)
-    topics += [("note", note) for note in reading.notes if not isinstance(note, Caution)]
+    topics += [("note", note) for note in notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):
         topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]
     stations, heights = reading.data.site.stations, reading.data.moving[:, 2::3]

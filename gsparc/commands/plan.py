@@ -32,6 +32,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         plan=floor, stations=stations, other_end=settings["other_end"],
         promise=promise, least_gain_db=float(config.least_gain_db), route=config.route,
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
+        goal=config.goal, threshold_db=settings["threshold_db"],
     )  # fmt: skip
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
     # Rows are in the order of the walk; the rank is that of their gains.
@@ -55,8 +56,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
     if predictor is not None and predictor.site.stations is not None:
-        every = "all stations alike (a map shows the strongest)"
-        before += f" of {every if stations is None else ', '.join(map(str, stations))}"
+        alike = config.goal == "all" and config.threshold_db is None
+        every = "all stations alike (a map shows the strongest)" if alike else "the strongest station"
+        every = every if stations is None else ", ".join(map(str, stations))
+        doubt = "" if config.threshold_db is None else f", where {config.threshold_db:g} is in doubt"
+        before += f" of {every}{doubt}"
         if promise is not None and (each := promise.stations_of_place()) < len(predictor.site.stations):
             before += f", a place lists the {each} strongest of {len(predictor.site.stations)}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"

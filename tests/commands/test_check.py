@@ -2,6 +2,7 @@ import io
 
 import numpy as np
 import pytest
+from networks import network
 from rich.console import Console
 
 from gsparc.commands.check import check, main, read_settings
@@ -224,3 +225,12 @@ def test_a_file_in_radians_ended_in_good(tmp_path):
     assert good and "a.npz: readable, but see its 1 warning\n" in text
     assert "warning     the places lie in the Gulf of Guinea" in text
     assert "radians? write degrees, or [rad] in the heads of a table" in text
+
+
+def test_check_said_nothing_of_azimuths(tmp_path):
+    """Training named wrong ones and those that no row tells; who looked before it was told of none."""
+    write_own(tmp_path / "right.npz", network(1, moments=220, asked=120).arrays(6))
+    write_own(tmp_path / "wrong.npz", network(1, wrong=2, moments=220, asked=120).arrays(6))
+    text = " ".join(_said(tmp_path / "right.npz")[1].split())
+    assert "note azimuths taken as listed, as no rows tell" in text and "contradicted" not in text
+    assert "warning azimuths are contradicted by levels" in " ".join(_said(tmp_path / "wrong.npz")[1].split())

@@ -73,12 +73,17 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     done = run("plan", f"ckpt={model}", "count=6", "area=[-20,0,80,60]", folder=tmp_path)
     assert done.status == 0, done
     (said,) = [line for line in done.out if "6 places: expected error" in line]
-    assert "a way of" in said and "of all stations alike (a map shows the strongest)" in said
+    assert "a way of" in said and "of the strongest station" in said
     facts = json.loads((tmp_path / "summary.json").read_text())
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     lines = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(lines) == 7 and lines[0].endswith(",way_m") and (tmp_path / "plan.png").exists()
     assert "; rows logged on the way not counted" in said
+    how = [f"ckpt={model}", "count=1", "promised=false"]
+    done = run("plan", *how, "threshold_db=-80", folder=tmp_path)
+    assert any("of the strongest station, where -80 is in doubt" in one for one in done.out), done
+    done = run("plan", *how, "goal=all", folder=tmp_path)
+    assert any("of all stations alike (a map shows the strongest)" in one for one in done.out), done
 
 
 def test_a_plan_did_not_say_how_many_stations_a_place_lists(mapped, model, tmp_path, monkeypatch):

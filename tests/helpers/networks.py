@@ -10,6 +10,8 @@ from gsparc.data.schema import Measurements
 
 SITES, SECTORS, SIDE_M, STEP_M, BLOCK_M = 10, 3, 2500.0, 18.0, 125.0
 COMMON_DB, OWN_DB, NOISE_DB, LENGTH_M = 5.0, 3.5, 1.5, 70.0  # shadowing of a site, of a cell; noise
+INDOOR_DB, BEHIND_DB, BEHIND_M = 16.0, 20.0, 300.0  # what buildings take off, of places in and behind them
+BUILT, HOUSE_M = 0.4, 85.0  # share of the blocks between streets that a building stands in; its side
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class Network:
         measured: (M, T) levels there [dBm]; the strongest are listed.
         asked: (Q, 3) places beside the track and around it [m].
         truth: (Q, T) levels there, without noise [dBm].
+        indoors: (Q,) bool, which of them a building stands around.
     """
 
     place: np.ndarray
@@ -32,6 +35,7 @@ class Network:
     measured: np.ndarray
     asked: np.ndarray
     truth: np.ndarray
+    indoors: np.ndarray
 
     def listed(self, count: int) -> np.ndarray:
         """(M, T) bool: which cells are among the `count` strongest of each moment."""
@@ -82,9 +86,36 @@ def _streets(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.array(places[:count])
 
 
+def _lost_to_buildings(
+    places: np.ndarray, sites: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Losses (n, R) [dB] of places (n, 2) in and behind buildings from sites (R, 2) [m]; which are in."""
+    count = int(SIDE_M // BLOCK_M) + 2
+    built = rng.uniform(size=(count, count)) < BUILT
+
+    def inside(at: np.ndarray) -> np.ndarray:
+        cell = np.floor(at / BLOCK_M)
+        middle = np.abs(at - (cell + 0.5) * BLOCK_M).max(-1) < HOUSE_M / 2
+        return middle & built[tuple(np.moveaxis(cell.astype(int).clip(0, count - 1), -1, 0))]
+
+    away = sites - places[:, None]
+    far = np.minimum(BEHIND_M / np.linalg.norm(away, axis=-1), 1.0)[..., None]
+    steps = np.linspace(0, 1, 20)[1:]
+    behind = np.mean([inside(places[:, None] + step * far * away) for step in steps], 0)
+    within = inside(places)
+    return BEHIND_DB * behind + INDOOR_DB * within[:, None], within
+
+
 @cache
 def network(seed: int, wrong: int = 0, moments: int = 700, asked: int = 250) -> Network:
     """Ten sites of three sectors; `wrong` azimuths of the list are turned by 180 degrees."""
+    return draw_network(seed, wrong, moments, asked)
+
+
+def draw_network(
+    seed: int, wrong: int, moments: int, asked: int | np.ndarray, buildings: bool = False
+) -> Network:
+    """The same; places (Q, 2) that are asked may be given, and buildings stand between streets."""
     rng = np.random.default_rng(seed)
     sites: list[np.ndarray] = []
     while len(sites) < SITES:
@@ -96,8 +127,10 @@ def network(seed: int, wrong: int = 0, moments: int = 700, asked: int = 250) -> 
     cells = len(place)
     tilt = rng.uniform(3, 8, cells).round()
     walk = _streets(rng, moments)
-    beside = walk[rng.integers(moments, size=asked // 2)] + rng.normal(0, 60, (asked // 2, 2))
-    every = np.concatenate([walk, beside, rng.uniform(0, SIDE_M, (asked - len(beside), 2))])
+    if isinstance(asked, int):
+        beside = walk[rng.integers(moments, size=asked // 2)] + rng.normal(0, 60, (asked // 2, 2))
+        asked = np.concatenate([beside, rng.uniform(0, SIDE_M, (asked - len(beside), 2))])
+    every = np.concatenate([walk, asked])
     every = np.c_[every, np.full(len(every), 1.5)]
     apart = np.linalg.norm(every[:, None, :2] - every[None, :, :2], axis=-1)
     root = np.linalg.cholesky(np.exp(-apart / LENGTH_M) + 1e-9 * np.eye(len(every)))
@@ -109,10 +142,15 @@ def network(seed: int, wrong: int = 0, moments: int = 700, asked: int = 250) -> 
         every, place, azimuth + rng.normal(0, 5, cells), tilt + rng.normal(0, 0.7, cells),
         rng.uniform(58, 75, cells), rng.uniform(8, 12, cells), rng.uniform(22, 30, cells),
     )  # fmt: skip
+    indoors = np.zeros(len(every), bool)
+    if buildings:
+        lost, indoors = _lost_to_buildings(every[:, :2], place[::SECTORS, :2], np.random.default_rng(seed))
+        level -= np.repeat(lost, SECTORS, 1)
     measured = level[:moments] + rng.normal(0, NOISE_DB, (moments, cells))
     written = azimuth % 360
     written[rng.permutation(cells)[:wrong]] += 180
-    return Network(place, written % 360, tilt, every[:moments], measured, every[moments:], level[moments:])
+    asked, truth, indoors = (part[moments:] for part in (every, level, indoors))
+    return Network(place, written % 360, tilt, every[:moments], measured, asked, truth, indoors)
 
 
 def reference(one: Network, count: int, azimuths: bool = True) -> tuple[np.ndarray, np.ndarray]:

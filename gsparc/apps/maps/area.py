@@ -64,7 +64,7 @@ class Grid:
 
 def lay_grid(
     site: Site | None, area: Any = None, height_m: float | None = None, step_m: float | None = None,
-    plan: FloorPlan | None = None, stations: int = 1,
+    plan: FloorPlan | None = None, stations: int = 1, buildings: Any = None,
 ) -> Grid:  # fmt: skip
     """Return the cells of a map.
 
@@ -76,6 +76,7 @@ def lay_grid(
         step_m: side of a cell; None: about `CELLS` of them.
         plan: beneath the map.
         stations: layers of each cell, for what memory is needed.
+        buildings: GeoJSON file of footprints, whose cells are left out.
 
     Raises:
         DataError: an area that is none, no height, a step that gives no cells, or more than memory holds.
@@ -94,8 +95,14 @@ def lay_grid(
         )
     nx, ny = (max(int(n), 1) for n in count)
     x, y = (low[i] + step * (0.5 + np.arange(n)) for i, n in enumerate((nx, ny)))
-    rows = (np.column_stack([x, np.full(nx, one)]) for one in y)  # a million places at once take memory
-    inside = np.ones((ny, nx), bool) if contains is None else np.array([contains(row) for row in rows])
+    within = None if buildings is None else _drawn(site, buildings, "buildings")[1]
+
+    def is_asked(places: np.ndarray) -> np.ndarray:
+        chosen: np.ndarray = np.ones(len(places), bool) if contains is None else contains(places)
+        return chosen if within is None else np.asarray(chosen & ~within(places))
+
+    # By rows: a million places at once take memory.
+    inside = np.array([is_asked(np.column_stack([x, np.full(nx, one)])) for one in y])
     if not inside.any():
         raise DataError(f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer")
     return Grid(x, y, height, step, inside, None if site is None else site.georeference)
@@ -106,12 +113,8 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
     box = None if site is None else site.moving_box
     width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
     if is_drawn(area):
-        origin = None if site is None else site.georeference
-        drawn, _ = read_shapes(area, "area", origin, site_m=width)
-        from shapely import contains_xy
-
-        low, high = np.reshape(drawn.bounds, (2, 2))
-        return low, high, lambda places: contains_xy(drawn, places)
+        (low, high), contains = _drawn(site, area, "area", width)
+        return low, high, contains
     if area is not None:
         low, high = _rectangle(area)
         if (high - low).max() < LEAST * width:
@@ -126,6 +129,14 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
     low, high = site.moving_box[:, -3:][:, :2] + site.origin[:2]
     margin = 0.02 * max(float((high - low).max()), 1e-6)
     return low - margin, high + margin, None
+
+
+def _drawn(site: Site | None, path: Any, key: str, width: float = 0.0) -> tuple[np.ndarray, Any]:
+    """Corners (2, 2) of a file's polygons, and what says which places (n, 2) are inside."""
+    drawn, _ = read_shapes(path, key, None if site is None else site.georeference, site_m=width)
+    from shapely import contains_xy
+
+    return np.reshape(drawn.bounds, (2, 2)), lambda places: contains_xy(drawn, places)
 
 
 def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import query_ends, to_local
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
+DRAWS = 200  # of levels, that tell how likely a station is the strongest
 SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
 SHARE_OF_SIDE = 0.15  # of the longer side: the length over which powers are alike, where nobody says it
 
@@ -51,12 +52,13 @@ class ErrorCovariance:
 
 def error_covariances(
     predictor: Predictor, places: np.ndarray, stations: Sequence[str], promise: Promise | None,
-    other_end: Sequence[float] | None = None,
+    other_end: Sequence[float] | None = None, goal: str = "all", threshold_db: float | None = None,
 ) -> list[ErrorCovariance]:  # fmt: skip
     """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
-    Held-out blocks of `promise` scale the variances. What is measured at a place lists those that are
-    predicted strongest there, as many as training rows have in the mean.
+    Held-out blocks of `promise` scale the variances, and what shall be known weighs them, see `weigh_goal`.
+    What is measured at a place lists those that are predicted strongest there, as many as training rows have
+    in the mean.
 
     Raises:
         ValueError: the model has no process.
@@ -69,7 +71,8 @@ def error_covariances(
     level = np.nan_to_num([told[name][0] for name in every], nan=-np.inf)
     listed = (level >= np.sort(level, 0)[-each]).T
     more = predictor.noise_by_others(places, [names.index(name) for name in every], listed).T
-    for name in stations:
+    levels, spreads = np.array([told[name] for name in stations]).swapaxes(0, 1)
+    for name, worth in zip(stations, weigh_goal(levels, spreads, goal, threshold_db), strict=True):
         number, asking = names.index(name), ask[name]
         covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
         weight = np.ones(len(places))
@@ -80,8 +83,32 @@ def error_covariances(
             _, error = calibration.half_and_error(told[name][1], inside, np.full(len(far), number))
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
-        covariances.append(ErrorCovariance(covariance, noise, noise + more[every.index(name)], weight))
+        measured = noise + more[every.index(name)]
+        covariances.append(ErrorCovariance(covariance, noise, measured, worth * weight))
     return covariances
+
+
+def weigh_goal(
+    level_db: np.ndarray, spread_db: np.ndarray, goal: str, threshold_db: float | None = None
+) -> np.ndarray:
+    """Return weights (T, S), of mean 1, of variances of T stations at S places.
+
+    Of goal `strongest` the chance of each to be that; with a threshold times the variance of whether one
+    reaches it.
+
+    >>> weigh_goal(np.array([[-60.0], [-90.0]]), np.ones((2, 1)), "strongest").ravel()
+    array([2., 0.])
+    """
+    if goal == "all" and threshold_db is None:
+        return np.ones_like(level_db)
+    rng, wins, reached = np.random.default_rng(0), np.zeros(level_db.shape), np.zeros(level_db.shape[1])
+    mean, spread, at = np.nan_to_num(level_db, nan=-np.inf), np.nan_to_num(spread_db), np.arange(len(reached))
+    for _ in range(DRAWS):
+        drawn = mean + spread * rng.normal(size=mean.shape)
+        wins[drawn.argmax(0), at] += 1
+        reached += drawn.max(0) >= (np.inf if threshold_db is None else threshold_db)
+    weight = wins * (reached * (DRAWS - reached) + 1)  # at no place none
+    return np.asarray(weight / weight.mean())
 
 
 def prior_covariances(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:

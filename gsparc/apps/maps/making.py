@@ -43,7 +43,7 @@ def predict_map(
     load: float | Sequence[float] | Mapping[str, float] = 1.0, noise_db: float | None = None,
     other_end: Sequence[float] | None = None, plan: FloorPlan | None = None,
     promise: Promise | Literal["stored"] | None = "stored", share: float = 0.9, tolerance_db: float = 0.1,
-    unit: str | None = None, dry: bool = False,
+    unit: str | None = None, dry: bool = False, buildings: Any = None,
 ) -> FieldMap:  # fmt: skip
     """Predict every cell of an area.
 
@@ -66,6 +66,7 @@ def predict_map(
             every cell. Known places must be stored with the model.
         unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as measured.
         dry: predict one cell of each station alone: whether everything asked for is possible.
+        buildings: see `lay_grid`.
 
     Raises:
         DataError: anything wrong with what is asked for.
@@ -75,7 +76,7 @@ def predict_map(
         raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
     promise = read_promise(predictor.extra) if promise == "stored" else promise
     names, notes = choose_stations(predictor, stations, promise)
-    grid = lay_grid(site, area, height_m, step_m, plan, len(names))
+    grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings)
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     about = station_facts(site, numbers)
     load_of = field_map.read_loads(load, names, about["stations"])

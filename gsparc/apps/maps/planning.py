@@ -17,11 +17,11 @@ from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
-from gsparc.apps.maps.making import choose_stations
+from gsparc.apps.maps.making import MOST_DB, choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
+from gsparc.data.limits import POSITIVE, check_arguments, choice, number, or_null, whole
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_place
 
@@ -33,7 +33,7 @@ WORTH = 0.02  # share of the expected error over an area, that places must take 
 
 @dataclass(frozen=True)
 class MeasurementPlan:
-    """Places to measure, the most telling first, or in the order of a walk.
+    """Places to measure, the most telling first, or in the order of a walk; errors are of the goal.
 
     Attributes:
         places: (n, 3) world [m].
@@ -88,7 +88,7 @@ def plan_measurements(
     walkable: Any = None, plan: FloorPlan | None = None, stations: Sequence[str | int] | None = None,
     other_end: Sequence[float] | None = None, promise: Promise | None = None, least_gain_db: float = 0.0,
     route: bool = True, start: Sequence[float] | None = None, route_m: float | None = None,
-    length_m: float | None = None,
+    length_m: float | None = None, goal: str = "strongest", threshold_db: float | None = None,
 ) -> MeasurementPlan:  # fmt: skip
     """Choose places to measure next, as a batch.
 
@@ -110,11 +110,13 @@ def plan_measurements(
         start: (2,) where the walk starts [m]; None: anywhere.
         route_m: longest walk [m]; None: any.
         length_m: before anything is measured, over which powers are alike [m].
+        goal, threshold_db: what shall be known, see `weigh_goal`.
 
     Raises:
         DataError: anything wrong with what is asked for.
     """
     metres = {"route_m": or_null(POSITIVE), "length_m": or_null(POSITIVE)}
+    metres |= {"goal": choice("strongest", "all"), "threshold_db": or_null(number(-MOST_DB, MOST_DB))}
     check_arguments(locals(), count=whole(1), least_gain_db=number(0), **metres)
     grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets, streets = grid.places(), None
@@ -127,7 +129,7 @@ def plan_measurements(
         unknown = prior_covariances(places, length_m)
     else:
         names, _ = choose_stations(predictor, stations)
-        unknown = error_covariances(predictor, places, names, promise, other_end)
+        unknown = error_covariances(predictor, places, names, promise, other_end, goal, threshold_db)
     begin = np.zeros((0, 2)) if start is None else read_place("start", start, 2)[None, :2]
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from towns import town_model
 
 import gsparc
-from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances
+from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, weigh_goal
 from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
@@ -42,6 +42,22 @@ def test_error_falls_and_places_lie_where_data_do_not(predictor):
     assert (np.diff(found.expected_db) < 0).all() and (found.places[:, 0] < 5).mean() > 0.7
     random = np.median(found.error_before)
     assert found.error_before[found.at[:, 0] < -20].mean() > random
+
+
+def test_a_plan_lowered_errors_of_stations_that_serve_nowhere(predictor):
+    """All counted alike, where a map shows the strongest, or which places reach a level."""
+    level, spread = np.array([[-60.0, -60, -60], [-200, -60, -90]]), np.ones((2, 3))
+    share = weigh_goal(level, spread, "strongest")
+    assert share.sum(0) == pytest.approx(2) and share[0] == pytest.approx([2, 1, 2], abs=0.2)
+    assert (weigh_goal(level, spread, "all") == 1).all()
+    doubt = weigh_goal(level + np.array([0, 0, 10]), spread, "strongest", -60)
+    assert doubt.sum(0)[0] > doubt.sum(0)[1] > 1e3 * doubt.sum(0)[2] and doubt.mean() == pytest.approx(1)
+    assert weigh_goal(level, spread, "strongest", 0) == pytest.approx(share)  # nothing is in doubt
+    area = [0, 0, 80, 60]
+    both = {goal: plan_measurements(predictor, 1, area, goal=goal) for goal in ("strongest", "all")}
+    one = {goal: plan_measurements(predictor, 1, area, goal=goal, stations=["west"]) for goal in both}
+    assert both["strongest"].before_db != pytest.approx(both["all"].before_db, rel=1e-3)
+    assert one["strongest"].before_db == pytest.approx(one["all"].before_db)
 
 
 def test_corridors_and_a_length(tmp_path, predictor):
@@ -98,7 +114,7 @@ def test_a_plan_promised_what_lists_of_the_strongest_cannot_give(predictor):
     assert whole.stations_of_place() == 2 and lists.stations_of_place() == 1
     gains = []
     for promise in (whole, lists):
-        found = plan_measurements(predictor, 6, area, promise=promise)
+        found = plan_measurements(predictor, 6, area, promise=promise, goal="all")
         gains.append(found.before_db - found.after_db)
     assert 0 < gains[1] < 0.8 * gains[0]
     places = np.array([[12.0, 20, 1.5], [68, 45, 1.5]])  # beside either mast
@@ -155,6 +171,7 @@ def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
     ({"count": 2, "start": [1]}, "two finite numbers"),
     ({"count": 2, "least_gain_db": -1}, "at least 0"),
     ({"count": 2, "length_m": 0}, "above 0"),
+    ({"count": 2, "goal": "best"}, "one of strongest, all"),
     ({"count": 2, "area": None}, "nothing says where"),
     ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
 ])  # fmt: skip

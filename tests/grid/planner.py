@@ -1,0 +1,151 @@
+"""What a planner is told of simulated networks, beside their truth, by seeds; FOLDER keeps their models.
+
+python tests/grid/planner.py covered FOLDER 0 1 2 >> docs/results/maps/covered.csv
+python tests/grid/planner.py planned FOLDER 0 1 2 3 4 >> docs/results/maps/planned.csv
+python tests/grid/planner.py azimuths FOLDER 10 11 >> docs/results/maps/azimuths.csv
+"""
+
+import csv
+import logging
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+
+import numpy as np
+from networks import NOISE_DB, Network, draw_network
+from scipy.spatial import cKDTree
+
+import gsparc
+from gsparc.apps.maps.covered import covered_between
+from gsparc.apps.maps.levels import joint_levels
+from gsparc.apps.maps.making import predict_map
+from gsparc.apps.maps.planning import coarse_grid, plan_measurements
+from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models import checkpoint
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.per_station import wrap_per_station
+from gsparc.models.powers.together import network as network_learning
+from gsparc.models.powers.together.network import check_azimuths
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.refit import Learned
+from gsparc.training.context import FitContext
+
+LISTED, MOMENTS, EVEN, STEP_M, AREA = 6, 350, 1000, 50.0, (250.0, 250.0, 2250.0, 2250.0)
+LEAST_LISTS = 20
+FOLDS, STOPS = 2, 40  # of promises; places that a plan sends one to
+SHARES = (0.9, 0.75, 0.5)  # of the places asked for, covered at the levels that are tried
+
+
+def town(seed: int, buildings: bool = True) -> Network:
+    """A network with places asked for: where a plan may send one, and `EVEN` others."""
+    even = np.random.default_rng(seed).uniform(*np.reshape(AREA, (2, 2)), (EVEN, 2))
+    stops = coarse_grid(None, AREA, 1.5).places()[:, :2]
+    return draw_network(seed, 0, MOMENTS, np.concatenate([even, stops]), buildings)
+
+
+def learned(data: Measurements, file: Path) -> tuple[Predictor, Promise]:
+    """A model of all rows with its promise, from its file where it is there."""
+    if not file.is_file():
+        method, every = wrap_per_station(Gsparc(), data), np.arange(len(data))
+        fold, context = Fold(every, every[:0], every[:0]), FitContext(file.parent, stations="together")
+        method.fit(data, fold, context)
+        promise = gather_promise(Learned(method, Gsparc(), data, fold, context), PromiseSettings(folds=FOLDS))
+        checkpoint.save(file, method)
+        promise.store(file)
+    predictor = gsparc.load(file)
+    promise = read_promise(predictor.extra)
+    assert promise is not None
+    return predictor, promise
+
+
+def covered(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
+    """Share promised with its interval, at places asked outdoors, true there, true at all, share refused."""
+    one = town(seed, buildings)
+    predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
+    low, high = np.maximum(one.moment[:, :2].min(0), AREA[:2]), np.minimum(one.moment[:, :2].max(0), AREA[2:])
+    even = ((one.asked[:, :2] > low) & (one.asked[:, :2] < high)).all(1) & (np.arange(len(one.asked)) < EVEN)
+    places, best, out = one.asked[even], one.truth[even].max(1), ~one.indoors[even]
+    for level in np.quantile(best[out], 1 - np.array(SHARES)).round():
+        field = predict_map(predictor, [*low, *high], step_m=STEP_M, threshold_db=level, promise=promise)
+        at = tuple(
+            np.abs(axis - places[:, i, None]).argmin(1) for i, axis in ((1, field.grid.y), (0, field.grid.x))
+        )
+        said, known = 1 - field.outage[at], ~field.refused[at]
+        ends = covered_between(field, predictor, promise)
+        shares = said[known & out].mean(), (best >= level)[known & out].mean(), (best >= level)[known].mean()
+        figures = (1 - np.nanmean(field.outage), *ends, *shares, 1 - known.mean())
+        yield (seed, int(buildings), level, *(round(float(v), 4) for v in figures))
+
+
+def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
+    """After `STOPS` more places by a way to choose: errors of the strongest, of all [dB], share misjudged."""
+    one = town(seed, buildings)
+    predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
+    stops, rng = one.asked[EVEN:], np.random.default_rng(seed)
+    level = float(np.quantile(one.truth[:EVEN][~one.indoors[:EVEN]].max(1), 0.25).round())
+    ways = {"before": np.zeros(0, int), "random": rng.permutation(len(stops))[:STOPS]}
+    far, ways["farthest"] = cKDTree(one.moment).query(stops)[0], []
+    while len(ways["farthest"]) < STOPS:
+        ways["farthest"].append(int(far.argmax()))
+        far = np.minimum(far, np.linalg.norm(stops - stops[far.argmax()], axis=1))
+    goals = {"all": ("all", None), "strongest": ("strongest", None), "covered": ("strongest", level)}
+    for name, (goal, threshold) in goals.items():
+        how = {"goal": goal, "threshold_db": threshold, "promise": promise, "route": False}
+        found = plan_measurements(predictor, STOPS, AREA, height_m=1.5, **how)
+        apart, ways[name] = cKDTree(stops).query(found.places)
+        assert apart.max() < 1.0
+    for name, chosen in ways.items():
+        heard = one.truth[EVEN:][chosen] + rng.normal(0, NOISE_DB, (len(chosen), len(one.place)))
+        parts = np.r_[one.moment, stops[chosen]], np.r_[one.measured, heard]
+        data = replace(one, moment=parts[0], measured=parts[1]).data(LISTED)
+        method, every = wrap_per_station(Gsparc(), data), np.arange(len(data))
+        method.fit(data, Fold(every, every[:0], every[:0]), FitContext(folder, stations="together"))
+        checkpoint.save(folder / "again.ckpt", method)
+        again = gsparc.load(folder / "again.ckpt")
+        said = joint_levels(again, one.asked[:EVEN], np.arange(len(one.place)))[:, 0]
+        best, true = said.max(1), one.truth[:EVEN].max(1)
+        errors = (best - true), (said - one.truth[:EVEN])
+        wrong = float(((best >= level) != (true >= level)).mean())
+        figures = [*(float(np.sqrt((e**2).mean())) for e in errors), wrong]
+        yield (seed, name, *(round(v, 4) for v in figures))
+
+
+def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
+    """Three azimuths wrong by an angle: lists, named, untested; others: named, of how many; untested."""
+    one = draw_network(seed, 0, 2 * MOMENTS, 20, buildings)
+    lists, rng = one.listed(LISTED).sum(0), np.random.default_rng(seed)
+    enough = np.flatnonzero(lists >= LEAST_LISTS)
+    enough = enough[np.argsort(lists[enough])]
+    for angle in (0, 30, 60, 120):
+        wrong = [rng.choice(part) for part in np.array_split(enough, 3)] if angle else []
+        azimuth = one.azimuth.copy()
+        azimuth[wrong] += angle * rng.choice([-1, 1], len(wrong))
+        data = replace(one, azimuth=azimuth % 360).data(LISTED)
+        names, notes = np.array(data.site.stations.name), check_azimuths(data)
+        said = (
+            " ".join(note for note in notes if head in note)
+            for head in ("contradicted by", "taken as listed")
+        )
+        named, untold = (np.isin(names, re.findall(r"[0-9]+-[0-9]+", part)) for part in said)
+        false = np.delete(named, wrong).sum(), len(names) - len(wrong), untold.sum()
+        for t in wrong or [-1]:
+            figures = (lists[t], int(named[t]), int(untold[t])) if wrong else ("", "", "")
+            yield (seed, int(buildings), angle, *figures, *false)
+
+
+PARTS = {"covered": covered, "planned": planned, "azimuths": azimuths}
+
+if __name__ == "__main__":
+    logging.disable(logging.WARNING)
+    network_learning.list_first = lambda names, _: ", ".join(names)  # all that are untested, not the first
+    part, folder, *seeds = sys.argv[1:]
+    for seed, buildings in product(map(int, seeds), (False, True)[: 1 + (part != "planned")]):
+        csv.writer(sys.stdout, lineterminator="\n").writerows(PARTS[part](seed, buildings, Path(folder)))
+        sys.stdout.flush()
