@@ -21,10 +21,8 @@ OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quanti
 
 def figure_names(kind):
     shape = {"spectrum": (1, 16, 16), "rssi": (1, 1)}.get(kind, (1, 1, 2))
-    one, metric = (
-        torch.ones(shape, dtype=torch.complex64 if "csi" in kind else torch.float32),
-        METRICS[kind](),
-    )
+    one = torch.ones(shape, dtype=torch.complex64 if "csi" in kind else torch.float32)
+    metric = METRICS[kind]()
     metric.update(one, one)
     return set(metric.summary(metric.compute())) - {"samples", "silent_samples"}
 

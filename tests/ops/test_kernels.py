@@ -87,9 +87,8 @@ def test_a_grid_that_nearly_closes_wrapped_by_two_periods(gap, first):
     """The kernels' period was the width, the reference's 2 pi / step."""
     scene, width = random_scene(seed=5, size=2.0), 16
     grid = SphereGrid(9, width, 0.0, first, 0.1, (1 - gap) * 2 * math.pi / width)
-    assert grid.periodic == (abs(gap) < 1e-6) and grid.per_turn == pytest.approx(
-        2 * math.pi / grid.azimuth_step
-    )
+    assert grid.periodic == (abs(gap) < 1e-6)
+    assert grid.per_turn == pytest.approx(2 * math.pi / grid.azimuth_step)
     assert_equals_reference(scene, poses(3), grid, projection="equirect")
 
 

@@ -49,9 +49,8 @@ def test_mean_is_the_mean(campaign, folds, tmp_path):
     rows = np.concatenate([fold.train, fold.val])
     batch = data.batch(fold.test)
     found = fitted("mean", data, fold, tmp_path).predict(batch).mean
-    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6) and torch.equal(
-        found[0], found[-1]
-    )
+    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6)
+    assert torch.equal(found[0], found[-1])
 
 
 @pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
