@@ -161,10 +161,8 @@ def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
         "x,y,lev,cell\n" + "".join(f"{i},{i % 3},-{60 + i},b\n" for i in range(30))
     )
     (tmp_path / "s.csv").write_text("name,x,y\nb,9,9\n")
-    file, said = (
-        str(tmp_path / "a.csv"),
-        ["dataset.columns.rssi_db=lev", f"dataset.stations_file={tmp_path / 's.csv'}"],
-    )
+    file = str(tmp_path / "a.csv")
+    said = ["dataset.columns.rssi_db=lev", f"dataset.stations_file={tmp_path / 's.csv'}"]
     assert main([file, "--no-draw", said[0]]) == 0
     assert "unknown; dataset.stations_file=FILE gives them" in capsys.readouterr().out
     assert main([file, "--no-draw", *said]) == 0

@@ -3,6 +3,7 @@
 import csv
 import logging
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from campaigns import compose
 from doors import knock
 from drives import city_drive, write_table
+from refusals import refused_as
 
 import gsparc
 from gsparc.apps.maps.intervals import HeldOutLevels
@@ -28,6 +30,8 @@ from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
+
+refused = partial(refused_as, DataError)
 
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
 NAMES = np.array(["roof-0", "roof-1", "mast"])
@@ -178,8 +182,7 @@ def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
         answered(town, tmp_path, heads, [*table[:2], [1, 1, 1, "roof-2"]])
     with pytest.raises(DataError, match=r"station=mats: no such station; did you mean 'mast'"):
         answered(town, tmp_path, "xyz", places, station="mats")
-    with pytest.raises(DataError, match=r"no row of .*\.csv is about it"):
-        answered(town, tmp_path, heads, table[:1], station="roof-0")
+    refused(r"no row of .*\.csv is about it", answered, town, tmp_path, heads, table[:1], station="roof-0")
 
 
 def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
@@ -306,18 +309,15 @@ def test_where_the_answers_go(town, tmp_path):
         ("a.csv", {"overwrite": True}, "these are the places themselves"),
         ("b.csv", {}, "is there already; say overwrite=true"),
     ):
-        with pytest.raises(DataError, match=message):
-            predict_file(town, file, tmp_path / out, **how)
+        refused(message, predict_file, town, file, tmp_path / out, **how)
     assert (tmp_path / "b.csv").read_text() == "kept"
     predict_file(town, file, tmp_path / "b.csv", overwrite=True)
     assert len(read(tmp_path / "b.csv")) == 3
     predict_file(town, file, tmp_path / "b.npz")
     with np.load(tmp_path / "b.npz") as stored:
         assert stored["station"].tolist() == NAMES.tolist() and stored["rssi_db"].shape == (3,)
-    with pytest.raises(DataError, match=r"expected a table \(csv, parquet"):
-        predict_file(town, tmp_path / "b.npz", tmp_path / "c.csv")
-    with pytest.raises(DataError, match="no such file"):
-        predict_file(town, tmp_path / "absent.csv")
+    refused(r"expected a table \(csv, parquet", predict_file, town, tmp_path / "b.npz", tmp_path / "c.csv")
+    refused("no such file", predict_file, town, tmp_path / "absent.csv")
     with pytest.raises(DataError, match="places in degrees, but arrays was measured in metres"):
         predict_file(town, write_table(tmp_path / "d.csv", ["lat", "lon"], [[47, 11]]))
 
@@ -387,8 +387,7 @@ def test_what_is_no_table_goes_to_an_npz(tmp_path, kind):
     arrays, message = UNTABLED[kind]
     model = fitted({"tx_position": walk(), "rx_position": POSTS[0], **arrays}, tmp_path, "mean")
     file = write_table(tmp_path / "a.csv", "xyz", walk()[:3].tolist())
-    with pytest.raises(DataError, match=message):
-        predict_file(model, file)
+    refused(message, predict_file, model, file)
     predict_file(model, file, tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as stored:
         assert stored[kind].shape == (3, *arrays[kind].shape[1:])
@@ -412,8 +411,7 @@ def test_both_ends_move(tmp_path):
         ("xyz", table[:, :3], "no coordinates of the receiver"),
         (["tx_lat", "tx_lon", "tx_z", "rx_lat", "rx_lon", "rx_z"], table, "places in degrees, but"),
     ):
-        with pytest.raises(DataError, match=message):
-            answered(model, tmp_path, wrong, rows)
+        refused(message, answered, model, tmp_path, wrong, rows)
 
 
 def test_an_end_that_stood_still_is_where_it_was(town, tmp_path, caplog):

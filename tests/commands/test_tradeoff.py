@@ -62,9 +62,8 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     assert len(rows) == facts["tradeoff/points"] == 3  # as trained, 2 without confidence
     assert len({row["closeness_db"] for row in rows}) == 2  # fewer pixels are not as near as the full model
     times = [float(row["render_ms_p50"]) for row in rows]
-    assert times == sorted(times) and all(
-        float(row["render_ms_p95"]) >= t for row, t in zip(rows, times, strict=True)
-    )
+    assert times == sorted(times)
+    assert all(float(row["render_ms_p95"]) >= t for row, t in zip(rows, times, strict=True))
     assert sum(int(row["front"]) for row in rows) == facts["tradeoff/front"] >= 1
     full = next(row for row in rows if row["label"].startswith("as trained"))
     assert float(full["psnr_db"]) == facts["test/psnr_db"]

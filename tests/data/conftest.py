@@ -1,9 +1,9 @@
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-import refusals
+from refusals import refused_as
 from releases import write_release
 
 from gsparc.data.errors import DataError
@@ -12,13 +12,7 @@ from gsparc.data.errors import DataError
 @pytest.fixture
 def refused():
     """`refused(says, read, ...)`: the error of `read(...)`, of which each problem is one short line."""
-
-    def error_of(says: str, read: Callable, *arguments, **more) -> DataError:
-        found = refusals.refused(says, read, *arguments, **more)
-        assert isinstance(found, DataError)
-        return found
-
-    return error_of
+    return partial(refused_as, DataError)
 
 
 @pytest.fixture

@@ -75,10 +75,8 @@ def test_whether_std_is_right_was_in_no_table():
 def test_silent_rows_counted_nowhere(drawn):
     """Beside lists of the strongest methods that predict what was heard everywhere had the better rmse."""
     data, mean_db = drawn
-    heard, level = (
-        data.censored_side(np.arange(COUNT)) == 0,
-        10 * np.log10(data.target[:, 0] * data.site.target_scale),
-    )
+    heard = data.censored_side(np.arange(COUNT)) == 0
+    level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
     lifted = np.maximum(mean_db, LEVEL + 6)  # as if every place heard
     honest, other = (
         {"error_db": said - level, **scored(data, said, 6.0).samples} for said in (mean_db, lifted)

@@ -1,4 +1,4 @@
-"""The map of a campaign: what is on it, and that it is drawn for every kind."""
+"""The map of a campaign and of what a field found: what is on it, and that it is drawn for every kind."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,10 @@ from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.checks.plausibility import find_level_steps
 from gsparc.data.own import from_arrays
+from gsparc.data.site_objects import SiteObjects
+from gsparc.data.walls import SceneWalls
 from gsparc.evaluation import site_plan
-from gsparc.evaluation.site_plan import draw_site, find_spots
+from gsparc.evaluation.site_plan import draw_found, draw_site, find_spots
 
 
 def scattered(count=80):
@@ -113,3 +115,44 @@ def test_other_kinds_are_drawn_too(campaign, figures):
     assert "transmitter" in said and "receiver" in said and "mean channel power [dB]" in said
     line = {"rx_position": np.arange(30.0)[:, None] * [1, 0, 0], "rssi_db": np.arange(30.0)}
     assert "30 powers at 30 places" in shown(from_arrays(line), figures)[1]
+
+
+STATION = np.array([101.0, 204.0, 2.0])
+HALF = np.sqrt(0.5)
+PLANES = np.array([[1.0, 0, 0, 5.0], [HALF, HALF, 0, 2.0], [0, 0, 1.0, -1.0]])  # two walls, and a floor
+BOX = np.array([[[1.0, 1.0, -1.0], [2.0, 3.0, 0.0]]])
+
+
+@pytest.fixture
+def room():
+    """Powers of a room far from the origin of its coordinates."""
+    places = np.random.default_rng(0).uniform([100, 200, 1], [108, 206, 1.1], (60, 3))
+    arrays = {"rx_position": places, "tx_position": STATION, "rssi_db": np.linspace(-60, -40, 60)}
+    return from_arrays(arrays, {"name": "room"})
+
+
+def drawn(figures, data, objects, known=None) -> Figure:
+    draw_found(data, objects, "unused.png", known)
+    figures[0].draw_without_rendering()
+    return figures[0]
+
+
+def test_walls_and_boxes_are_drawn_where_they_are(room, figures):
+    corners = np.array([[100.0, 200, 0], [108, 200, 0], [108, 200, 3], [100, 200, 3]])
+    known = SceneWalls((corners,), BOX + room.site.origin)
+    figure = drawn(figures, room, SiteObjects.from_arrays(PLANES, BOX), known)
+    lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
+    np.testing.assert_allclose(lines["mirror planes found"][:, 0], 5.0 + room.site.origin[0])
+    np.testing.assert_allclose(lines["known walls"], [[108, 200], [100, 200]])
+    np.testing.assert_allclose(lines["ends that stand"], STATION[None, :2])
+    assert {text.get_text() for text in figure.legends[0].get_texts()} == {
+        "measured places", "known walls", "known boxes", "mirror planes found", "boxes found (1)",
+        "ends that stand",
+    }  # fmt: skip
+    assert f"z = {room.site.origin[2] - 1.0:.2f} m" in figure.get_suptitle()
+
+
+def test_a_wall_apart_from_all_places_was_beside_the_map(room, figures):
+    apart = np.array([[1.0, 0, 0, 25.0], [1.0, 0, 0, 900.0]])
+    axis = drawn(figures, room, SiteObjects.from_arrays(apart)).axes[0]
+    assert 25 < axis.get_xlim()[1] - room.site.origin[0] < 60

@@ -27,6 +27,8 @@ LINES = {
     "place": "place ckpt=FILE", "view": "view ckpt=FILE save=page.html", "tradeoff": "tradeoff ckpt=FILE",
     "calibrate": "calibrate ckpt=FILE",
 }  # fmt: skip
+ALIKE = ("an array's field", "evaluate", "place", "view")  # stop where another kind does, at the same door
+STOPPED = [pytest.param(kind, marks=pytest.mark.rare if kind in ALIKE else ()) for kind in LINES]
 SIZES = (0, 300, 6_000, 60_000)  # bytes: nothing, Hydra's notes, tables, pictures and models
 
 
@@ -67,7 +69,7 @@ def test_a_full_disk_is_said_in_one_line(kind, tiny, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", LINES)
+@pytest.mark.parametrize("kind", STOPPED)
 def test_ctrl_c_ends_every_stage_in_one_line(kind, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tiny.folder)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -47,7 +47,7 @@ def sooner(folder: Path):
 
 
 pytestmark = pytest.mark.slow  # at once: tests/commands/test_resumed.py, tests/simulate/test_campaign.py
-CHAINS = pytest.mark.parametrize("chain", [0, 1, 2])
+CHAINS = pytest.mark.parametrize("chain", [1, *(pytest.param(one, marks=pytest.mark.rare) for one in (0, 2))])
 
 
 @CHAINS

@@ -84,7 +84,7 @@ def module() -> Path:
 )  # fmt: skip
 def test_nothing_is_found(module, isa, others):
     files = [f"tests/hard_cases/test_{case}.py" for case in CASES]
-    ops = ("kernels", "face", "compute_kernels", "queries")
+    ops = ("kernels", "compute_kernels", "queries")
     files += [f"tests/ops/test_{name}.py" for name in ops]
     left = " and ".join(f"not {word}" for word in ("shim", "forked", *others))
     done = watched(

@@ -249,10 +249,8 @@ def assert_within(got: Outcome, known: Condition, factor: float) -> None:
             continue
         gap = (got[name].double() - want).abs()
         gap = gap[..., known.steady] if name in ("image", "transmittance") else gap
-        error, allowed = (
-            (float(gap.max()) if gap.numel() else 0.0),
-            known.allowed(name, got.precision, factor),
-        )
+        error = float(gap.max()) if gap.numel() else 0.0
+        allowed = known.allowed(name, got.precision, factor)
         part = "backward" if name.startswith("d_") else "forward"
         relative = 1 + float(want.abs().max())
         LEDGER.compared(got.engine, got.precision, part, error / relative, allowed / relative)

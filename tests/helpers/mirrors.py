@@ -14,10 +14,15 @@ from gsparc.data.public.fetch import PublicSet, Source
 Answer = Callable[[BaseHTTPRequestHandler, bytes], None]
 
 
-def sound(request: BaseHTTPRequestHandler, content: bytes) -> None:
+def begin(request: BaseHTTPRequestHandler, **heads: object) -> None:
     request.send_response(200)
-    request.send_header("Content-Length", str(len(content)))
+    for name, value in heads.items():
+        request.send_header(name.replace("_", "-"), str(value))
     request.end_headers()
+
+
+def sound(request: BaseHTTPRequestHandler, content: bytes) -> None:
+    begin(request, Content_Length=len(content))
     request.wfile.write(content)
 
 

@@ -34,11 +34,9 @@ def records(csi, tick, time, number, sender) -> bytes:
     rows = np.zeros(len(csi), RECORD)
     rows["size"], rows["code"], rows["antennas"], rows["length"] = RECORD.itemsize - 2, 0xBB, (3, 1), 192
     gain = 40 - 20 * np.log10(np.linalg.norm(csi, axis=1))  # the strongest fills the converter
-    rows["order"], rows["gain"], rows["rssi"] = (
-        0b100100,
-        40,
-        np.clip(np.round(84 - gain)[:, None] + [0, -40, -40], 1, 255),  # 0 is no antenna,
-    )
+    rows["order"] = 0b100100
+    rows["gain"] = 40
+    rows["rssi"] = np.clip(np.round(84 - gain)[:, None] + [0, -40, -40], 1, 255)  # 0 is no antenna
     scaled = csi / np.abs(csi).max(axis=1, keepdims=True) * 90
     parts = np.zeros((len(csi), 30, 6), np.int8)
     parts[..., 0], parts[..., 1] = np.round(scaled.real), np.round(scaled.imag)

@@ -123,10 +123,8 @@ def test_a_checkpoint_says_the_same(name, tmp_path):
     checkpoint.save(tmp_path / "model.ckpt", fitted.method, fitted.config)
     again, _ = loading.load(tmp_path / "model.ckpt")
     same(fitted.method, again, asked(fitted))
-    assert (
-        again.count_components() == fitted.method.count_components()
-        and again.effects == fitted.method.effects
-    )
+    assert again.count_components() == fitted.method.count_components()
+    assert again.effects == fitted.method.effects
 
 
 NAMED = {

@@ -311,8 +311,7 @@ def test_what_is_scored_is_what_is_served(name, layout):
     scored = method.predict(batch).mean
     if name not in UPLINK:
         return torch.testing.assert_close(served(predictor, data, rows), scored, rtol=1e-4, atol=1e-5)
-    with pytest.raises(ValueError, match="uplink= is needed"):
-        method.predict(replace(batch, uplink=None))
+    refused("uplink= is needed", method.predict, replace(batch, uplink=None))
     heard = batch.uplink * data.site.target_scale
     said = predictor.csi(uplink=heard) / data.site.target_scale
     scored = method.predict(replace(batch, noise_variance=None)).mean

@@ -13,8 +13,10 @@ from gsparc.ops import cuda_library
 HERE = Path(__file__).parent
 ENGINES = ["cpu", "shim"] if cuda_library.missing_device() else ["cpu", "shim", "gpu"]
 OF_THE_CPU = {
-    *("test_operators", "test_queries"),  # files
+    "test_queries",  # a file
     "test_compute_kernels",  # tests/cuda/test_cuda.py has those of a GPU, in float32
+    *("test_inputs_on_strides_are_understood", "test_calls_have_the_layout_of_the_kernels"),
+    "test_the_table_has_every_operator_and_what_computes_it",
     *("test_absent_backends_say_why", "test_every_instruction_set", "test_spans_cut_no_pixel_off"),
     "test_kernels_of_another_compiler_were_the_slowest_ones",
     "test_similarity_has_forward_mode",

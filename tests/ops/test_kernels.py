@@ -1,5 +1,8 @@
-"""The kernels against the float64 reference, forward and backward, on random fields."""
+"""The kernels against the float64 reference, their stages apart and together, and the list of them."""
 
+import csv
+import ctypes
+import importlib
 import math
 import re
 import subprocess
@@ -22,8 +25,25 @@ from rasters import (
     render,
     truth,
 )
+from refusals import refused
 
-from gsparc.ops import Cutoff, SphereGrid, _native, make_plan, mean_weights, rasterize
+from gsparc.ops import (
+    BackendUnavailable,
+    Cutoff,
+    SphereGrid,
+    StalePlan,
+    _native,
+    calls,
+    composite,
+    cuda_library,
+    freeze,
+    make_plan,
+    mean_weights,
+    operators,
+    projection,
+    rasterize,
+)
+from gsparc.ops.geometry import WIDEST_GRID
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 
@@ -87,9 +107,8 @@ def test_a_grid_that_nearly_closes_wrapped_by_two_periods(gap, first):
     """The kernels' period was the width, the reference's 2 pi / step."""
     scene, width = random_scene(seed=5, size=2.0), 16
     grid = SphereGrid(9, width, 0.0, first, 0.1, (1 - gap) * 2 * math.pi / width)
-    assert grid.periodic == (abs(gap) < 1e-6) and grid.per_turn == pytest.approx(
-        2 * math.pi / grid.azimuth_step
-    )
+    assert grid.periodic == (abs(gap) < 1e-6)
+    assert grid.per_turn == pytest.approx(2 * math.pi / grid.azimuth_step)
     assert_equals_reference(scene, poses(3), grid, projection="equirect")
 
 
@@ -192,3 +211,82 @@ def test_screen_gradient_is_the_shift_of_the_footprint():
         turned.append(loss)
     slope = (turned[0] - turned[1]) / (2 * step)
     assert torch.isclose(got["d_means2d"][0, 0, 0], slope, rtol=1e-4)
+
+
+GRID = GRIDS["hemisphere"]
+
+
+def test_the_widest_grid_is_drawn_to_its_last_column():
+    scene, width = random_scene(n=20, samples=1), WIDEST_GRID
+    grid = SphereGrid(1, width, 0.2, 0.0, 0.1, 2 * torch.pi / width)
+    one, other = (
+        rasterize(*scene.model, scene.features, poses(0), grid, backend=b).image for b in ("cpu", "reference")
+    )
+    assert (one - other).abs().max() < 1e-12 and other.abs().max() > 0.01
+
+
+def test_absent_backends_say_why():
+    scene = random_scene(n=4)
+    reason = cuda_library.missing_device() or "needs tensors on cuda"
+    with pytest.raises(BackendUnavailable, match=re.escape(reason)):
+        make_plan(*scene.model, poses(0), GRID, backend="cuda")
+    refused("backend is", make_plan, *scene.model, poses(0), GRID, backend="tpu")
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("channels", [0, 1, 3, 8, 9, 19, 70])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_frozen_view_of_any_number_of_channels(channels, samples, dtype):
+    """Few channels add neighbouring blocks apart, many all at once."""
+    scene, pose = random_scene(n=300, channels=channels, samples=samples).to(dtype), poses(0)
+    plan = make_plan(*scene.model, pose, GRIDS["patch"])
+    frozen = freeze(plan, *scene.model, version=0)
+    want = composite(plan, *scene.model, scene.features).image
+    close = {"rtol": 0, "atol": 1e-12 if dtype == torch.float64 else 1e-5}
+    assert torch.allclose(frozen.render(scene.features, version=0), want, **close)
+    assert torch.allclose(frozen.render(scene.features[0], version=0), want[0], **close)
+    assert torch.allclose(frozen.render_visible(scene.features[:, frozen.order]), want, **close)
+
+
+def test_plans_and_views_of_other_fields_are_refused():
+    scene, few = random_scene(), random_scene(n=4)
+    frozen = freeze(make_plan(*scene.model, poses(0), GRID), *scene.model, version=3)
+    with pytest.raises(StalePlan, match="version 3, the field is at 4"):
+        frozen.render(scene.features, version=4)
+    refused("one pose", freeze, make_plan(*scene.model, poses(2), GRID), *scene.model, version=0)
+    refused("plan again", composite, make_plan(*few.model, poses(0), GRID), *scene.model, scene.features)
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_inputs_on_strides_are_understood():
+    scene, pose, grid = random_scene(n=9), poses(0), SphereGrid.hemisphere(10, 40)
+    wide = torch.empty(9, 6, dtype=torch.float64)[:, ::2]
+    wide.copy_(scene.means)
+    rest = (scene.quats, scene.scales, scene.opacities)
+    plain, strided = (make_plan(means, *rest, pose, grid) for means in (scene.means, wide))
+    assert all(torch.equal(a, b) for a, b in zip(plain.buffers, strided.buffers, strict=True))
+    images = [
+        composite(plan, means, *rest, scene.features).image
+        for plan, means in ((plain, scene.means), (strided, wide))
+    ]
+    assert torch.equal(*images)
+
+
+def test_calls_have_the_layout_of_the_kernels():
+    assert ctypes.sizeof(calls.Call) == _native.CALL_BYTES
+    assert list(projection.PROJECTIONS) == _native.PROJECTIONS
+
+
+def test_the_table_has_every_operator_and_what_computes_it():
+    with (ROOT / "docs" / "reference" / "operators.csv").open(encoding="utf-8", newline="") as file:
+        _, *rows = csv.reader(file)
+    for module in ("native", "cuda", "similarity"):
+        importlib.import_module(f"gsparc.ops.{module}")
+    shown = {name: computed for name, _, *computed in rows}
+    assert shown.keys() == operators.KERNELS["cpu"].keys()
+    for name, computed in shown.items():
+        served = [operators.KERNELS[device].get(name) for device in ("cpu", "cuda")]
+        wanted = [f and f"{f.__module__.split('.')[-1]}.{f.__name__}" for f in served]
+        assert computed == [function or "PyTorch" for function in wanted], name

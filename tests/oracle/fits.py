@@ -114,10 +114,8 @@ def moved(
     old: dict[str, np.ndarray], new: dict[str, np.ndarray], asked: Arrays, bound: float, double: float
 ) -> list[str]:
     """Answers that differ by more than a share of the targets' deviation, one line each."""
-    scale, lines = (
-        spread(asked),
-        [f"{part}: {'gone' if part in old else 'new'}" for part in sorted(old.keys() ^ new.keys())],
-    )
+    scale = spread(asked)
+    lines = [f"{part}: {'gone' if part in old else 'new'}" for part in sorted(old.keys() ^ new.keys())]
     for part in sorted(old.keys() & new.keys()):
         kind = part.split()[0]
         unit = {"variance": scale**2, "confidence": 1.0}.get(kind, scale)

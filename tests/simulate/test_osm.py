@@ -87,5 +87,4 @@ def test_spoilt_extracts_are_refused_in_one_line(kind, tmp_path):
 
 def test_missing_extract_and_folder_are_refused(tmp_path):
     for path in (tmp_path / "none.osm", tmp_path):
-        with pytest.raises(ValueError, match="no such file"):
-            read_town(path, 3.5e9)
+        refused("no such file", read_town, path, 3.5e9)

@@ -28,10 +28,8 @@ pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
 from gsparc.apps.export.serving import RAW, LimitedServer, Limits, build_application
 
 TX = np.array([3.0, 2, 2])
-HOSTILE, HOSTILE_S = (
-    Path(__file__).parents[2] / "helpers" / "hostile.py",
-    int(os.environ.get("GSPARC_HOSTILE_S", "15")),
-)
+HOSTILE = Path(__file__).parents[2] / "helpers" / "hostile.py"
+HOSTILE_S = int(os.environ.get("GSPARC_HOSTILE_S", "15"))
 
 
 def fitted(kind="rssi"):

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from cities import city, fold
+from cities import city, fold, uplink_field
 from doors import knock
 from names import find_unexplained
 
@@ -20,11 +20,8 @@ from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.apps.link.study import beam_facts, beam_gain, beam_loss_db, find_crossing, rate_facts, send_blocks
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
-from gsparc.models.uplink.method import UplinkField
-from gsparc.models.uplink.search import SearchSettings
 from gsparc.prediction.channels import centred_grid, interpolate_tones, resource_grid
 from gsparc.prediction.risk import binomial_interval
-from gsparc.training.context import FitContext
 
 needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
 
@@ -45,12 +42,9 @@ def drawn():
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    data = city("all")
-    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
-    method.fit(data, fold(), FitContext())
     file = tmp_path_factory.mktemp("link") / "model.ckpt"
-    checkpoint.save(file, method)
-    return data, file
+    checkpoint.save(file, uplink_field())
+    return city("all"), file
 
 
 def test_interpolation_hits_a_channel_it_was_not_shown() -> None:

@@ -75,11 +75,10 @@ def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
 @pytest.mark.parametrize(
     "rows", ["outlier", "", [-1], [1.5], [999], 3, None, True, [True], [[3]], {"3": 4}, [10**20], np.array(3)]
 )
-def test_rows_that_cannot_be_left_out_are_refused(rows, tmp_path):
+def test_rows_that_cannot_be_left_out_are_refused(rows, tmp_path, refused):
     """A single number, null and a number beyond 64 bits ended in words of Python and NumPy."""
     clean, _ = spoilt("rssi", tmp_path, 0)
-    with pytest.raises(ValueError, match=r"split\.leave_out"):
-        split_for({"name": "random", "leave_out": rows}, clean)
+    refused(r"split\.leave_out", split_for, {"name": "random", "leave_out": rows}, clean)
 
 
 @pytest.mark.parametrize("rows", [np.array([3, 4]), [np.int64(3), np.uint8(4)], (3, 4)])
@@ -101,10 +100,9 @@ def test_real_dynamics_are_no_outliers():
     assert not too_far(track).any() and not too_far(np.zeros((5, 3))).any()
 
 
-def test_a_row_beyond_float32_is_refused(tmp_path):
+def test_a_row_beyond_float32_is_refused(tmp_path, refused):
     """Its target would be infinite, in units of the other rows."""
-    with pytest.raises(ValueError, match=r"csi, row 5: beyond float32 in units of the other rows"):
-        spoilt("csi", tmp_path, 5, 1e200)
+    refused(r"csi, row 5: beyond float32 in units of the other rows", spoilt, "csi", tmp_path, 5, 1e200)
 
 
 @pytest.mark.parametrize(

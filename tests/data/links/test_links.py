@@ -326,10 +326,8 @@ def test_a_level_of_0_far_above_all_others_was_the_strongest(count, stations):
         posts = rng.uniform(0, 50, (stations, 3))
         arrays |= {"station": np.arange(240) % stations, "station_position": posts}
     reading = interpret(Raw(arrays), "file")
-    assert (
-        len(reading.data) == 240 - count
-        and 10 * np.log10(reading.data.target.max() * reading.data.site.target_scale) < -41
-    )
+    assert len(reading.data) == 240 - count
+    assert 10 * np.log10(reading.data.target.max() * reading.data.site.target_scale) < -41
     (said,) = [note for note in reading.notes if "exactly 0" in note]
     assert "no value, left out; dataset.not_heard=[0]" in said and reading.data.censored is None
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import mirrors
 import pytest
 from filelock import FileLock
-from mirrors import mirrored, offer, sound, source_of
+from mirrors import begin, mirrored, offer, sound, source_of
 from releases import real
 
 from gsparc.commands import data as command
@@ -59,17 +59,13 @@ def test_what_is_damaged_is_fetched_again_and_alone(mirror, monkeypatch, tmp_pat
 
 
 def cut(request, content):
-    request.send_response(200)
-    request.send_header("Content-Length", str(len(content)))
-    request.end_headers()
+    begin(request, Content_Length=len(content))
     request.wfile.write(content[:-7])
     request.close_connection = True
 
 
 def stalls(request, content):
-    request.send_response(200)
-    request.send_header("Content-Length", str(len(content)))
-    request.end_headers()
+    begin(request, Content_Length=len(content))
     request.wfile.write(content[:10])
     request.wfile.flush()
     time.sleep(1.5)
@@ -90,8 +86,7 @@ def moved(request, content):
 
 
 def endless(request, content):
-    request.send_response(200)
-    request.end_headers()
+    begin(request)
     request.wfile.write(bytes(400_000))
 
 
@@ -256,8 +251,7 @@ def test_more_than_the_known_size_is_not_read(mirror, monkeypatch, tmp_path, ref
     sent = []
 
     def flood(request, content):
-        request.send_response(200)
-        request.end_headers()
+        begin(request)
         with contextlib.suppress(OSError):
             for _ in range(1000):
                 request.wfile.write(os.urandom(2**16))
@@ -270,9 +264,7 @@ def test_more_than_the_known_size_is_not_read(mirror, monkeypatch, tmp_path, ref
 
 def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path, refused):
     def drips(request, content):
-        request.send_response(200)
-        request.send_header("Content-Length", str(len(content)))
-        request.end_headers()
+        begin(request, Content_Length=len(content))
         with contextlib.suppress(OSError):
             for one in content:
                 request.wfile.write(bytes([one]))
@@ -287,10 +279,7 @@ def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path, refused)
 def test_what_is_packed_on_the_wire_is_not_unpacked(mirror, monkeypatch, tmp_path, refused):
     def packed(request, content):
         body = gzip.compress(bytes(10**7))
-        request.send_response(200)
-        request.send_header("Content-Encoding", "gzip")
-        request.send_header("Content-Length", str(len(body)))
-        request.end_headers()
+        begin(request, Content_Encoding="gzip", Content_Length=len(body))
         with contextlib.suppress(OSError):
             request.wfile.write(body)
 

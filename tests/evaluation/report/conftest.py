@@ -1,6 +1,5 @@
 """Run directories as training leaves them, invented."""
 
-import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from drives import write_table
 from PIL import Image
 
 
@@ -36,7 +36,7 @@ def invent(
         "ssim": 0.9 + 0 * value, "ssim_gauss": 0.92 + 0 * value, "psnr_db": value, "mse": 10 ** (-value / 10),
         "baseline/gp/psnr_db": value - 0.5,
     }  # fmt: skip
-    _csv(folder / "per_sample.csv", samples)
+    write_table(folder / "per_sample.csv", samples, zip(*samples.values(), strict=True))
     facts = {
         "dataset/kind": "spectrum", "dataset/name": "toy", "dataset/sha256": "d" * 64,
         "dataset/stand_in": None,
@@ -60,13 +60,6 @@ def invent(
         (folder / ".hydra").mkdir()
         (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(overrides)))
     return folder
-
-
-def _csv(path: Path, columns: dict) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows(zip(*columns.values(), strict=True))
 
 
 @pytest.fixture

@@ -135,9 +135,8 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
         (folder / "summary.json").write_text(json.dumps(facts))
     runs = short_settings(frame(tmp_path))
     pooled = tables.table_of_seeds(runs)
-    assert pooled.title == "Settings over draws" and [row[0] for row in pooled.rows] == [
-        "gsparc", "mean (baseline)", "gp (baseline)",
-    ]  # fmt: skip
+    assert pooled.title == "Settings over draws"
+    assert [row[0] for row in pooled.rows] == ["gsparc", "mean (baseline)", "gp (baseline)"]
     found = cells(pooled, 0)
     assert (found["draws"], found["seeds"]) == (3, 1)
     assert found["PSNR dB"] == Interval(29.0, error=pytest.approx(1 / 3**0.5))

@@ -134,10 +134,8 @@ def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, 
         few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))
     )
     few.fit(data, _fold(160), FitContext(tmp_path))
-    assert (
-        few.fitted_model().emission.encoding.width == 40
-        and whole.fitted_model().emission.encoding.width == 128
-    )
+    assert few.fitted_model().emission.encoding.width == 40
+    assert whole.fitted_model().emission.encoding.width == 128
     batch = data.batch(_fold(160).test)
     said = [m.predict(batch).mean for m in (whole, few)]
     assert (said[0] - said[1]).square().mean() < 5e-3 * batch.target.square().mean()

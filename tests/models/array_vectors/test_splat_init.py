@@ -45,10 +45,8 @@ def process(trained):
     _, data, fold = trained
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
-    matrix, partner = (
-        steering_matrix(site.array, site.grid, site.wavelength).numpy(),
-        index_mirror_elements(site.array),
-    )
+    matrix = steering_matrix(site.array, site.grid, site.wavelength).numpy()
+    partner = index_mirror_elements(site.array)
     found = recover_cached(data, fold.train)  # the same solutions
     kernel = choose_kernel(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = align_by_likelihood(found.vectors, places, partner, kernel)

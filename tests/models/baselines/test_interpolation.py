@@ -1,5 +1,6 @@
-"""The simple baselines, and what all of them share."""
+"""The simple baselines, what all of them share, and kriging from the nearest of many places."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
+from gsparc.models.baselines.kriging import Kriging, Variogram
 from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
@@ -49,9 +51,8 @@ def test_mean_is_the_mean(campaign, folds, tmp_path):
     rows = np.concatenate([fold.train, fold.val])
     batch = data.batch(fold.test)
     found = fitted("mean", data, fold, tmp_path).predict(batch).mean
-    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6) and torch.equal(
-        found[0], found[-1]
-    )
+    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6)
+    assert torch.equal(found[0], found[-1])
 
 
 @pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
@@ -101,3 +102,44 @@ def test_runs_were_taken_as_one_without_a_word(campaign, folds, tmp_path):
     said = [InverseDistance().fit(d, fold, FitContext(tmp_path)).notes for d in (several, data)]
     assert any("channels of 2 runs" in note for note in said[0])
     assert not any("runs" in note for note in said[1])
+
+
+def field(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places, powers [dB] of a smooth field with noise, and queries among them."""
+    rng = np.random.default_rng(0)
+    places = np.concatenate([rng.uniform(0, 30, (count, 2)), np.ones((count, 1))], 1)
+    level = 6 * np.sin(places[:, 0] / 3) + 4 * np.cos(places[:, 1] / 4)
+    return places, (level + rng.normal(0, 0.5, count)).astype(np.float32)[:, None], places[:40] + 0.1
+
+
+def krige(places: np.ndarray, decibels: np.ndarray, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    method = Kriging()
+    method.positions, method.values, method.channels = places, decibels, None
+    method.variogram = Variogram(0.25, 25.0, 5.0)
+    method._factor_system()
+    place, weights, variance = method._weights(queries)
+    return (weights * decibels[place, 0]).sum(1), variance
+
+
+def test_nearest_places_screen_the_others(monkeypatch):
+    places, decibels, queries = field(600)
+    whole, spread = krige(places, decibels, queries)
+    monkeypatch.setattr(kriging, "WHOLE", 100)
+    near, wider = krige(places, decibels, queries)
+    assert np.abs(near - whole).max() < 0.15 and np.sqrt(np.mean((near - whole) ** 2)) < 0.05
+    assert (wider >= spread - 1e-9).all() and np.abs(wider / spread - 1).max() < 0.05
+
+
+def test_two_places_have_no_variogram():
+    """Their one distance is more than half the extent: no quantile of nothing could be taken."""
+    found = kriging.fit_variogram(np.array([[0.0, 0, 0], [3.0, 4, 0]]), np.array([[-60.0], [-70.0]]))
+    assert (found.nugget, found.range) == (0.0, 2.5) and found.sill > 0
+
+
+def test_few_places_printed_a_warning_of_a_library():
+    """`OptimizeWarning: Covariance of the parameters could not be estimated`, which nobody had asked for."""
+    rng = np.random.default_rng(0)
+    places, levels = np.c_[rng.uniform(0, 50, (4, 2)), np.zeros(4)], np.round(2 * rng.normal(size=(4, 1)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert kriging.fit_variogram(places, levels).sill >= 0

@@ -271,8 +271,5 @@ def test_the_log_counted_the_sources_of_a_fit_before_the_last(pillar, caplog, mo
 
     monkeypatch.setattr(ImageSources, "condition", counted)
     found.fit(data, fold, FitContext())
-    assert (
-        said_before
-        and not any(said_before)
-        and f"{found.count_gaussians} Gaussians from init=rays" in caplog.text
-    )
+    assert said_before and not any(said_before)
+    assert f"{found.count_gaussians} Gaussians from init=rays" in caplog.text

@@ -83,11 +83,8 @@ def test_paths_of_each_antenna_sum_to_the_prediction(four):
     method, data, fold = four
     batch = data.batch(fold.test[:5])
     gain, delay, direction, _ = method.paths(batch)
-    assert gain.shape == delay.shape == (5, 4, method.count_components()) and direction.shape == (
-        5,
-        method.count_components(),
-        3,
-    )
+    assert gain.shape == delay.shape == (5, 4, method.count_components())
+    assert direction.shape == (5, method.count_components(), 3)
     assert torch.allclose(gain.sum(-1), method.predict(batch).mean[..., 0], atol=1e-4)
     antennas = torch.from_numpy(static_array(data.site, 4) + data.site.static_position)
     direct = torch.linalg.vector_norm(

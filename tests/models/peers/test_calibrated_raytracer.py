@@ -77,11 +77,8 @@ def test_where_no_scene_is_known_it_says_so_in_one_line(scene, words):
 
 def test_a_room_without_triangles_names_no_scene():
     boxy = SceneSettings("box", 30, CARRIER_HZ, 0.0, 1, room={"size_m": [6, 5, 3]})
-    assert (
-        not has_known_scene(said(boxy))
-        and not has_known_scene({})
-        and not has_known_scene({"scene": "a street"})
-    )
+    assert not has_known_scene(said(boxy)) and not has_known_scene({})
+    assert not has_known_scene({"scene": "a street"})
     street = SceneSettings("canyon", 30, CARRIER_HZ, 0.0, 1, builtin="simple_street_canyon")
     assert has_known_scene(said(street)) and known_scene(None, said(street), 2e9).carrier_hz == 2e9
 

@@ -127,10 +127,8 @@ def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
     """Among very many rows the nearest to a row could be a silent one of the same place."""
     one = town(150, walls=False)
     twice = np.tile(np.arange(150), 2)
-    places, decibels = (
-        one.moving[twice] + one.site.origin,
-        np.asarray(db(torch.from_numpy(one.target[twice])), float),
-    )
+    places = one.moving[twice] + one.site.origin
+    decibels = np.asarray(db(torch.from_numpy(one.target[twice])), float)
     decibels[150:] -= 1e-6  # no copies
     data = from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
     silent = np.arange(300) >= 150

@@ -109,14 +109,10 @@ def test_few_rows_have_no_fringes():
 
 def test_what_is_sampled():
     places = plane(200).moving
-    assert (
-        resolves_wavelength(places, WAVELENGTH)
-        and not resolves_wavelength(places, 0.01)
-        and not resolves_wavelength(places, None)
-    )
-    assert not resolves_wavelength(np.hstack([places, places]), WAVELENGTH) and not resolves_wavelength(
-        places[:1], WAVELENGTH
-    )
+    assert resolves_wavelength(places, WAVELENGTH) and not resolves_wavelength(places, 0.01)
+    assert not resolves_wavelength(places, None)
+    assert not resolves_wavelength(np.hstack([places, places]), WAVELENGTH)
+    assert not resolves_wavelength(places[:1], WAVELENGTH)
 
 
 def test_a_blend_goes_from_rows_to_groups_to_nothing():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cities import city, deaf, fold, folder
+from cities import city, deaf, fold, folder, uplink_field
 
 from gsparc.data.datasets.argos import load_argos
 from gsparc.data.splits import Split
@@ -56,10 +56,7 @@ def test_noise_is_read_off_empty_delays() -> None:
 
 @pytest.fixture(scope="module")
 def fitted():
-    data = city("all")
-    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
-    method.fit(data, fold(), FitContext())
-    return method, data
+    return uplink_field(), city("all")
 
 
 def _relative(found, true) -> torch.Tensor:

@@ -26,10 +26,8 @@ def scene(order: int, most: int = 200, walls: SceneWalls = ROOM, hidden: bool = 
 def test_all_images_are_the_simulators_and_as_visible():
     told, mirrors, sequences = scene(3)
     transmitter = torch.from_numpy(told.tx[0])
-    found, true = (
-        images(transmitter, mirrors.planes, sequences).numpy(),
-        told.images.mirror_points(told.tx[0]),
-    )
+    found = images(transmitter, mirrors.planes, sequences).numpy()
+    true = told.images.mirror_points(told.tx[0])
     apart = np.linalg.norm(found[:, None] - true[None], axis=-1)
     assert sequences[0] == () and (apart.min(1) < 1e-6).all() and len(set(apart.argmin(1))) == len(sequences)
     assert (

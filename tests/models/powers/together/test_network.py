@@ -196,10 +196,8 @@ def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
 def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
     one = network(seed, wrong)
     method, _ = fitted(one, count, tmp_path, azimuths)
-    found, plain = (
-        judged(one, count, *levels(method, one)),
-        judged(one, count, *reference(one, count, azimuths)),
-    )
+    found = judged(one, count, *levels(method, one))
+    plain = judged(one, count, *reference(one, count, azimuths))
     assert found["rmse"] < 0.9 * plain["rmse"] and abs(found["bias_unlisted"]) < 3, found
     assert all(0.82 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), found
     assert found["best"] > plain["best"] - 0.05, (found, plain)
