@@ -14,6 +14,7 @@ from gsparc.data.schema import Measurements
 
 BAND = "power_db"  # of the strongest station, as `gsparc map` writes; with a name behind it of one of several
 MOST = 4_000_000  # levels: they are kept with a model
+ABOUT_M = 100.0  # least distance from the rows' box that levels are kept within [m]
 
 
 def read_prior_levels(
@@ -39,8 +40,8 @@ def read_prior_levels(
     read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
     points, level = read(path, data, station)
     known = np.isfinite(level) & np.isfinite(points).all(1)
-    if not 0 < known.sum() <= MOST:
-        raise DataError(f"model.prior={path}: {known.sum():,} levels; 1 to {MOST:,} are needed")
+    if not known.any():
+        raise DataError(f"model.prior={path}: no level is known in it")
     points, level = points[known], level[known]
     at = data.moving[:, :2] + data.site.origin[:2]
     if not ((at >= points.min(0) - 1) & (at <= points.max(0) + 1)).all(1).any():
@@ -48,7 +49,14 @@ def read_prior_levels(
             f"x {a:.0f} to {b:.0f}, y {c:.0f} to {d:.0f} m" for (a, b), (c, d) in map(_extent, (points, at))
         )
         raise DataError(f"model.prior={path}: it is of {box}, and all rows lie elsewhere: {rows}")
-    return points, level
+    # Of a whole country only what lies about the rows is kept.
+    margin = max(float(np.ptp(at, axis=0).max()), ABOUT_M)
+    near = ((points >= at.min(0) - margin) & (points <= at.max(0) + margin)).all(1)
+    if near.sum() > MOST:
+        raise DataError(
+            f"model.prior={path}: {near.sum():,} levels about the rows; {MOST:,} at most are kept"
+        )
+    return points[near], level[near]
 
 
 def _extent(points: np.ndarray) -> np.ndarray:

@@ -8,6 +8,8 @@ from rasterio.transform import from_origin
 from refusals import refused
 
 import gsparc
+from gsparc.data.own import from_arrays
+from gsparc.data.prior_levels import read_prior_levels
 from gsparc.models.powers.prior_map import PriorMap
 
 POST = [0.0, 0.0, 20.0]
@@ -67,6 +69,17 @@ def test_a_model_keeps_the_map_that_it_was_given(rasters):
     found = fit(rows, rasters / "right.tif", model="powers", save=path)
     (rasters / "right.tif").unlink()
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), found.rssi(rx=asked), atol=1e-4)
+
+
+def test_of_a_large_map_what_lies_about_the_rows_is_kept(tmp_path):
+    at = from_origin(-30_000, 30_000, 50, 50)
+    how = {"width": 1200, "height": 1200, "count": 1, "dtype": "float32", "driver": "GTiff", "transform": at}
+    with rasterio.open(tmp_path / "land.tif", "w", **how) as file:
+        file.write(np.random.default_rng(0).normal(-90, 5, (1200, 1200)).astype("float32"), 1)
+    rows = draw(30, 3)
+    data = from_arrays({"rx_position": rows, "tx_position": np.array(POST), "rssi_db": measured(rows)})
+    points, level = read_prior_levels(tmp_path / "land.tif", data)
+    assert len(level) < 40**2 and points.min() > -650 and points.max() < 1350
 
 
 def test_each_station_has_the_band_of_its_name(rasters, caplog):
