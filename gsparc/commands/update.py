@@ -13,6 +13,7 @@ from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
+from gsparc.evaluation.given_heard import strongest_lists
 from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
@@ -38,7 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
     stored = checkpoint.read(config.ckpt)
     predictor = load(config.ckpt)
-    known, watch = len(predictor.alarms), Stopwatch()
+    known, watch, told, skipped = len(predictor.alarms), Stopwatch(), 0, 0
     if config.undo:
         predictor.undo(config.undo)
     else:
@@ -46,9 +47,15 @@ def task(config: DictConfig) -> dict[str, Any]:
         if not placed:
             raise DataError(f"{config.data}: has no places; later rows need them")
         how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
+        if strongest_lists(data) is not None:
+            raise DataError(
+                f"{config.data}: lists of the strongest hold what is strong, and would raise all levels: "
+                "train on all drives; `gsparc evaluate` names cells that are gone"
+            )
         rows = level_rows(data, predictor.site)
         for start in range(0, len(rows), config.batch or len(rows)):
-            predictor.update(rows[start : start + (config.batch or len(rows))], **how)
+            found = predictor.update(rows[start : start + (config.batch or len(rows))], **how)
+            told, skipped = told + len(found.rows), skipped + found.skipped
     seconds, out = watch.seconds, config.out or config.ckpt
     checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
     table = alarm_rows(predictor)
@@ -62,9 +69,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - known,
         "update/versions": len(predictor.versions), "time/update_s": seconds,
     }  # fmt: skip
-    before = (
-        f"{predictor.journal[-1] if predictor.journal else 'as it was learned'}; model in {out}; summary "
-    )
+    said = f"{told} rows, {skipped} skipped, as they tell nothing, {len(table) - known} alarms"
+    said = f"{config.undo} versions back" if config.undo else said
+    before = f"update: {said}; model in {out}; summary "
     return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
 
 

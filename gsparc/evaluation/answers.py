@@ -140,7 +140,7 @@ def predict_file(
 
 
 def _with_tested(answers: Answers, local: np.ndarray, power: PowerUnit, tested: Tested) -> Answers:
-    """Answers whose deviations are the tested ones; NaN where they are refused."""
+    """Answers whose deviations are the tested ones; the model's own where they are refused."""
     assert answers.said.variance is not None
     mean = answers.said.mean[:, 0].double().numpy()
     spread = own = answers.said.variance.double().sqrt().numpy()
@@ -148,7 +148,8 @@ def _with_tested(answers: Answers, local: np.ndarray, power: PowerUnit, tested: 
         with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
             spread = power_in_decibels(mean, own**2)[1]
     error = tested(local, answers.station, spread)
-    scaled = torch.from_numpy(own * error / np.where(spread > 0, spread, np.nan))
+    ratio = np.where(np.isnan(error), 1.0, error / np.where(spread > 0, spread, np.nan))
+    scaled = torch.from_numpy(own * ratio)
     said = replace(answers.said, variance=scaled.square())
     return replace(answers, said=said, refused=np.isnan(error))
 

@@ -15,7 +15,7 @@ from gsparc.evaluation.table import Column, Table
 from gsparc.models.powers.groups import number_squares
 
 WORST = 3  # stations shown; the file has all
-BY_CHANCE, SURE = 1e-4, 0.999  # chance at which a station is missed; most that a prediction is trusted
+BY_CHANCE, SURE = 0.02, 0.999  # chance at which a station is missed; most that a prediction is trusted
 ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
 
 
@@ -59,24 +59,22 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
 
 
 def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
-    """Return stations that no list holds though lists should, a row each: `rows`, `expected`, `chance`.
+    """Return stations that no list holds though lists should, a row each: `moments`, `expected`, `chance`.
 
-    Of `rows` of the station `expected` should be listed. Rows of one square of floor err together and count
-    as one, by their mean probability: a station that is there stays out of all with at most this `chance`.
+    Of `moments` `expected` should list the station. Moments of one square of floor err together and count as
+    one, by their largest probability: a station that is there stays out of all with at most this `chance`.
     Empty of other data than lists of the strongest.
     """
-    if not {"strongest_told", "heard_share"} <= scores.samples.keys():
-        return pd.DataFrame(columns=["rows", "expected", "chance"])
-    assert data.station is not None
-    rows = pd.DataFrame({
-        "station": data.station[scores.row], "square": number_squares(data.moving[scores.row]),
-        "share": scores.samples["heard_share"], "listed": data.censored_side(scores.row) <= 0,
-    }).dropna()  # fmt: skip
-    missed = 1 - rows.groupby(["station", "square"]).share.mean().clip(upper=SURE)
-    by = rows.groupby("station")
-    found = by.agg(rows=("share", "size"), expected=("share", "sum"), listed=("listed", "any"))
+    shares = scores.never_listed
+    if shares is None or not len(shares):
+        return pd.DataFrame(columns=["moments", "expected", "chance"])
+    assert data.place is not None
+    moments, first = np.unique(data.place, return_index=True)
+    square = number_squares(data.moving[first])[np.searchsorted(moments, shares.moment)]
+    missed = 1 - shares.groupby(["station", square]).share.max().clip(upper=SURE)
+    found = shares.groupby("station").agg(moments=("share", "size"), expected=("share", "sum"))
     found["chance"] = missed.groupby("station").prod()
-    return found[~found.listed & (found.chance < BY_CHANCE)].drop(columns="listed")
+    return found[found.chance < BY_CHANCE]
 
 
 def describe_unlisted(scores: Scores, data: Measurements) -> str | None:
@@ -84,8 +82,8 @@ def describe_unlisted(scores: Scores, data: Measurements) -> str | None:
     found, stations = unlisted_stations(scores, data).sort_values("chance"), data.site.stations
     if stations is None or not len(found):
         return None
-    names = np.array(stations.shown)[found.index]
-    said = zip(names, found.expected, found["rows"], found.chance, strict=True)
+    names = np.array(stations.shown)[found.index.astype(int)]
+    said = zip(names, found.expected, found.moments, found.chance, strict=True)
     return ", ".join(f"{n} (in {e:.0f} of {r:.0f} lists; chance {c:.0e})" for n, e, r, c in said)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.spatial import cKDTree
 
@@ -117,6 +118,37 @@ def _levels_near(method: Method, lists: StrongestLists, site: Site, places: np.n
     with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
         level[:, at, station] = power_in_decibels(power, variance.double().numpy() * site.target_scale**2)
     return level
+
+
+def never_listed(
+    method: Method, lists: StrongestLists, data: Measurements, asked: Measurements
+) -> pd.DataFrame:
+    """Return how probably lists hold stations that none of them does: columns `station`, `moment`, `share`.
+
+    Of every moment that was asked about, not of a choice of unlisted rows; levels are drawn as the method
+    predicts them. Empty of methods that do not know what lists leave out.
+
+    Args:
+        method: fitted.
+        lists: of the rows that it learned from.
+        data, asked: all rows that are scored, and some of them, in its coordinates.
+    """
+    table = pd.DataFrame({"station": [], "moment": [], "share": []}, dtype=float)
+    if not method.uses_censored:
+        return table
+    assert data.station is not None and asked.place is not None
+    heard = data.station[data.censored_side(np.arange(len(data))) <= 0]
+    absent = np.setdiff1d(np.flatnonzero(np.isfinite(lists.level).any(0)), heard)
+    moment, first = np.unique(asked.place, return_index=True)
+    mean, spread = _levels_near(method, lists, asked.site, asked.moving[first])
+    rng, floor = np.random.default_rng(0), np.nanmin(lists.level)
+    parts = [table]
+    for here, *level in zip(moment, mean, spread, strict=True):
+        drawn = level[0][:, None] + level[1].clip(0)[:, None] * rng.normal(size=(len(level[0]), DRAWS))
+        last = np.partition(drawn, -lists.length, axis=0)[-lists.length]
+        share = (drawn[absent] >= np.maximum(last, floor)).mean(1)
+        parts.append(pd.DataFrame({"station": absent, "moment": here, "share": share}))
+    return pd.concat(parts)
 
 
 def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.given_heard import (
     levels_given_heard,
     levels_of_nearest_moment,
+    never_listed,
     strongest_lists,
     strongest_told,
 )
@@ -38,6 +40,7 @@ class Scores:
         fold, row: (S,) int64.
         samples: quantities of the metrics of `kind`, (S,) float64 each.
         confidence, variance: (S,) float64, NaN where the method gives none.
+        never_listed: see `gsparc.evaluation.given_heard.never_listed`; None of other data than lists.
     """
 
     kind: Scored
@@ -46,6 +49,7 @@ class Scores:
     samples: dict[str, np.ndarray]
     confidence: np.ndarray
     variance: np.ndarray
+    never_listed: pd.DataFrame | None = None
 
     def figures(self) -> dict[str, float | None]:
         """Return flat figures over all folds together."""
@@ -153,6 +157,7 @@ def score_methods(
     if len(methods) != len(split.folds):
         raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
     every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
+    missing: list[pd.DataFrame] = []
     own, before = learned or (data, split)
     limited = data.site.kind == "rssi" and (own.censored_side(before.folds[0].train) > 0).any()
     are_lists = limited and strongest_lists(data) is not None
@@ -187,6 +192,7 @@ def score_methods(
             lists = strongest_lists(there)
             if lists is not None and are_lists:
                 scored["strongest_told"] = strongest_told(method, lists, asked)
+                missing.append(never_listed(method, lists, data.subset(np.concatenate(every)), asked))
             given = levels_given_heard(method, there, asked, *level, lists)
             # Who learned from heard rows alone predicts such levels.
             scored |= given if method.uses_censored else {"heard_share": given["heard_share"]}
@@ -203,4 +209,5 @@ def score_methods(
         confidence=pooled.pop("confidence"),
         variance=pooled.pop("variance"),
         samples=pooled,
+        never_listed=pd.concat(missing) if missing else None,
     )

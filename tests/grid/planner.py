@@ -3,6 +3,7 @@
 python tests/grid/planner.py covered FOLDER 0 1 2 >> docs/results/maps/covered.csv
 python tests/grid/planner.py planned FOLDER 0 1 2 3 4 >> docs/results/maps/planned.csv
 python tests/grid/planner.py azimuths FOLDER 10 11 >> docs/results/maps/azimuths.csv
+python tests/grid/planner.py off FOLDER 801 802 >> docs/results/maps/off.csv
 """
 
 import csv
@@ -27,7 +28,10 @@ from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import coarse_grid, plan_measurements
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.align_site import align_to_site
+from gsparc.evaluation.by_station import unlisted_stations
+from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import wrap_per_station
@@ -131,7 +135,7 @@ def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
         names, notes = np.array(data.site.stations.name), check_azimuths(data)
         said = (
             " ".join(note for note in notes if head in note)
-            for head in ("contradicted by", "taken as listed")
+            for head in ("contradicted by", "azimuths not tested")
         )
         named, untold = (np.isin(names, re.findall(r"[0-9]+-[0-9]+", part)) for part in said)
         false = np.delete(named, wrong).sum(), len(names) - len(wrong), untold.sum()
@@ -140,7 +144,36 @@ def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
             yield (seed, int(buildings), angle, *figures, *false)
 
 
-PARTS = {"covered": covered, "planned": planned, "azimuths": azimuths}
+def off(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
+    """Cells of a site that was off in a second drive: moments that should list each, chance, named; others."""
+    one = draw_network(seed, 0, 1000, 10, buildings)
+    first, second = (slice(0, 600), slice(600, 1000))
+    data = replace(one, moment=one.moment[first], measured=one.measured[first]).data(LISTED)
+    method, every = wrap_per_station(Gsparc(), data), np.arange(len(data))
+    method.fit(data, Fold(every, every[:0], every[:0]), FitContext(folder, stations="together"))
+    taught = Split("all", (Fold(every, every[:0], every[:0]),))
+    for site in (None, *range(0, 10, 2)):
+        measured, cells = (
+            one.measured[second].copy(),
+            [] if site is None else [3 * site + k for k in range(3)],
+        )
+        measured[:, cells] = -400.0
+        later = replace(one, moment=one.moment[second], measured=measured).data(LISTED)
+        judged = align_to_site(later, data.site)
+        rows = np.arange(len(judged))
+        whole = Split("whole", (Fold(rows[:0], rows[:0], rows),))
+        scores = score_methods([method], judged, whole, learned=(data, taught))
+        named = unlisted_stations(scores, judged)
+        others = int((~named.index.isin(cells)).sum())
+        shares = scores.never_listed.groupby("station").share.sum()
+        for cell in cells or [-1]:
+            chance = f"{named.chance[cell]:.1e}" if cell in named.index else ""
+            expected = round(float(shares.get(cell, 0.0)), 1) if cells else ""
+            figures = (expected, int(cell in named.index), chance) if cells else ("", "", "")
+            yield (seed, int(buildings), "" if site is None else site, *figures, others)
+
+
+PARTS = {"off": off, "covered": covered, "planned": planned, "azimuths": azimuths}
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)

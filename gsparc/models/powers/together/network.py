@@ -267,8 +267,8 @@ def _note_untested(
     far = (TURNS.abs() >= UNSEEN_DEG).nonzero()[:, 0]
     told = misfit[:, far].amin(1) - misfit[:, len(TURNS) // 2] > sure
     blind = ((trend.table[:, 0] != NO_AZIMUTH) & ~told).nonzero()[:, 0].tolist()
-    said = f"{list_first([names[t] for t in blind], 12)} of {len(names)} sectors"
-    every = f"azimuths taken as listed, as no rows tell them from {UNSEEN_DEG:g} degrees more: {said}"
+    said = f"{len(blind)} of {len(names)} sectors: {list_first([names[t] for t in blind], 30)}"
+    every = f"azimuths not tested, as no rows tell them from {UNSEEN_DEG:g} degrees more, of {said}"
     return [every] if blind else []
 
 
