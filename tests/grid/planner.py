@@ -145,7 +145,7 @@ def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
 
 
 def off(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
-    """Cells of a site that was off in a second drive: moments that should list each, chance, named; others."""
+    """Cells of a site that was off in a second drive: moments expected, named, chance; others named."""
     one = draw_network(seed, 0, 1000, 10, buildings)
     first, second = (slice(0, 600), slice(600, 1000))
     data = replace(one, moment=one.moment[first], measured=one.measured[first]).data(LISTED)

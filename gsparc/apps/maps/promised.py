@@ -73,7 +73,7 @@ def map_notes(
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
         ends = "" if covered is None else " (90 % interval {:.1%} to {:.1%})".format(*covered)
-        left = figures["map/refused"] / max(int(field.grid.inside.sum()), 1)
+        left = (field.grid.inside & field.refused).sum() / max(field.grid.inside.sum(), 1)
         only = f" ({left:.0%} of the area is refused, and not among them)" * bool(left)
         notes.append(f"{1 - float(outage):.1%}{ends} of the predicted squares{only} with {level}")
     if field.unit == "dB":
