@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data import instantiate, spacing, splits
 from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, list_first
 from gsparc.data.limits import choice
 from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
@@ -127,9 +127,14 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
         known = (told >= splits.LEAST_ROWS) | ((asked > 0) & np.isfinite(places).all(1))
         kept = fold.test[known[data.station[fold.test]]]
         folds.append(replace(fold, test=kept) if len(kept) else fold)
-    if left := sum(len(old.test) - len(new.test) for old, new in zip(split.folds, folds, strict=True)):
-        said = "split: %d test rows are left out, of stations with under %d training rows"
-        log.warning(said, left, splits.LEAST_ROWS)
+    pairs = zip(split.folds, folds, strict=True)
+    left = np.concatenate([np.setdiff1d(old.test, new.test) for old, new in pairs])
+    if len(left):
+        new, rows = np.unique(data.station[left[data.censored_side(left) <= 0]], return_counts=True)
+        names = [f"{data.site.stations.shown[t]} (in {n} rows)" for t, n in zip(new, rows, strict=True)]
+        said = "split: %d test rows are left out, of stations with under %d training rows%s"
+        heard_now = f"; heard now: {list_first(names, 12)}" * bool(names)
+        log.warning(said, len(left), splits.LEAST_ROWS, heard_now)
     return replace(split, folds=tuple(folds))
 
 

@@ -258,6 +258,8 @@ def test_a_second_survey_had_no_table_where_a_station_was_rarely_heard_before(pl
     learned = Split("none", (Fold(np.arange(len(first)), none, none),))
     chosen = answerable(Split("whole", (Fold(none, none, every),)), second, (first, learned))
     assert set(second.station[chosen.folds[0].test]) == {0, 1}
-    assert "test rows are left out, of stations with under 4 training rows" in caplog.text
+    assert (
+        "test rows are left out, of stations with under 4 training rows; heard now: roof (in 8" in caplog.text
+    )
     for name in ("zero", "kriging"):
         fit_baseline(name, second, chosen, learned=(first, learned))
