@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from textwrap import wrap
+from textwrap import fill, wrap
 from typing import Any
 
 import numpy as np
@@ -217,7 +217,7 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
         axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
     few = [stations.shown[t] for t in np.flatnonzero((azimuth != NO_AZIMUTH) & ~enough)]
     left = f"; too few rows to draw: {list_first(few, 6)}" if few else ""
-    figure.suptitle(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{left}")
+    figure.suptitle(fill(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{left}", 90))
     for axis in axes.flat[len(chosen) :]:
         axis.set_visible(False)
     figure.supxlabel("angle from the azimuth that is used [deg]")

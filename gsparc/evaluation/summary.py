@@ -158,7 +158,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     wrong = wrong_deviations(chi2, main_figure(facts, prefix))
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
-        rest.append(f"{GIVEN_HEARD}; levels of maps and predict are {above:.1f} dB lower in the mean")
+        rest.append(
+            f"{GIVEN_HEARD}; maps and predict show them listed or not, {above:.1f} dB lower in the mean"
+        )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"off, or gone? expected in lists and in none: {unlisted}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""

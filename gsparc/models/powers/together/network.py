@@ -150,8 +150,8 @@ def learn_network(
         f" {bearing:.2g} dB by direction from it, noise {noise:.2g} dB"
     )
     beams = (
-        f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as said, floor "
-        f"{floor:.3g} dB, tilts {tilt:+.2g} deg"
+        f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as listed or "
+        f"usual, floor {floor:.3g} dB, tilts {tilt:+.2g} deg"
     )
     aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
     return Prior(kernel, trend), [law_note, *aimed, *notes]
