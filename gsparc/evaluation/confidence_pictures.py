@@ -59,7 +59,9 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
     """Confidence of low and high losses, over quintiles of loss, and against the absolute error."""
     figure, grid = panels(3 * WIDE, TALL * len(runs) + 0.3, len(runs), 3)
     for (both, fifths, scatter), row in zip(grid, runs, strict=True):
-        sure, loss = row["run"].samples["confidence"], _loss(row)
+        loss = _loss(row)
+        known = np.isfinite(loss)  # rows where nothing was heard have no error
+        sure, loss = row["run"].samples["confidence"][known], loss[known]
         high = loss > np.median(loss)
         bins = np.linspace(sure.min(), sure.max(), 25)
         for name, part, colour in (("low", ~high, PALETTE[2]), ("high", high, PALETTE[1])):
@@ -73,7 +75,7 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         fifths.boxplot([sure[part == number] for number in range(5)], tick_labels=names)
         fifths.set(xlabel="fifth of the loss", ylabel="confidence C")
         spectra = row["kind"] == "spectrum"
-        error = row["run"].samples["mae"] if spectra else loss
+        error = row["run"].samples["mae"][known] if spectra else loss
         scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
         scatter.set(xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C")
         scatter.set_title(f"rank correlation {spearmanr(sure, error).statistic:.2f}")

@@ -10,12 +10,13 @@ RNG = np.random.default_rng(0)
 ERROR = RNG.uniform(0.01, 1, 100)  # of rows, the surest first in what follows
 
 
-def rows(tmp_path, kind: str, sure=1 - ERROR):
+def rows(tmp_path, kind: str, sure=1 - ERROR, silent=0):
     own = {
         "spectrum": {"mae": ERROR, "ssim_gauss": 1 - ERROR, "psnr_db": -20 * np.log10(ERROR)},
         "csi": {"error_power": ERROR, "target_power": ERROR * 0 + 1, "snr_db": -10 * np.log10(ERROR)},
         "rssi": {"error_db": ERROR - 0.5},
     }[kind]
+    own = {name: np.where(np.arange(100) < silent, np.nan, values) for name, values in own.items()}
     facts = {"dataset/kind": kind, "model/name": "gsparc", "seed": 0, "split/sha256": "s"}
     run = Run(tmp_path, facts)
     beside = {f"baseline/gp/{name}": values - 1 for name, values in own.items() if name.endswith("_db")}
@@ -43,6 +44,13 @@ def test_confidence_falls_over_fifths_of_the_loss(tmp_path):
     medians = [line.get_ydata()[0] for line in fifths.lines[5::6]]  # of each box the last
     assert len(medians) == 5 and (np.diff(medians) < 0).all()
     assert scatter.get_title() == "rank correlation -1.00" and len(both.patches) == 48
+
+
+def test_rows_where_nothing_was_heard_made_all_losses_low(tmp_path):
+    """A median of errors that some rows have not: no loss was high, and numpy said so."""
+    both, *_ = drawn("confidence", tmp_path, "rssi", silent=40)
+    low, high = ([bar.get_height() for bar in both.patches[24 * k : 24 * k + 24]] for k in (0, 1))
+    assert sum(low) > 0 and sum(high) > 0 and "60 rows" in both.get_title()
 
 
 def test_only_the_paper_s_curve_is_relative_to_the_rows_tested(tmp_path):
