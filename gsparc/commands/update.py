@@ -13,7 +13,6 @@ from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
-from gsparc.evaluation.given_heard import strongest_lists
 from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
@@ -47,11 +46,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         if not placed:
             raise DataError(f"{config.data}: has no places; later rows need them")
         how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
-        if strongest_lists(data) is not None:
-            raise DataError(
-                f"{config.data}: lists of the strongest hold what is strong, and would raise all levels: "
-                "train on all drives; `gsparc evaluate` names cells that are gone"
-            )
         rows = level_rows(data, predictor.site)
         for start in range(0, len(rows), config.batch or len(rows)):
             found = predictor.update(rows[start : start + (config.batch or len(rows))], **how)

@@ -106,7 +106,7 @@ def _read_rows(path: Path, data: Measurements, station: str | None) -> tuple[np.
         raise DataError(f"model.prior={path}: no powers of one end that moves")
     kept = np.ones(len(rows), bool)
     if rows.station is not None and rows.site.stations is not None:
-        kept = rows.station == _number([str(name) for name in rows.site.stations.name], station, path)
+        kept = rows.station == _number(rows.site.stations.shown, station, path)
     points = (rows.moving + rows.site.origin)[kept, :2]
     theirs, ours = rows.site.georeference, data.site.georeference
     if theirs is not None and ours is not None:

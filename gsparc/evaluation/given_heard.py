@@ -7,7 +7,7 @@ import pandas as pd
 import torch
 from scipy.spatial import cKDTree
 
-from gsparc.data.links.strongest import StrongestLists
+from gsparc.data.links.strongest import StrongestLists, levels_db
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import power_in_decibels
@@ -18,21 +18,6 @@ from gsparc.processes.censored import truncated_moments
 NEAREST = 30  # silent rows of a station
 DRAWS = 100  # of the levels of all that may be listed
 FARTHEST = -8.0  # deviations below its limit that a predicted level is clamped at
-
-
-def strongest_lists(data: Measurements) -> StrongestLists | None:
-    """Return what is listed at each moment, where these are lists of the strongest; None elsewhere."""
-    if data.place is None or data.station is None or data.site.stations is None:
-        return None
-    heard = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
-    level, at = _levels_db(data, heard), data.moving[heard]
-    count = len(data.site.stations)
-    lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)
-    return lists if lists.are_strongest() else None
-
-
-def _levels_db(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    return 10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale)
 
 
 def levels_given_heard(
@@ -54,7 +39,7 @@ def levels_given_heard(
         mean_db, spread_db: (n,) of levels, heard or not; where these are NaN they stay.
         lists: of the strongest, that the learned rows are; None: they are none.
     """
-    level = _levels_db(learned, np.arange(len(learned)))
+    level = levels_db(learned, np.arange(len(learned)))
     silent = learned.censored_side(np.arange(len(learned))) > 0
     mine, own = (np.zeros(len(d), int) if d.station is None else d.station for d in (asked, learned))
     told = method.uses_censored and (spread_db > 0).any()
@@ -139,6 +124,8 @@ def never_listed(
     assert data.station is not None and asked.place is not None
     heard = data.station[data.censored_side(np.arange(len(data))) <= 0]
     absent = np.setdiff1d(np.flatnonzero(np.isfinite(lists.level).any(0)), heard)
+    if not len(absent):
+        return table
     moment, first = np.unique(asked.place, return_index=True)
     mean, spread = _levels_near(method, lists, asked.site, asked.moving[first])
     rng, floor = np.random.default_rng(0), np.nanmin(lists.level)
@@ -168,7 +155,7 @@ def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -
         level = _levels_near(method, lists, asked.site, asked.moving[first])[0]
     measured = np.full(level.shape, -np.inf)
     heard = np.flatnonzero(asked.censored_side(np.arange(len(asked))) <= 0)
-    np.maximum.at(measured, (which[heard], asked.station[heard]), _levels_db(asked, heard))
+    np.maximum.at(measured, (which[heard], asked.station[heard]), levels_db(asked, heard))
     best, told = (one == one.max(1, keepdims=True) for one in (measured, level))
     told &= np.isfinite(level)
     share = (best & told).sum(1) / np.maximum(told.sum(1), 1)

@@ -11,6 +11,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.data.units import power_in_decibels
@@ -18,7 +19,6 @@ from gsparc.evaluation.given_heard import (
     levels_given_heard,
     levels_of_nearest_moment,
     never_listed,
-    strongest_lists,
     strongest_told,
 )
 from gsparc.evaluation.metrics import METRICS, power_errors

@@ -89,7 +89,7 @@ def station_site(site: Site, number: int) -> Site:
     place = stations.position[number]
     array = site.array if stations.array is None else stations.array[number]
     return replace(
-        site, name=f"{site.name}{OF_STATION}{stations.name[number]}", stations=None, carrier_hz=carrier,
+        site, name=f"{site.name}{OF_STATION}{stations.shown[number]}", stations=None, carrier_hz=carrier,
         array=array, static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
     )  # fmt: skip
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from gsparc.data.links.stations import find_station
+from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import PowerUnit
@@ -306,7 +307,16 @@ class UpdateMixin:
 
 
 def level_rows(data: Measurements, site: Site) -> LevelRows:
-    """Return measurements of powers, in a model's coordinates, as `update` takes them, in their order."""
+    """Return measurements of powers, in a model's coordinates, as `update` takes them, in their order.
+
+    Raises:
+        ValueError: lists of the strongest.
+    """
+    if strongest_lists(data) is not None:
+        raise ValueError(
+            "update: lists of the strongest hold what is strong, and would raise all levels; train on all "
+            "drives, gsparc evaluate names cells that are gone"
+        )
     data = without_devices(data, site)
     rows = np.arange(len(data)) if data.sequence is None else np.argsort(data.sequence, kind="stable")
     if data.mask is not None:

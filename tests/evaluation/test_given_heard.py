@@ -7,10 +7,11 @@ import pytest
 import torch
 from networks import network
 
+from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.given_heard import levels_given_heard, strongest_lists
+from gsparc.evaluation.given_heard import levels_given_heard
 from gsparc.evaluation.summary import remarks
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, Prediction

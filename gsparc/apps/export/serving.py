@@ -270,7 +270,11 @@ def build_application(
             where: dict[str, Any] = {site.moving_end: np.array(rows.places)}
             found = predictor.update(**where, rssi=levels)
             assert keep is not None
-            keep()
+            try:
+                keep()
+            except OSError:  # answers are those of the file
+                predictor.undo()
+                raise
         return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
 
     async def update(request: Request) -> dict[str, Any]:

@@ -11,11 +11,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.row_order import along_curve, hash_rows
+
+if TYPE_CHECKING:
+    from gsparc.data.schema import Measurements
 
 FULL = 0.15  # of the moments, that hold as many as any: .03 at most where hearing alone ends lists
 LEAST_MOMENTS = 20
@@ -178,3 +182,19 @@ class StrongestLists:
         links = np.sort(links[np.argsort(-turn.flat[links], kind="stable")[:most]])
         moment, station = np.unravel_index(links, may.shape)
         return moment, station, below[moment, station]
+
+
+def strongest_lists(data: Measurements) -> StrongestLists | None:
+    """Return what is listed at each moment, where these are lists of the strongest; None elsewhere."""
+    if data.place is None or data.station is None or data.site.stations is None:
+        return None
+    heard = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
+    level, at = levels_db(data, heard), data.moving[heard]
+    count = len(data.site.stations)
+    lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)
+    return lists if lists.are_strongest() else None
+
+
+def levels_db(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Return levels (n,) [dB] of rows of powers."""
+    return 10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale)

@@ -86,11 +86,10 @@ class Powers(Mixture):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
         # A tuple is not noted when it is read, nor what the class that makes this was given.
-        heeded.count_reads(
-            *["model.terms"] * bool(self.own_terms), *["model.prior"] * (self.prior is not None)
-        )
+        heeded.count_reads(*["model.terms"] * bool(self.own_terms))
         terms = self.own_terms
-        if self.prior is not None:
+        if self.prior is not None and data.site.static_end is not None:  # a map is about one end that moves
+            heeded.count_reads("model.prior")
             station = data.site.name.rpartition(OF_STATION)[2]
             terms = (*terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
         return super().fit(data, fold, replace(context, terms=terms))

@@ -1,14 +1,15 @@
 """A map from before any row (`model.prior`): of a planning tool, a ray tracer, or last year's model.
 
 Levels are a share of the map's, which is about 1 before any row, a constant, and a process of what the map
-lacks. A process without the map stands beside it, and rows left out say which is right
-(`gsparc.models.stack`): a map that does not help costs seconds.
+lacks. Laws without the map stand beside it, and the likelihood of rows left out says which is right
+(`candidate_priors` in `settings.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -42,10 +43,15 @@ class PriorMap(Columns):
         """Return a map of levels (M,) [dB] at points (M, 2) [m]."""
         return cls(torch.from_numpy(points.copy()), torch.from_numpy(level - level.mean()))
 
+    @cached_property
+    def _tree(self) -> cKDTree:
+        """Of the points: made once, since each query asks it."""
+        return cKDTree(self.points.numpy())
+
     def columns(self, places: Tensor) -> Tensor:
         """See `Columns`."""
         at = places[:, :2]
-        near = cKDTree(self.points.numpy()).query(at.detach().numpy(), min(NEAR, len(self.points)))[1]
+        near = self._tree.query(at.detach().numpy(), min(NEAR, len(self.points)))[1]
         near = torch.from_numpy(near.reshape(len(at), -1))
         weight = 1 / ((self.points[near] - at[:, None]).square().sum(2) + CLOSE**2)
         return ((weight * self.level[near]).sum(1) / weight.sum(1))[:, None].to(places.dtype)

@@ -490,3 +490,15 @@ def test_levels_that_were_measured_change_the_answers_and_are_stored():
         build_application(predictor, Limits(), None, kept.clear)
     with Served(predictor) as running:
         assert running.post(json.dumps(rows), path="/update")[0] == 404
+
+
+def test_an_update_that_a_full_disk_refused_is_taken_back():
+    predictor = fitted()
+
+    def keep():
+        raise OSError(28, "No space left on device")
+
+    rows = json.dumps({"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]})
+    with Served(predictor, "word", keep) as running:
+        assert running.post(rows, path="/update", authorization="Bearer word")[0] == 500
+    assert len(predictor.versions) == 1

@@ -10,6 +10,7 @@ from refusals import refused
 import gsparc
 from gsparc.data.own import from_arrays
 from gsparc.data.prior_levels import read_prior_levels
+from gsparc.models.powers import prior_map
 from gsparc.models.powers.prior_map import PriorMap
 
 POST = [0.0, 0.0, 20.0]
@@ -118,3 +119,20 @@ def test_maps_that_cannot_be_meant_are_refused(rasters):
     refused(r"it is of x 5 to 695, .* all rows lie elsewhere: x 5\d\d\d", fit, far, path, rssi=measured(rows))
     channels = {"rssi": None, "csi": np.ones(30) + 0j, "frequency_hz": 1e9}
     refused(r"model\.prior is of received powers", fit, rows, path, **channels)
+
+
+def test_a_map_was_sorted_again_for_every_query(rasters, monkeypatch):
+    found = fit(draw(12, 103), rasters / "right.tif")
+    found.rssi(rx=draw(2, 1))
+    made = []
+    monkeypatch.setattr(prior_map, "cKDTree", lambda points: made.append(points))
+    found.rssi(rx=draw(3, 4))
+    assert not made
+
+
+def test_a_map_of_one_end_means_nothing_where_both_move(rasters, caplog):
+    caplog.set_level("INFO")
+    rows = draw(30, 3)
+    fit(rows, rasters / "right.tif", tx=draw(30, 9))
+    assert "noise" in caplog.text  # settings are told of
+    assert "a share of the map" not in caplog.text
