@@ -25,14 +25,9 @@ from gsparc.ops.transforms import to_numpy
 from gsparc.processes.averages import MeanVariance, mean_at_places
 from gsparc.processes.density import LOOKS, SETTLED, TINY, fit_kernel
 from gsparc.processes.factor import Factor, NotDefiniteError
+from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.kernel import Kernel, distances
-from gsparc.processes.neighbourhood import (
-    NEIGHBOURS,
-    Neighbourhood,
-    covering_rows,
-    nearest_distance,
-    rows_with_nearest,
-)
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance, rows_with_nearest
 from gsparc.processes.prior import Posterior, Prior
 
 COVER = 2_000  # rows that weigh the mean law

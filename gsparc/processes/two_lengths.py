@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from gsparc.processes.density import SETTLED, ProfiledDensity, covariance_of, fit_kernel
+from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.kernel import Kernel, distances
-from gsparc.processes.neighbourhood import covering_rows
 
 SHORT, LONG = (0.25, 1.0), (1.0, 300.0)  # wavelengths; next to no field varies within a quarter
 START = (0.37, 2.8)

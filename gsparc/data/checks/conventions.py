@@ -23,6 +23,7 @@ from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_arra
 from gsparc.data.errors import list_first
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.level_field import fit_level_field
 
 RATIO = math.log(1000)  # of likelihoods
@@ -162,7 +163,7 @@ def _rivals_of_places(data: Measurements) -> list[str]:
     known = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
     if data.site.static_end is None or len(known) < FEWEST["spectrum"]:
         return []
-    drawn = np.sort(np.random.default_rng(0).permutation(known)[:ROWS])
+    drawn = known[draw_rows(len(known), ROWS, 0)]
     data, links = data.subset(rows[drawn]), links.take(drawn)
 
     def score(placed: Measurements, least: float = 10 * EXPONENTS[0]) -> float:

@@ -26,16 +26,16 @@ from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import power_rows
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.density import TINY, fit_kernel_by_left_out
+from gsparc.processes.few_rows import covering_rows, draw_rows
 from gsparc.processes.kernel import SHARES, Kernel, distances
 from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
+from gsparc.processes.neighbourhood import NEIGHBOURS
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import (
     MOST_ROWS,
     PowerProcess,
     PowerRows,
     condition_on_powers,
-    draw_rows_half_heard,
 )
 from gsparc.processes.prior import Prior
 
@@ -148,7 +148,7 @@ class GaussianProcess(Differentiable, ClosedForm):
             return self._learn_many(positions, targets)
         self.powers = None
         parts = principal_components(targets, self.target, self.limit)
-        looked_at = draw_rows_half_heard(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        looked_at = draw_rows(len(targets), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
         self.scores = Exact.from_values(Prior(kernel), at, scores)

@@ -27,8 +27,8 @@ from gsparc.models.stack import choose_weights, error_products
 from gsparc.models.target_rows import training_targets
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.left_out import rows_of_groups
-from gsparc.processes.neighbourhood import covering_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 

@@ -23,6 +23,7 @@ from gsparc.physics.waves import NEAR_M
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.places import ORIGIN, UNKNOWN
 
 NOBODY = -1  # in place of a station's number: none of them
@@ -110,13 +111,10 @@ class Group(SlotPlaces):
         """Return the rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
-    def thin_rows(self, limit: float) -> Group:
+    def thin_rows(self, limit: int) -> Group:
         """Return at most so many rows, drawn evenly."""
-        if len(self) <= limit:
-            return self
         # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
-        index = np.random.default_rng(0).permutation(len(self))[: int(limit)]
-        return self.select_rows(torch.from_numpy(np.sort(index)))
+        return self.select_rows(torch.from_numpy(draw_rows(len(self), limit, 0)))
 
     def _tensors(self) -> dict[str, Tensor]:
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
@@ -327,7 +325,7 @@ def _fit_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     return measured / measured.abs() if count_static_ends(groups) > 1 else measured
 
 
-def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: float = math.inf) -> tuple[Group, ...]:
+def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: int | None = None) -> tuple[Group, ...]:
     """Return at most `max_groups` groups, spread over all, of at most `max_rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.

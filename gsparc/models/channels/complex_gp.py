@@ -29,9 +29,10 @@ from gsparc.models.run_factors import RunFactors
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
+from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import PlaceValues, condition_on_nearest, kriging_weights
-from gsparc.processes.neighbourhood import Neighbourhood, covering_rows, median_spacing
+from gsparc.processes.neighbourhood import Neighbourhood, median_spacing
 from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import MOST_ROWS

@@ -36,6 +36,7 @@ from gsparc.ops.transforms import to_numpy
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
@@ -72,7 +73,7 @@ class GroupWeights:
         whole = self.given.factor.lower
         lower = whole.real.contiguous() if self.is_real else whole
         root = Factor(lower).root
-        few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
+        few = lower[evenly_spaced(len(lower), CHECKED)]
         # A query reads all n^2 entries of the root, of which single precision has half the bytes.
         short = root.to(torch.float32 if self.is_real else torch.complex64)
         squares = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)

@@ -30,6 +30,7 @@ from gsparc.ops import Pose
 from gsparc.ops.transforms import full_precision
 from gsparc.processes.factor import Factor
 from gsparc.processes.features import Features, whitened_features
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 
@@ -182,8 +183,8 @@ def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: 
     if count < LEAST_HELD:
         return None
     draws = np.random.default_rng(0)
-    pixels = torch.from_numpy(np.sort(draws.permutation(seen.images.shape[1])[:PIXELS]))
-    centres = np.sort(draws.permutation(count)[:CENTRES])
+    pixels = torch.from_numpy(draw_rows(seen.images.shape[1], PIXELS, draws))
+    centres = draw_rows(count, CENTRES, draws)
     distance = cdist(places, places)
     spacing = np.median(np.where(np.eye(count, dtype=bool), np.inf, distance).min(1))
     gaps = np.array(GAPS) * spacing
