@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Channels with unknown factors are compared after alignment, which is another figure.
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
+Chosen = np.ndarray | slice  # of rows
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
 LIGHT = 299_792_458.0  # [m/s]
@@ -353,9 +354,17 @@ class Measurements:
         carriers = None if self.site.stations is None else self.site.stations.carrier_hz
         return None if carriers is None or self.station is None else carriers[self.station]
 
-    def censored_side(self, rows: np.ndarray) -> np.ndarray:
-        """Return `censored` of rows (n,), (n,) int8."""
-        return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
+    def censored_side(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return `censored` of rows (n,), (n,) int8; 0 of each where nothing is."""
+        return (np.zeros(len(self)) if self.censored is None else self.censored)[rows].astype(np.int8)
+
+    def stations_of(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return `station` of rows (n,), (n,) int64; 0 of each where there is one."""
+        return np.zeros(len(self), np.int64)[rows] if self.station is None else self.station[rows]
+
+    def runs_of(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return `run` of rows (n,), (n,) int64; 0 of each where all are in phase."""
+        return np.zeros(len(self), np.int64)[rows] if self.run is None else self.run[rows]
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Return targets of the given rows as float32 or complex64, in stored units."""

@@ -66,12 +66,12 @@ class StationsOfFold(NamedTuple):
 
 def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> StationsOfFold:
     """Return which stations `method` can learn, and which it is tested on without."""
-    assert data.station is not None and data.site.stations is not None
+    assert data.site.stations is not None
     count = len(data.site.stations)
     # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
-    learnable = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
-    return StationsOfFold(learnable, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~learnable)
+    known, asked = (np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test))
+    return StationsOfFold(known >= LEAST_ROWS, (asked > 0) & (known < LEAST_ROWS))
 
 
 def station_site(site: Site, number: int) -> Site:
@@ -191,7 +191,7 @@ class PerStation(Method):
             ValueError: see `fit`.
         """
         stations = data.site.stations
-        assert stations is not None and data.station is not None
+        assert stations is not None
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
@@ -211,7 +211,7 @@ class PerStation(Method):
             numbers.append(UNHEARD)
         lost = np.isnan(stations.position).any(1)
         if joint:  # it seeks those that have rows
-            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.station[fold.train])
+            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.stations_of(fold.train))
         if UNHEARD in numbers and lost.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
             others = f" for those without training rows ({names}); give them, or split otherwise"
@@ -226,8 +226,7 @@ class PerStation(Method):
 
     def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""
-        assert data.station is not None
-        rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+        rows = np.flatnonzero((data.stations_of() == number) | (number == UNHEARD))
         return rows, data.subset(rows, self._site_of_copy(data.site, number))
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:

@@ -254,8 +254,8 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     A sector alone would be left to its site's others, which share its shadowing.
     """
     data, known, stations = learned.data, learned.rows, learned.data.site.stations
-    assert stations is not None and data.station is not None
-    site = number_sites(stations, stations.position)[data.station[known]]
+    assert stations is not None
+    site = number_sites(stations, stations.position)[data.stations_of(known)]
     heard = np.unique(site)
     if len(heard) < LEAST_STATIONS:
         return NewStationError()

@@ -153,7 +153,7 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
     """
     require_waves(data.site)
     alike, order = np.zeros(len(rows), np.int64), _order_in_station(data)
-    run = alike if data.run is None else np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
+    run = np.unique(data.runs_of(rows), return_inverse=True)[1].reshape(-1)
     station = alike if data.station is None or data.site.stations is None else data.station[rows]
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
@@ -176,7 +176,7 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
 
 def _order_in_station(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station, as they were taken."""
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    station = data.stations_of()
     taken = np.arange(len(data)) if data.sequence is None else data.sequence
     order = np.empty(len(data))
     for number in np.unique(station):

@@ -85,7 +85,7 @@ class ComplexGP(ClosedForm):
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = np.concatenate([fold.train, fold.val])
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
-        one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
+        one_run = len(np.unique(data.runs_of(known))) == 1  # factors of several need all rows
         many = len(known) > MOST_ROWS and one_run
         notes = self._fit_by_neighbours(data, known) if many else self._fit_one_factor(data, known)
         length, noise = float(self.kernel.length), self.kernel.noise
@@ -122,7 +122,7 @@ class ComplexGP(ClosedForm):
         """Rows (n,) with one factor, settings chosen on some unless given; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
-        runs = np.zeros(len(known)) if data.run is None else data.run[known]
+        runs = data.runs_of(known)
         names, run = np.unique(runs, return_inverse=True)
         rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
         if kernel is None:

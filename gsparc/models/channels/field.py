@@ -149,7 +149,7 @@ class ChannelField(ClosedForm):
                 f"channels of shape {tuple(data.target.shape[1:])}, the field has {self.channel}"
             )
         self.rows = np.asarray(rows)
-        runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
+        runs = np.unique(data.runs_of(self.rows))
         self._condition_groups(group_channels(data, self.rows, self.by_antenna), runs, None)
 
     def _condition_groups(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:

@@ -152,7 +152,7 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, effort: Effort) -
     prior, _ = find_terms(data, rows, few, effort)
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
     both = zip(prior.signal_covariances(groups), groups, strict=True)
-    runs = np.unique(np.asarray(data.run)[rows])
+    runs = np.unique(data.runs_of(rows))
     factors, _ = fit_run_factors(groups, [a + prior.disturbance(group) for a, group in both], len(runs))
     return RunFactors(runs, factors)
 
@@ -161,7 +161,7 @@ def _fit_isotropic(data: Measurements, rows: np.ndarray, effort: Effort) -> tupl
     """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
     groups = group_channels(data, rows, False)
     looked = thin_groups(groups, COLUMNS, effort.chosen_on)
-    runs = 1 if data.run is None else len(np.unique(data.run[rows]))
+    runs = len(np.unique(data.runs_of(rows)))
     wavelength = 2 * math.pi / groups[0].slot.wavenumber
     tried: list[tuple[float, Tensor, float, float]] = []
     for length in LENGTHS:

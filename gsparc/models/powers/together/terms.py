@@ -91,10 +91,10 @@ class StationRows(PowerRows):
 def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
     site, notes = data.site, []
-    assert site.stations is not None and data.station is not None
+    assert site.stations is not None
     places = np.array(site.stations.position, np.float64)
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
-        own = rows[data.station[rows] == number]
+        own = rows[data.stations_of(rows) == number]
         if len(own):
             places[number] = locate_still_end(power_rows(data, own))
             said = say_estimated(places[number] + site.origin)
@@ -104,8 +104,7 @@ def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, 
 
 def rows_of_stations(data: Measurements, rows: np.ndarray, places: np.ndarray) -> StationRows:
     """Return rows (n,) of stations that stand at `places` (T, 3) [m]."""
-    assert data.station is not None
-    station = data.station[rows].astype(np.int64)
+    station = data.stations_of(rows)
     seen = power_rows(data, rows)
     ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
     return StationRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
