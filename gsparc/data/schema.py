@@ -225,6 +225,14 @@ class Site:
         return tx if self.static_end == "rx" else place
 
     @property
+    def still_places(self) -> np.ndarray:
+        """Local places (T, 3) float64 [m] of the static ends, NaN where unknown; (1, 3) where both move."""
+        if self.stations is not None:
+            return np.asarray(self.stations.position, np.float64)
+        place = np.full(3, np.nan) if self.static_position is None else self.static_position
+        return np.asarray(place, np.float64)[None]
+
+    @property
     def query_box(self) -> np.ndarray:
         """The box for each end that moves, (2, 3) or (2, 6) [m]: of what `moving` gives."""
         return np.tile(self.box, 1 if self.static_end is not None else 2)

@@ -92,9 +92,7 @@ class UserTerm(Columns):
     @classmethod
     def from_site(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
-        still = np.full_like(site.origin, np.nan) if site.static_position is None else site.static_position
-        places = [torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)]
-        return cls(term, places[0], places[1])
+        return cls(term, *map(torch.from_numpy, (site.origin.astype(np.float64), site.still_places[0])))
 
     @property
     def weight_prior(self) -> tuple[float, float]:
