@@ -29,10 +29,10 @@ from gsparc.physics.decibels import TINY_POWER
 from gsparc.physics.row_factors import Freedom, align_factors, describe_freedom
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.few_rows import covering_rows
+from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import neighbour_weights
 from gsparc.processes.neighbourhood import median_spacing
-from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 
 log = logging.getLogger(__name__)
 

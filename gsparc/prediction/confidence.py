@@ -16,12 +16,13 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
+from gsparc.models.baselines.gp import principal_components
 from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
 from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold
 from gsparc.processes.factor import Factor
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
 

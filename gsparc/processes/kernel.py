@@ -322,6 +322,10 @@ class Kernel(Stored):
         first, *others = (term.covariance(a, b) for term in self.signals)
         return sum(others, first)
 
+    def correlations_of(self, apart: Tensor) -> Tensor:
+        """Return correlations (..., n, n) at distances [m], or at places (..., n, D) where more counts."""
+        return self.correlation(apart) if self.is_isotropic else self.correlations(apart, apart)
+
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]; times `amplitude`: covariances."""
         result = self.correlations(places, places)

@@ -8,8 +8,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.processes.averages import MeanVariance
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior

@@ -22,7 +22,7 @@ from gsparc.field.encoding import Smoothness
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
-from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
+from gsparc.models.baselines.gp import principal_components
 from gsparc.models.splat.left_out_images import LeftOut, means_and_variances
 from gsparc.models.stack import LEAST_HELD
 from gsparc.models.target_rows import training_targets
@@ -31,6 +31,7 @@ from gsparc.ops.transforms import full_precision
 from gsparc.processes.factor import Factor
 from gsparc.processes.features import Features, whitened_features
 from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 

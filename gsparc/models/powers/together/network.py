@@ -23,9 +23,10 @@ from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows, places_and_notes, rows_of_stations
 from gsparc.processes.censored import PseudoValues
-from gsparc.processes.density import SETTLED, NegativeLogEvidence, minimise
+from gsparc.processes.density import NegativeLogEvidence
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.fit_kernel import SETTLED, minimise
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import horizontal, moving_end, other_end
 from gsparc.processes.prior import Prior
