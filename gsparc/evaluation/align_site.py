@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.errors import list_first
 from gsparc.data.links.stations import all_names
 from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.units import WATTS
-from gsparc.prediction.query import SAME_PLACE_M
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
-from gsparc.models.target_rows import power_rows
+from gsparc.models.target_rows import power_rows, training_targets
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.density import TINY
 from gsparc.processes.few_rows import covering_rows, draw_rows
@@ -90,6 +90,12 @@ def principal_components(targets: np.ndarray, target: Target, limit: int, block:
     # A small difference of large sums may round below 0.
     lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
+
+
+def kernel_of_targets(data: Measurements, rows: np.ndarray, components: int) -> Kernel:
+    """Return the likeliest kernel of one length for rows (n,), by so many components of their targets."""
+    parts = principal_components(training_targets(data, rows), data.site.target, components)
+    return choose_left_out_kernel(data.moving[rows], parts.scores, len(parts.mean), 1)
 
 
 class GaussianProcess(Differentiable, ClosedForm):

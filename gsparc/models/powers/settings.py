@@ -32,6 +32,7 @@ from gsparc.processes.kernel import (
     Kernel,
     Shadowing,
     distances,
+    median_distance,
 )
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
@@ -257,7 +258,7 @@ def _fit_one_length(
     shape: type[Shadowing | ExponentialShadowing] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
 ) -> KernelCandidate:  # fmt: skip
     view = rows.view(trend)
-    scale = float(np.median(view.apart.numpy())) or float(view.apart.max()) or 1.0
+    scale = median_distance(view.apart)
     if len(view.values) < 3 or not view.values.any() or not view.apart.any():
         amplitude = max(float(view.values.square().mean()), 1e-12)
         return KernelCandidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
@@ -287,7 +288,7 @@ def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
 
 
 def _median_distance(rows: PowerRows) -> float:
-    return float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
+    return median_distance(distances(*(torch.from_numpy(rows.places),) * 2))
 
 
 def _end_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:

@@ -18,7 +18,7 @@ from gsparc.models.powers.settings import EVIDENCE_LOOKS
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.models.stack import mean_and_error
 from gsparc.processes.fit_kernel import fit_kernel_by_evidence, fit_kernel_by_left_out
-from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.kernel import Kernel, distances, median_distance
 from gsparc.processes.places import extra_columns, moving_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
@@ -132,8 +132,8 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
     views = {number: few.select_station(number).view(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
-    middle = float(np.median(far.numpy())) or 1.0
-    start = Kernel.from_lengths([length * middle for length in START.lengths], START.shares, START.noise)
+    lengths = [length * median_distance(far) for length in START.lengths]
+    start = Kernel.from_lengths(lengths, START.shares, START.noise)
     _, kernel = fit_kernel_by_left_out([start], [*views.values()], start.bounds(far))
     amplitudes = [float(view.left_out(kernel)[1]) for view in views.values()]
     logs = np.log(np.maximum(amplitudes, LEAST_DB2))
