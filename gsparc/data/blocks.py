@@ -119,8 +119,3 @@ def rows_by(label: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
     """Yield each different label of (n,), and the rows (k,) that have it."""
     for one in np.unique(label).tolist():
         yield one, np.flatnonzero(label == one)
-
-
-def evenly_spaced(count: int, most: int) -> np.ndarray:
-    """Return (n,) int64, at most `most` of `count` numbers in order, evenly from first to last."""
-    return np.linspace(0, count - 1, min(count, most)).astype(int)

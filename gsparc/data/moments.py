@@ -36,7 +36,7 @@ class Snapshots:
     @classmethod
     def from_rows(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
         """Arrange rows (S,): the i-th visit of each station to a place is one moment."""
-        station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+        station = data.stations_of(rows)
         moment = number_moments(data, rows)
         _, first = np.unique(moment, return_index=True)
         target = np.asarray(data.target[rows])
@@ -46,7 +46,7 @@ class Snapshots:
         tones = data.site.subcarriers_hz
         known = tones is not None and len(tones) == target.shape[2]
         tones = np.asarray(tones, float) if known else np.zeros(target.shape[2])
-        run = np.zeros(len(first), np.int64) if data.run is None else data.run[rows[first]]
+        run = data.runs_of(rows[first])
         empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
         antenna, places = column * target.shape[1], data.moving[rows[first]]
         one = cls(rows, moment, antenna, names, places, empty, tones - tones.mean(), run)

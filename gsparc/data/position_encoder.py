@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.processes.few_rows import draw_rows
+
 SIZE_M = 100.0  # four deviations of the first coordinate, so that lengths are of the order of metres
 
 
@@ -47,6 +49,6 @@ def features(uplink: np.ndarray) -> np.ndarray:
 def _pairs(antennas: int) -> tuple[np.ndarray, np.ndarray]:
     first, second = np.triu_indices(antennas, 1)
     if len(first) > ANTENNA_PAIRS:
-        keep = np.sort(np.random.default_rng(0).permutation(len(first))[:ANTENNA_PAIRS])
+        keep = draw_rows(len(first), ANTENNA_PAIRS, 0)
         first, second = first[keep], second[keep]
     return first, second

@@ -104,9 +104,8 @@ def _read_rows(path: Path, data: Measurements, station: str | None) -> tuple[np.
     rows = interpret(read_own(path), path).data
     if rows.site.kind != "rssi" or rows.site.static_end is None:
         raise DataError(f"model.prior={path}: no powers of one end that moves")
-    kept = np.ones(len(rows), bool)
-    if rows.station is not None and rows.site.stations is not None:
-        kept = rows.station == _number(rows.site.stations.shown, station, path)
+    names = [] if rows.site.stations is None else rows.site.stations.shown
+    kept = rows.stations_of() == (_number(names, station, path) if names else 0)
     points = (rows.moving + rows.site.origin)[kept, :2]
     theirs, ours = rows.site.georeference, data.site.georeference
     if theirs is not None and ours is not None:

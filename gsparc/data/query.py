@@ -75,7 +75,7 @@ class Query:
             station: (B,) int64, of several stations; None of one.
         """
         several, count = site.stations, len(places)
-        still = np.full(3, np.nan) if site.static_position is None else site.static_position
+        still = np.full(3, np.nan) if station is None and several is not None else site.still_places[0]
         turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
         if several is not None and station is not None:
             still = several.position[station.numpy()]

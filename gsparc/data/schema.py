@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # Channels with unknown factors are compared after alignment, which is another figure.
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
+Chosen = np.ndarray | slice  # of rows
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
 LIGHT = 299_792_458.0  # [m/s]
@@ -224,6 +225,14 @@ class Site:
         return tx if self.static_end == "rx" else place
 
     @property
+    def still_places(self) -> np.ndarray:
+        """Local places (T, 3) float64 [m] of the static ends, NaN where unknown; (1, 3) where both move."""
+        if self.stations is not None:
+            return np.asarray(self.stations.position, np.float64)
+        place = np.full(3, np.nan) if self.static_position is None else self.static_position
+        return np.asarray(place, np.float64)[None]
+
+    @property
     def query_box(self) -> np.ndarray:
         """The box for each end that moves, (2, 3) or (2, 6) [m]: of what `moving` gives."""
         return np.tile(self.box, 1 if self.static_end is not None else 2)
@@ -353,9 +362,17 @@ class Measurements:
         carriers = None if self.site.stations is None else self.site.stations.carrier_hz
         return None if carriers is None or self.station is None else carriers[self.station]
 
-    def censored_side(self, rows: np.ndarray) -> np.ndarray:
-        """Return `censored` of rows (n,), (n,) int8."""
-        return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
+    def censored_side(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return `censored` of rows (n,), (n,) int8; 0 of each where nothing is."""
+        return (np.zeros(len(self)) if self.censored is None else self.censored)[rows].astype(np.int8)
+
+    def stations_of(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return `station` of rows (n,), (n,) int64; 0 of each where there is one."""
+        return np.zeros(len(self), np.int64)[rows] if self.station is None else self.station[rows]
+
+    def runs_of(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return `run` of rows (n,), (n,) int64; 0 of each where all are in phase."""
+        return np.zeros(len(self), np.int64)[rows] if self.run is None else self.run[rows]
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Return targets of the given rows as float32 or complex64, in stored units."""

@@ -7,8 +7,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from gsparc.data.blocks import evenly_spaced
 from gsparc.data.links.stations import number_places
+from gsparc.processes.few_rows import evenly_spaced
 
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0

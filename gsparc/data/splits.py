@@ -15,6 +15,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent, thin_rows
+from gsparc.processes.few_rows import draw_rows
 
 WHOLE = ("stations", "carriers", "runs")  # of which whole ones are held out
 NAMES = ("random", "grouped", "corner", "blocks", "sparse", "later", *WHOLE, "none")
@@ -381,7 +382,7 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
     keep = len(train) if s.train_count is None else s.train_count
     keep = max(min(keep, round(s.thin * len(train))), 1) if len(train) else 0
     # A prefix of one permutation: smaller training sets are subsets of larger ones.
-    train = train[np.sort(rng.permutation(len(train))[:keep])]
+    train = train[draw_rows(len(train), keep, rng)]
     if len(train) == 0 or (len(test) == 0 and s.name != "none"):
         raise DataError(
             f"split={s.name}: fold {fold} has {len(train)} training and {len(test)} test rows of "

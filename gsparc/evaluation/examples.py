@@ -14,6 +14,7 @@ from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import distinct_baselines
 from gsparc.models.method import Method
 from gsparc.prediction.confidence import predict_rows
+from gsparc.processes.few_rows import evenly_spaced
 
 FILE = "predictions.npz"
 MOST = 4  # rows kept: spread over the tested ones, as rows beside each other were measured beside each other
@@ -41,7 +42,7 @@ class Examples:
     def of_methods(cls, methods: Mapping[str, Method], data: Measurements, rows: np.ndarray) -> Examples:
         """Ask fitted methods, the run's own last, about a few of `rows` (n,)."""
         assert data.site.grid is not None
-        few = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(int)]
+        few = rows[evenly_spaced(len(rows), MOST)]
         said = {name: predict_rows(method, data, few) for name, method in methods.items()}
         own = [*said.values()][-1].confidence
         sure = np.full(len(few), np.nan) if own is None else own.numpy()

@@ -12,6 +12,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
 
+from gsparc.processes.few_rows import evenly_spaced
+
 MOST_POINTS = 1500  # measured places that are drawn
 # A city's mesh has millions of triangles; the short ones are not seen at this scale.
 MOST_WALLS = 50_000
@@ -64,7 +66,7 @@ def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
 def draw_measured(axis: Any, places: np.ndarray) -> None:
     """Mark places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
     if len(places):
-        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        few = places[evenly_spaced(len(places), MOST_POINTS)]
         # By the root of their number, so that the area that marks hide stays the same.
         size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
         rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}

@@ -82,7 +82,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
         return None, ""
     power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
-    heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
+    heard = heard | (data.censored_side() < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
     value = power[row, entry] if data.site.kind == "csi" else 10 * np.log10(power[row, entry])
     # Powers of channels are averaged linearly, levels of a station in decibels.

@@ -15,6 +15,7 @@ import numpy as np
 from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.processes.few_rows import first_rows
 from gsparc.processes.level_field import fit_level_field
 
 log = logging.getLogger(__name__)
@@ -32,10 +33,10 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
         return data
     names, rows = data.site.device_names, fold.train[data.censored_side(fold.train) == 0]
     level = 10 * np.log10(np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny))
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    station = data.stations_of(rows)
     most = int(np.clip(MOST_ROWS / len(np.unique(station)), LEAST_OF_STATION, MOST_OF_STATION))
     order = np.random.default_rng(0).permutation(len(rows))
-    some = np.sort(np.concatenate([order[station[order] == one][:most] for one in np.unique(station)]))
+    some = first_rows(order, most, station, np.zeros(len(rows), bool))
     device, heard = data.device[rows][some], np.unique(data.device[rows][some])
     each = [(device == one).astype(float) for one in heard[1:]]
     field = fit_level_field(data.moving[rows][some], level[some], station[some], each)

@@ -18,7 +18,7 @@ from gsparc.models.carriers.method import CarrierField
 from gsparc.models.method import Method, import_path
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.mixture.methods import Bearings, Channels, ImageSources, Powers
-from gsparc.models.powers.own_terms import to_terms
+from gsparc.models.powers.own_terms import OwnTerms, to_terms
 from gsparc.models.refined_places import position_errors
 from gsparc.models.splat.image_process import ArrayProcess, ImageProcess
 from gsparc.models.splat.method import LearnedField
@@ -65,10 +65,8 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
             (True, ImageProcess),
         )
         kind = next(kind for called, kind in table if called)
-        if settings.own_terms and kind is not Powers:
-            raise ValueError(f"model.terms are of received powers; the target is {site.kind} here")
-        if settings.prior is not None and kind is not Powers:
-            raise ValueError(f"model.prior is of received powers; the target is {site.kind} here")
+        for said in settings.own_terms.said if kind is not Powers else ():
+            raise ValueError(f"{said} of received powers; the target is {site.kind} here")
         rendered = issubclass(kind, ImageProcess)
         if (rendered and hides is False) or (kind is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"
@@ -100,8 +98,7 @@ class Gsparc(LearnsTogether):
     Args:
         effects: switches of terms.
         position_std: of each coordinate of training positions [m]; None: as the data say.
-        terms: further `Columns` of one station's powers.
-        prior: a file of one station's powers from before any row, see `Powers`.
+        terms, prior: see `OwnTerms`.
         name: as it appears in tables.
         **field: see `LearnedField`.
     """
@@ -121,7 +118,7 @@ class Gsparc(LearnsTogether):
         self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
         self.switches, self.position_std, self._field = effects, position_std, field
-        self.own_terms, self.prior = to_terms(terms), prior
+        self.own_terms = OwnTerms(to_terms(terms), prior)
 
     def learns_jointly(self, site: Site) -> bool:
         """See `LearnsTogether`; carriers of spectra share paths, too."""
@@ -151,8 +148,7 @@ class Gsparc(LearnsTogether):
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count
-            own: dict[str, Any] = {"terms": self.own_terms, "prior": self.prior}
-            own = own if solved[target] is Powers else {}
+            own: dict[str, Any] = vars(self.own_terms) if solved[target] is Powers else {}
             return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **own)
         rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
         if target not in rendered:

@@ -8,7 +8,6 @@ moving, so that its query is (tx, rx), where the method can do that.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
+from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
 from gsparc.data.errors import Caution, list_first
 from gsparc.data.executor import run_all
 from gsparc.data.query import Query
@@ -28,7 +28,6 @@ from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
-from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import AddsCarriers, HasJoint, Method, MethodFactory, Prediction, Reconditions
@@ -41,7 +40,7 @@ from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
+UNHEARD = NOBODY  # the copy for all that were never heard
 
 
 def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
@@ -66,12 +65,12 @@ class StationsOfFold(NamedTuple):
 
 def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> StationsOfFold:
     """Return which stations `method` can learn, and which it is tested on without."""
-    assert data.station is not None and data.site.stations is not None
+    assert data.site.stations is not None
     count = len(data.site.stations)
     # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
-    learnable = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
-    return StationsOfFold(learnable, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~learnable)
+    known, asked = (np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test))
+    return StationsOfFold(known >= LEAST_ROWS, (asked > 0) & (known < LEAST_ROWS))
 
 
 def station_site(site: Site, number: int) -> Site:
@@ -191,7 +190,7 @@ class PerStation(Method):
             ValueError: see `fit`.
         """
         stations = data.site.stations
-        assert stations is not None and data.station is not None
+        assert stations is not None
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
@@ -211,7 +210,7 @@ class PerStation(Method):
             numbers.append(UNHEARD)
         lost = np.isnan(stations.position).any(1)
         if joint:  # it seeks those that have rows
-            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.station[fold.train])
+            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.stations_of(fold.train))
         if UNHEARD in numbers and lost.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
             others = f" for those without training rows ({names}); give them, or split otherwise"
@@ -226,8 +225,7 @@ class PerStation(Method):
 
     def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""
-        assert data.station is not None
-        rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+        rows = np.flatnonzero((data.stations_of() == number) | (number == UNHEARD))
         return rows, data.subset(rows, self._site_of_copy(data.site, number))
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
@@ -296,21 +294,15 @@ class PerStation(Method):
     def _stations_of_query(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
-        # One pose may stand for all rows.
-        ends = query.tx if self.site.static_end == "tx" else query.rx.position.expand_as(query.tx)
-        table = torch.from_numpy(self.site.stations.position)
-        # A station at an unknown place is nearest to none: NaN would be the least of every row.
-        distance = torch.cdist(ends.detach().cpu().double(), table).nan_to_num(math.inf)
-        apart, number = distance.min(dim=1)
-        shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
-        if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
-            here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
-            names = " and ".join(self.site.stations.shown[t] for t in here)
+        ends = Ends.from_query(self.site, query)
+        here = station_distances(torch.from_numpy(self.site.still_places), ends.still) <= SAME_PLACE_M
+        for shared in here[here.sum(1) > 1][:1] if set(self._copies) != {UNHEARD} else ():
+            # Sectors of one mast, or carriers.
+            names = " and ".join(self.site.stations.shown[t] for t in shared.nonzero()[:, 0].tolist())
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
-        if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
-            row = int(apart.argmax())
+        for row in (~here.any(1)).nonzero()[:1, 0].tolist() if UNHEARD not in self._copies else ():
             raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}")
-        return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
+        return ends.station
 
     def state(self) -> dict[str, Any]:
         """Return the class and state of every copy, by its station's number."""

@@ -16,12 +16,12 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
+from gsparc.models.baselines.gp import kernel_of_targets
 from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
-from gsparc.models.target_rows import training_targets
 from gsparc.prediction.query import Queries, match_input
 from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
@@ -104,9 +104,7 @@ def position_kernel(data: Measurements, fold: Fold) -> Kernel:
     """Choose the rival process's kernel: length and noise by likelihood on a few known rows."""
     known = np.concatenate([fold.train, fold.val])
     # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
-    few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
-    parts = principal_components(training_targets(data, few), data.site.target, COMPONENTS)
-    return choose_left_out_kernel(data.moving[few], parts.scores, len(parts.mean), 1)
+    return kernel_of_targets(data, known[draw_rows(len(known), KERNEL_ROWS, 0)], COMPONENTS)
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:

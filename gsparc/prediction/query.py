@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.assemble import FARTHEST
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.errors import DataError
 from gsparc.data.limits import finite_array
 from gsparc.data.query import Query
@@ -20,7 +21,6 @@ from gsparc.ops.transforms import to_numpy
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
 
-SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
 
 

@@ -43,6 +43,11 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
     return torch.where(none, 0.0, torch.where(none, 1.0, squared).sqrt())
 
 
+def median_distance(distance: Tensor) -> float:
+    """Return the median of distances (...) [m], of rows at few places the largest, of those at one 1."""
+    return float(np.median(distance.numpy())) or float(distance.max()) or 1.0
+
+
 def matern32(distance: Tensor, length: Tensor | float) -> Tensor:
     """Return the Matern-3/2 correlation of distances (...) [m].
 
@@ -322,6 +327,10 @@ class Kernel(Stored):
         first, *others = (term.covariance(a, b) for term in self.signals)
         return sum(others, first)
 
+    def correlations_of(self, apart: Tensor) -> Tensor:
+        """Return correlations (..., n, n) at distances [m], or at places (..., n, D) where more counts."""
+        return self.correlation(apart) if self.is_isotropic else self.correlations(apart, apart)
+
     def gram(self, places: Tensor) -> Tensor:
         """Return correlations (n, n) with noise of places (n, D) [m]; times `amplitude`: covariances."""
         result = self.correlations(places, places)
@@ -343,9 +352,7 @@ class Kernel(Stored):
         [-4.61, -13.82]
         """
         distance = distance if self.is_isotropic else distances(distance, distance)
-        # All rows may stand at one place, whose distances are 0.
-        scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
-        *lengths, noise = (term.bounds(scale) for term in self.terms)
+        *lengths, noise = (term.bounds(median_distance(distance)) for term in self.terms)
         shares = [(-SHARES, SHARES)] * (len(lengths) - 1)
         return [*chain(*lengths), *shares, *noise]
 

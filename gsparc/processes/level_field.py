@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial.distance import cdist
 
 from gsparc.processes.factor import Factor
+from gsparc.processes.kernel import ExponentialShadowing, Kernel
 
 REACHES = (1 / 3, 1 / 10, 1 / 30, 1 / 100)  # lengths of correlation, parts of the region
 NUGGETS = (0.05, 0.2, 0.7, 3.0)  # variance of fading and noise, parts of that of shadowing
@@ -27,17 +27,13 @@ class LevelField:
 
     Attributes:
         score: logarithm of the likelihood, less half of that of the rows for each slope.
-        length: of correlation [m].
-        nugget: variance of noise, part of that of the correlated field.
-        variance: of the correlated field [dB^2].
+        kernel: of the correlated field [m, dB^2], and of noise.
         columns: (n, k) regressors.
         slope: (k,) of them.
     """
 
     score: float
-    length: float
-    nugget: float
-    variance: float
+    kernel: Kernel
     columns: np.ndarray
     slope: np.ndarray
 
@@ -48,7 +44,8 @@ class LevelField:
 
     def precision(self, place: np.ndarray) -> np.ndarray:
         """Return the inverse covariance (m, m) [1/dB^2] of levels at places (m, d) [m]."""
-        return _factor(cdist(place, place), self.length, self.nugget).inverse.numpy() / self.variance
+        gram = self.kernel.gram(torch.from_numpy(place))
+        return Factor.from_gram(gram).inverse.numpy() / self.kernel.amplitude
 
 
 def fit_level_field(
@@ -75,13 +72,13 @@ def fit_level_field(
     count, wide = len(level), float(np.ptp(place, axis=0).max())
     table = np.column_stack([level, *columns])
     parts = [np.flatnonzero(group == one) for one in np.unique(group)]
-    apart = [cdist(place[part], place[part]) for part in parts]
     found = []
     for length in (max(reach * wide, 1e-9) for reach in REACHES):
         for nugget in nuggets:
             gram, logarithms, means = np.zeros((table.shape[1],) * 2), 0.0, []
-            for part, distance in zip(parts, apart, strict=True):
-                factor = _factor(distance, length, nugget)
+            kernel = Kernel.from_length(length, nugget, term=ExponentialShadowing)
+            for part in parts:
+                factor = Factor.from_gram(kernel.gram(torch.from_numpy(place[part])))
                 both = np.column_stack([np.ones(len(part)), table[part]])
                 white = factor.whiten(torch.from_numpy(both)).numpy()
                 known = float(white[:, 0] @ white[:, 0])
@@ -100,11 +97,5 @@ def fit_level_field(
                 more = float(np.log1p(spread * weight).sum()) + math.log(own.sum())
                 more += len(slope) * math.log(count)
                 score = -0.5 * (count * math.log(variance) + logarithms + more)
-                found.append(LevelField(score, length, nugget, variance, table[:, 1:], slope))
+                found.append(LevelField(score, replace(kernel, amplitude=variance), table[:, 1:], slope))
     return max(found, key=lambda one: one.score)
-
-
-def _factor(distance: np.ndarray, length: float, nugget: float) -> Factor:
-    covariance = np.exp(-distance / length)
-    covariance[np.diag_indices(len(covariance))] += nugget
-    return Factor.from_gram(torch.from_numpy(covariance))

@@ -10,6 +10,7 @@ density of rows given their nearest ones.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -23,16 +24,12 @@ from torch import Tensor
 from gsparc.ops.queries import has_query_kernel, nearest_weights
 from gsparc.ops.transforms import to_numpy
 from gsparc.processes.averages import MeanVariance, mean_at_places
-from gsparc.processes.density import LOOKS, SETTLED, TINY, fit_kernel
+from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor, NotDefiniteError
+from gsparc.processes.few_rows import covering_rows
+from gsparc.processes.fit_kernel import LOOKS, SETTLED, fit_kernel
 from gsparc.processes.kernel import Kernel, distances
-from gsparc.processes.neighbourhood import (
-    NEIGHBOURS,
-    Neighbourhood,
-    covering_rows,
-    nearest_distance,
-    rows_with_nearest,
-)
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance, rows_with_nearest
 from gsparc.processes.prior import Posterior, Prior
 
 COVER = 2_000  # rows that weigh the mean law
@@ -270,29 +267,39 @@ class NeighbourSample(NamedTuple):
     """Rows with their nearest others: each row first, then its neighbours.
 
     Attributes:
-        apart: (T, 1 + k, 1 + k) distances between them [m].
+        apart: (T, 1 + k, 1 + k) distances between them [m]; their places (T, 1 + k, D) where more counts.
         values: (T, 1 + k, P), less the mean law and its weighed terms; outputs share kernel and amplitude.
         counts: (T, 1 + k) rows that each value is the mean of.
+        scatter: (T,) sum of squares of the first one's rows about their mean; None: not looked at.
     """
 
     apart: Tensor
     values: Tensor
     counts: Tensor
+    scatter: Tensor | None = None
 
 
-def nearest_density(kernel: Kernel, sample: NeighbourSample) -> tuple[Tensor, Tensor]:
-    """Return the negative log density, mean over rows [nats], and the best amplitude."""
-    covariance, noise = kernel.correlation(sample.apart), kernel.noise / sample.counts
+def nearest_density(
+    kernel: Kernel, sample: NeighbourSample, penalty: float = EXCESS
+) -> tuple[Tensor, Tensor]:
+    """Return the negative log density, mean over rows [nats], and the best amplitude; see `EXCESS`."""
+    covariance, noise = kernel.correlations_of(sample.apart), kernel.noise / sample.counts
     value, near = sample.values[:, 0], sample.values[:, 1:]
     gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:] + JITTER)
     weights, known = kriging_weights(gram, covariance[:, 0, 1:])
     variance = 1 + noise[:, 0] - known
-    squared = (value - torch.einsum("tk,tkp->tp", weights, near)).square().mean(1)
-    amplitude = (squared / variance).mean().clamp_min(TINY)
+    missed = value - torch.einsum("tk,tkp->tp", weights.to(near.dtype), near)
+    squared, spread = missed.abs().square().mean(1) / variance, variance.log().sum()
+    count = variance.new_tensor(len(variance))
+    if sample.scatter is not None:  # visits again tell of the noise alone
+        again = (sample.counts[:, 0] - 1).sum()
+        squared, spread = squared + sample.scatter / kernel.noise, spread + again * math.log(kernel.noise)
+        count = count + again
+    amplitude = (squared.sum() / count).clamp_min(TINY)
     # Near rows alone tell no long process of a huge amplitude from one of the values' own.
-    excess = (amplitude / value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
-    density = 0.5 * (amplitude.log() + variance.log().mean())
-    return density + EXCESS * excess.square() / len(variance), amplitude
+    excess = (amplitude / value.abs().square().mean().clamp_min(TINY)).log().clamp_min(0.0)
+    density = 0.5 * (amplitude.log() + spread / count)
+    return density + penalty * excess.square() / len(variance), amplitude
 
 
 def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:

@@ -1,4 +1,4 @@
-"""Rows that cover a site, and neighbours of a place among very many, not all of the same spot."""
+"""Neighbours of a place among very many, not all of the same spot."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.ops.transforms import is_differentiated, to_numpy
+from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.kernel import distances
 from gsparc.processes.stored import Stored
 
@@ -18,43 +19,6 @@ NEIGHBOURS = 30  # that tell of a place
 WIDER = 0.5  # share of them that are of sparser sets
 SPARSER = 8.0  # from one set of places to the next
 FEWEST = 500  # places in the sparsest of them
-ENOUGH = 0.8  # of rows that cover a site, one in each cell
-HALVINGS = 40  # of the side of cells, each a look at all rows
-
-
-def covering_rows(places: np.ndarray, most: int, seed: int) -> np.ndarray:
-    """Draw at most so many rows, sorted: one in each of as many cubic cells of one side, the rest at random.
-
-    A vehicle that stood for an hour counts no more than a place that it drove by. Time is linear in n.
-
-    >>> covering_rows(np.array([[0.0], [0.1], [0.2], [50.0], [100.0]]), most=3, seed=0).shape
-    (3,)
-
-    Args:
-        places: (n, D) [m].
-        most: rows, at least 1.
-        seed: of what is drawn.
-    """
-    if len(places) <= most:
-        return np.arange(len(places))
-    order = np.random.default_rng(seed).permutation(len(places))
-    low, size = places.min(0), max(float(np.ptp(places, axis=0).max()), np.finfo(float).tiny)
-    mixing = np.random.default_rng(0).integers(1, 2**62, places.shape[1])
-    fine, coarse, first = 0.0, size * 2, order[:1]
-    for _ in range(HALVINGS):
-        # Bisection: the larger the cells are, the fewer rows are drawn.
-        side = fine + (coarse - fine) / 2
-        cells = np.floor((places[order] - low) / side).astype(np.int64)
-        number = cells @ mixing  # of each cell its own, but for collisions of no weight
-        result = order[np.unique(number, return_index=True)[1]]
-        if len(result) <= most:
-            coarse, first = side, result
-        else:
-            fine = side
-        if len(first) >= ENOUGH * most or coarse - fine < 1e-3 * coarse:
-            break
-    rest = order[~np.isin(order, first)][: most - len(first)]
-    return np.sort(np.concatenate([first, rest]))
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,11 @@ from torch import Tensor
 from gsparc.processes.averages import MeanVariance, mixture_moments
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import covering_rows, first_rows
+from gsparc.processes.fit_kernel import View
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
+from gsparc.processes.neighbourhood import NEIGHBOURS
 from gsparc.processes.posterior import Exact, Posterior
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
@@ -69,36 +71,21 @@ class PowerRows:
         """Return means (m, 1) [dB] over the rows of each place."""
         return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
-    def distances_terms_values(
-        self, trend: Trend, kernel: Kernel | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return distances (n, n) [m], terms (n, Q) of a trend, and values less its mean (n, 1) [dB].
+    def view(self, trend: Trend, kernel: Kernel | None = None) -> View:
+        """Return the rows [dB] less the mean of a trend and with its terms, as a kernel's settings see them.
 
         Of a `kernel` to which more than distances counts, places (n, D) [m] stand for these.
         """
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
         apart = distances(places, places) if kernel is None or kernel.is_isotropic else places
-        return apart, trend.columns(places), rest[:, None]
+        return View(apart, trend.columns(places), rest[:, None], torch.from_numpy(self.side))
 
     def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
-        return self.subset(draw_rows_half_heard(self.silent, count, seed))
-
-
-def draw_rows_half_heard(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
-    """Draw at most so many rows, sorted; at least half of them were heard where as many were.
-
-    >>> len(draw_rows_half_heard(np.arange(100) >= 10, most=8, seed=0))  # ten were heard, 90 were not
-    8
-    """
-    rng = np.random.default_rng(seed)
-    loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
-    if len(loud) + len(quiet) > most:
-        share = round(most * len(loud) / (len(loud) + len(quiet)))
-        first = max(share, min(len(loud), most // 2))
-        loud, quiet = loud[:first], quiet[: most - first]
-    return np.sort(np.concatenate([loud, quiet]))
+        rng = np.random.default_rng(seed)
+        order = np.concatenate([rng.permutation(np.flatnonzero(one)) for one in (~self.silent, self.silent)])
+        return self.subset(first_rows(order, count, np.zeros(len(order)), self.silent))
 
 
 def trend_about_rows(rows: PowerRows, law: Law | None) -> Trend:

@@ -9,7 +9,6 @@ from scipy.stats import multivariate_normal
 
 from gsparc.processes import censored
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep, log_evidence, truncated_moments
-from gsparc.processes.powers import draw_rows_half_heard
 
 
 def test_moments_of_a_truncated_normal():
@@ -84,11 +83,3 @@ def test_rows_certain_to_be_silent_change_nothing():
     every, rest = fit_by_ep(told, level), fit_by_ep(told.marginal(kept), level[kept])
     assert np.allclose(every.value[kept], rest.value, atol=1e-2)
     assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
-
-
-def test_drawn_rows_keep_half_of_what_was_heard():
-    silent = np.arange(1000) >= 100
-    rows = draw_rows_half_heard(silent, 150, 0)
-    assert len(rows) == 150 and (~silent[rows]).sum() == 75 and (np.diff(rows) > 0).all()
-    assert (~silent[draw_rows_half_heard(silent, 300, 0)]).sum() == 100
-    assert np.array_equal(draw_rows_half_heard(silent, 1000, 0), np.arange(1000))

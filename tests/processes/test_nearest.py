@@ -10,7 +10,7 @@ from gsparc.processes import neighbourhood, powers
 from gsparc.processes.kernel import Kernel, SmoothRough
 from gsparc.processes.nearest import Nearest, PlaceValues
 from gsparc.processes.nearest import condition_on_nearest as given_places
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
+from gsparc.processes.neighbourhood import NEIGHBOURS
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
 from gsparc.processes.prior import Prior
@@ -124,17 +124,6 @@ def test_covariances_are_those_of_rows_that_cover_the_site(many):
     queries = torch.from_numpy(data.moving[300:])
     wide, narrow = few.answer(queries)[1], process.answer(queries)[1]
     assert isinstance(process.posterior, Nearest) and (wide >= narrow * 0.99).float().mean() > 0.95
-
-
-def test_a_parked_car_counts_no_more_than_a_street():
-    rng = np.random.default_rng(0)
-    parked = 5 + 1e-3 * rng.normal(size=(9000, 2))
-    places = np.concatenate([parked, rng.uniform(0, 1000, (1000, 2))])
-    chosen = covering_rows(places, 500, 0)
-    assert len(chosen) == 500 and len(np.unique(chosen)) == 500
-    assert (chosen >= 9000).mean() > 0.75
-    assert np.array_equal(covering_rows(places[:300], 500, 0), np.arange(300))
-    assert len(covering_rows(np.zeros((50, 3)), 20, 0)) == 20
 
 
 @pytest.mark.parametrize("kind", ["csi", "spectrum"])

@@ -8,9 +8,9 @@ from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.promise import Promise
-from gsparc.data.blocks import evenly_spaced
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import evenly_spaced
 
 SQUARES, STRONGEST, DRAWS = 300, 4, 400  # drawn together: squares, stations in each, times
 ENDS = (0.05, 0.95)

@@ -272,15 +272,14 @@ def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: floa
 
 def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
     """Return what a `FieldMap` says of stations (T,): names, as in a list of cells, places, carriers, ..."""
-    stations, nothing = site.stations, np.full(3, np.nan)
+    stations, place = site.stations, (site.still_places + site.origin)[:, :2]
     if stations is None:
-        still = (nothing if site.static_position is None else site.static_position) + site.origin
-        return {"stations": ("",), "station_place": still[None, :2], "bands": ()}
+        return {"stations": ("",), "station_place": place, "bands": ()}
     carrier = np.zeros(1) if stations.carrier_hz is None else stations.carrier_hz[numbers]
     several = len(np.unique(carrier)) > 1
     return {
         "stations": tuple((stations.label or stations.name)[number] for number in numbers),
-        "station_place": stations.position[numbers, :2] + site.origin[:2],
+        "station_place": place[numbers],
         "azimuth": np.zeros(0) if stations.sector is None else stations.sector[numbers, 0],
         "bands": tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier) if several else (),
         "site": number_sites(stations, stations.position)[numbers],

@@ -17,7 +17,6 @@ from gsparc.apps.maps.intervals import HeldOutLevels, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise, held_out_evidence
-from gsparc.data.blocks import evenly_spaced
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_all
 from gsparc.data.limits import (
@@ -37,6 +36,7 @@ from gsparc.models.powers.together.network import ONE_BAND, number_sites
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
+from gsparc.processes.few_rows import evenly_spaced
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
@@ -254,8 +254,8 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     A sector alone would be left to its site's others, which share its shadowing.
     """
     data, known, stations = learned.data, learned.rows, learned.data.site.stations
-    assert stations is not None and data.station is not None
-    site = number_sites(stations, stations.position)[data.station[known]]
+    assert stations is not None
+    site = number_sites(stations, stations.position)[data.stations_of(known)]
     heard = np.unique(site)
     if len(heard) < LEAST_STATIONS:
         return NewStationError()

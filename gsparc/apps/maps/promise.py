@@ -139,7 +139,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     evidence = HeldOutLevels(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(HeldOutLevels))
     )
-    return Promise(evidence, places, station_numbers(data, learned.rows), side)
+    return Promise(evidence, places, data.stations_of(learned.rows), side)
 
 
 def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> HeldOutLevels:
@@ -147,8 +147,8 @@ def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.
     rows, known = fold.test, np.concatenate([fold.train, fold.val])
     mean, spread = predict_rows(method, data, rows)
     level, side = measured_levels(data, rows)
-    station = station_numbers(data, rows)
-    before = data.moving[known], station_numbers(data, known)
+    station = data.stations_of(rows)
+    before = data.moving[known], data.stations_of(known)
     far = intervals.nearest_distances(*before, data.moving[rows], station)
     evidence = HeldOutLevels(level, mean, spread, far, block, station, side)
     return evidence.subset(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
@@ -163,8 +163,3 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[
     for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
         mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
     return mean, spread
-
-
-def station_numbers(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Return numbers (n,) int64; 0 where there is one."""
-    return np.zeros(len(rows), np.int64) if data.station is None else data.station[rows].astype(np.int64)

@@ -24,10 +24,10 @@ from gsparc.apps.view.scene import (
     Points,
 )
 from gsparc.apps.view.viewed import Measured, Viewed
-from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import ENDS, LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
+from gsparc.processes.few_rows import evenly_spaced
 
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn

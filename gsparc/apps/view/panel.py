@@ -8,9 +8,9 @@ import numpy as np
 
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import Answer
-from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import panels
+from gsparc.processes.few_rows import evenly_spaced
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
 MOST_LINES = 4  # antennas whose responses are drawn

@@ -18,7 +18,7 @@ from gsparc.apps.view.building import VALUES, Sphere, build_scene, start_place
 from gsparc.apps.view.plane import Plane, refine_plane
 from gsparc.apps.view.scene import EXTENT, DrawnScene, Points
 from gsparc.apps.view.viewed import Measured, Viewed
-from gsparc.data.blocks import evenly_spaced
+from gsparc.processes.few_rows import evenly_spaced
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ import numpy as np
 
 from gsparc.apps.maps import levels
 from gsparc.apps.maps.making import choose_stations
-from gsparc.apps.maps.promise import station_numbers
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.open_runs import open_files
@@ -96,7 +95,7 @@ class Viewed:
             return None
         data, stations = self.data, self.site.stations
         number = 0 if station is None or stations is None else stations.name.index(station)
-        rows = np.flatnonzero(station_numbers(data, np.arange(len(data))) == number)
+        rows = np.flatnonzero(data.stations_of() == number)
         places = data.moving[rows][:, -3:] + data.site.origin
         if data.site.kind == "spectrum":
             chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))

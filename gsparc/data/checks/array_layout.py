@@ -29,7 +29,7 @@ NEAR = 0.9  # cosine of an angle to the nearest pixel: of places a little below 
 def layout_warnings(data: Measurements) -> list[str]:
     """Name the grid or plane that spectra seem to be of instead of the declared ones."""
     site = data.site
-    first = np.arange(len(data)) if data.station is None else np.flatnonzero(data.station == 0)
+    first = np.flatnonzero(data.stations_of() == 0)
     if site.kind != "spectrum" or site.grid is None or site.array is None or not len(first):
         return []
     carrier = site.carrier_hz if data.carrier_hz is None else float(data.carrier_hz[first[0]])
@@ -76,12 +76,12 @@ def carrier_warnings(data: Measurements) -> list[str]:
     """Name what several carriers at the same places tell: shifted rows, a mirrored azimuth."""
     if data.site.kind != "spectrum" or data.carrier_hz is None or data.place is None:
         return []
-    assert data.site.stations is not None and data.station is not None
+    assert data.site.stations is not None
     count, places = len(data.site.stations), int(data.place.max()) + 1
     step = max(1, data.target[0].size // PIXELS)
     seen = data.site.target.to_real(data.target.reshape(len(data), -1)[:, ::step])
     table = np.full((count, places, seen.shape[1]), np.nan)
-    table[data.station, data.place] = seen - seen.mean(0)
+    table[data.stations_of(), data.place] = seen - seen.mean(0)
     shifted = []
     for station, name in enumerate(data.site.stations.shown):
         others = np.nansum(np.delete(table, station, axis=0), axis=0)

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.blocks import evenly_spaced, rows_by
+from gsparc.data.blocks import rows_by
 from gsparc.data.limits import SettingError, choice
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import neighbour_distance
 from gsparc.physics.row_factors import FREEDOMS, Freedom, align_factors, describe_freedom, resolvable_delays
+from gsparc.processes.few_rows import evenly_spaced
 
 log = logging.getLogger(__name__)
 

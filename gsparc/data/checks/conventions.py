@@ -23,6 +23,7 @@ from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_arra
 from gsparc.data.errors import list_first
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.level_field import fit_level_field
 
 RATIO = math.log(1000)  # of likelihoods
@@ -85,8 +86,7 @@ def convention_warnings(data: Measurements) -> list[str]:
 def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
     stations = data.site.stations
-    run = np.zeros(len(data), np.int64) if data.run is None else data.run
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    run, station = data.runs_of(), data.stations_of()
     single = data.site.kind == "csi" and data.target.shape[1] == 1
     if stations is None or data.place is None or len(stations) < COHERENT or not single:
         return data, run * (int(station.max()) + 1) + station
@@ -162,7 +162,7 @@ def _rivals_of_places(data: Measurements) -> list[str]:
     known = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
     if data.site.static_end is None or len(known) < FEWEST["spectrum"]:
         return []
-    drawn = np.sort(np.random.default_rng(0).permutation(known)[:ROWS])
+    drawn = known[draw_rows(len(known), ROWS, 0)]
     data, links = data.subset(rows[drawn]), links.take(drawn)
 
     def score(placed: Measurements, least: float = 10 * EXPONENTS[0]) -> float:

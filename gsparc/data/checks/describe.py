@@ -18,7 +18,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     site, own, error = data.site, data.release_split, data.site.convergence_error
     phases = estimate_coherence(data)
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
-    weak, strong = (int((data.censored_side(np.arange(len(data))) == side).sum()) for side in (1, -1))
+    weak, strong = (int((data.censored_side() == side).sum()) for side in (1, -1))
     # Wavelengths and stored scales tell who reads powers nothing.
     paths, scale, powers = data.directions, site.target_scale, site.kind == "rssi"
     lines = [

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.data.blocks import evenly_spaced
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.level_field import NUGGETS, fit_level_field
 
 MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s

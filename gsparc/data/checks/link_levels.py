@@ -56,14 +56,14 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     if site.kind != "rssi" or site.static_end is None:
         return None
     stations = site.stations
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    station = data.stations_of()
     place = np.arange(len(data)) if data.place is None else data.place
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
     count = 1 if stations is None else len(stations)
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
     link, called = which.reshape(-1) * count + station, data.row_names
-    side = data.censored_side(np.arange(len(data)))
+    side = data.censored_side()
     rows = np.flatnonzero(side <= 0)
     # Lists end at their weakest, of several levels: what piles up there is no receiver's noise.
     floors = np.unique(np.stack([station, level], 1)[side > 0], axis=0)

@@ -188,7 +188,7 @@ def strongest_lists(data: Measurements) -> StrongestLists | None:
     """Return what is listed at each moment, where these are lists of the strongest; None elsewhere."""
     if data.place is None or data.station is None or data.site.stations is None:
         return None
-    heard = np.flatnonzero(data.censored_side(np.arange(len(data))) <= 0)
+    heard = np.flatnonzero(data.censored_side() <= 0)
     level, at = levels_db(data, heard), data.moving[heard]
     count = len(data.site.stations)
     lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)

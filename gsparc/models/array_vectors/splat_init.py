@@ -32,7 +32,7 @@ from gsparc.models.target_rows import training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering_matrix
 from gsparc.processes.features import whitened_features
-from gsparc.processes.neighbourhood import covering_rows
+from gsparc.processes.few_rows import covering_rows
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)

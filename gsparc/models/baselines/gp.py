@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
@@ -23,25 +22,25 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
-from gsparc.models.target_rows import power_rows
+from gsparc.models.target_rows import power_rows, training_targets
 from gsparc.physics.separable import Separable, separate_axes
-from gsparc.processes.density import TINY, fit_kernel_by_left_out
-from gsparc.processes.kernel import SHARES, Kernel, distances
+from gsparc.processes.density import TINY
+from gsparc.processes.few_rows import covering_rows, draw_rows
+from gsparc.processes.fit_kernel import choose_left_out_kernel
+from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
-from gsparc.processes.neighbourhood import NEIGHBOURS, covering_rows
+from gsparc.processes.neighbourhood import NEIGHBOURS
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import (
     MOST_ROWS,
     PowerProcess,
     PowerRows,
     condition_on_powers,
-    draw_rows_half_heard,
 )
 from gsparc.processes.prior import Prior
 
 LOOKED_AT = 600  # rows that tell the strongest components
 STRONGEST = 32  # components that they are chosen by
-STARTS = np.array([0.01, 0.05, 0.25])  # lengths that a search starts from, of the extent
 FINER = 0.01  # of the share that components leave out, what their numbers by rows and columns may
 ROUNDING = 1e-10  # of the largest eigenvalue, below which one is of no axis
 
@@ -93,30 +92,10 @@ def principal_components(targets: np.ndarray, target: Target, limit: int, block:
     return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
 
 
-def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: int, count: int = 2) -> Kernel:
-    """Return the lengths and noise of largest leave-one-out likelihood.
-
-    Two lengths are those of interference and of levels: one that is short enough for interference predicts
-    the mean in every gap.
-
-    Args:
-        positions: (n, 3) [m].
-        scores: (n, P) centred targets in an orthonormal basis.
-        entries: real numbers per target, P or more.
-        count: of lengths, 1 or 2.
-    """
-    spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
-    # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
-    if len(positions) < 3 or not scores.any():
-        return Kernel.from_length(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
-    bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2))] * count
-    bounds += [*[(-SHARES, SHARES)] * (count - 1), (math.log(1e-8), math.log(1e2))]
-    # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
-    lengths = combinations(spread * STARTS, count)
-    starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
-    places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    known = starts, distances(places, places), None, values, bounds
-    return fit_kernel_by_left_out(*known, entries=entries, bounded=False)[1]
+def kernel_of_targets(data: Measurements, rows: np.ndarray, components: int) -> Kernel:
+    """Return the likeliest kernel of one length for rows (n,), by so many components of their targets."""
+    parts = principal_components(training_targets(data, rows), data.site.target, components)
+    return choose_left_out_kernel(data.moving[rows], parts.scores, len(parts.mean), 1)
 
 
 class GaussianProcess(Differentiable, ClosedForm):
@@ -148,7 +127,7 @@ class GaussianProcess(Differentiable, ClosedForm):
             return self._learn_many(positions, targets)
         self.powers = None
         parts = principal_components(targets, self.target, self.limit)
-        looked_at = draw_rows_half_heard(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        looked_at = draw_rows(len(targets), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
         at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
         self.scores = Exact.from_values(Prior(kernel), at, scores)

@@ -23,7 +23,7 @@ from gsparc.training.stopwatch import Stopwatch
 
 def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """What a reader must know of channels of several runs that are learned as if they were of one."""
-    count = 0 if data.run is None or data.site.kind != "csi" else len(np.unique(data.run[rows]))
+    count = len(np.unique(data.runs_of(rows))) if data.site.kind == "csi" else 0
     note = (
         f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
     )

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
 from torch import Tensor
 
-from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.processes.averages import MeanVariance
-from gsparc.processes.kernel import Kernel
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
@@ -41,27 +41,30 @@ class CarriersAlone(Stored):
             count: of carriers.
             entries: pixels.
         """
-        kernels: list[Kernel | None] = []
-        for number in range(count):
-            own = values[station == number]
-            if len(own) < LEAST_ROWS:
-                kernels.append(None)
-                continue
-            centred = (own - own.mean(0)).numpy()
-            kernels.append(choose_left_out_kernel(places[station == number].numpy(), centred, entries))
-        none = values.new_zeros(0, values.shape[1])
-        start = (None if one is None else Exact.from_values(Prior(one), places[:0], none) for one in kernels)
-        return cls(values.new_zeros(count, values.shape[1]), tuple(start)).condition(places, values, station)
+        priors: list[Prior | None] = [None] * count
+        for number in (torch.bincount(station, minlength=count) >= LEAST_ROWS).nonzero()[:, 0].tolist():
+            here = station == number
+            centred = values[here] - values[here].mean(0)
+            kernel = choose_left_out_kernel(places[here].numpy(), centred.numpy(), entries)
+            priors[number] = Prior(kernel)
+        return cls._from_priors(priors, places, values, station)
 
     def condition(self, places: Tensor, values: Tensor, station: Tensor) -> Self:
         """Return the same kernels conditioned on rows; see `learn`."""
-        means, processes = self.means.clone(), list(self.processes)
-        for number, one in enumerate(processes):
-            if one is not None:
-                here = station == number
-                means[number] = values[here].mean(0)
-                processes[number] = Exact.from_values(one.prior, places[here], values[here] - means[number])
-        return replace(self, means=means, processes=tuple(processes))
+        priors = [None if one is None else one.prior for one in self.processes]
+        return self._from_priors(priors, places, values, station)
+
+    @classmethod
+    def _from_priors(
+        cls, priors: Sequence[Prior | None], places: Tensor, values: Tensor, station: Tensor
+    ) -> Self:
+        means, processes = values.new_zeros(len(priors), values.shape[1]), list[Exact | None]()
+        for number, prior in enumerate(priors):
+            here = station == number
+            means[number] = values[here].mean(0) if prior else 0.0
+            centred = values[here] - means[number]
+            processes.append(None if prior is None else Exact.from_values(prior, places[here], centred))
+        return cls(means, tuple(processes))
 
     def add_unknown(self) -> Self:
         """Return these and, last, a carrier without rows."""

@@ -27,8 +27,8 @@ from gsparc.models.stack import choose_weights, error_products
 from gsparc.models.target_rows import training_targets
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.left_out import rows_of_groups
-from gsparc.processes.neighbourhood import covering_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
@@ -77,7 +77,7 @@ class CarrierField(OneArray):
         whole, known = len(known), known[_at_covering_places(data.tx[known], MOST_ROWS)]
         images, groups = self.read_rows(data, known)
         carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()
-        assert carrier is not None and grid is not None and data.station is not None
+        assert carrier is not None and grid is not None
         power = [images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups]
         seen = torch.stack([lags.to_lags(one).mean(0) for one in power])
         self.paths = find_paths(lags, seen, self.places, *self.pose())
@@ -93,7 +93,7 @@ class CarrierField(OneArray):
         self.lost = max(beyond, 0.0) / images.numel()
 
         self.rows = torch.from_numpy(np.c_[data.tx[known], np.log2(carrier[known])])
-        place, station = torch.empty(len(known)).long(), torch.from_numpy(data.station[known])
+        place, station = torch.empty(len(known)).long(), torch.from_numpy(data.stations_of(known))
         for number, rows in enumerate(groups):
             place[rows] = number
         self._inverse = self._thin = None

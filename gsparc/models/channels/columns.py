@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,16 +17,14 @@ from torch import Tensor
 
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.models.run_factors import best_run_factors, factor_matrix
-from gsparc.ops import Pose
 from gsparc.ops.transforms import to_numpy
 from gsparc.physics.waves import NEAR_M
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.places import ORIGIN, UNKNOWN
 
-NOBODY = -1  # in place of a station's number: none of them
-SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
 BAND_RAD = 1.0  # tones whose phases turn no more than this against each other over all places are one band
 
 
@@ -110,13 +108,10 @@ class Group(SlotPlaces):
         """Return the rows (m,) of these numbers."""
         return Group(self.slot, **{name: part[index] for name, part in self._tensors().items()})
 
-    def thin_rows(self, limit: float) -> Group:
+    def thin_rows(self, limit: int) -> Group:
         """Return at most so many rows, drawn evenly."""
-        if len(self) <= limit:
-            return self
         # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
-        index = np.random.default_rng(0).permutation(len(self))[: int(limit)]
-        return self.select_rows(torch.from_numpy(np.sort(index)))
+        return self.select_rows(torch.from_numpy(draw_rows(len(self), limit, 0)))
 
     def _tensors(self) -> dict[str, Tensor]:
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}
@@ -155,7 +150,7 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
     """
     require_waves(data.site)
     alike, order = np.zeros(len(rows), np.int64), _order_in_station(data)
-    run = alike if data.run is None else np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
+    run = np.unique(data.runs_of(rows), return_inverse=True)[1].reshape(-1)
     station = alike if data.station is None or data.site.stations is None else data.station[rows]
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
@@ -178,7 +173,7 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
 
 def _order_in_station(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station, as they were taken."""
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    station = data.stations_of()
     taken = np.arange(len(data)) if data.sequence is None else data.sequence
     order = np.empty(len(data))
     for number in np.unique(station):
@@ -189,7 +184,7 @@ def _order_in_station(data: Measurements) -> np.ndarray:
 
 def _slots_of_station(data: Measurements, station: int, rows: np.ndarray, by_antenna: bool) -> list[Slot]:
     site, (antennas, tones) = data.site, data.target.shape[1:]
-    centre, carrier = static_place(site, station), station_carrier(site, station)
+    centre, carrier = torch.from_numpy(site.still_places[station]), station_carrier(site, station)
     every = tuple(range(antennas))
     if not by_antenna:
         return [Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)]
@@ -219,57 +214,12 @@ def coherent_bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]
     return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
 
 
-def static_place(site: Site, station: int) -> Tensor:
-    """Return the place (3,) float64 [m] of a static end, local; NaN where unknown."""
-    if site.stations is not None:
-        return torch.from_numpy(np.asarray(site.stations.position[station], np.float64))
-    if site.static_position is None:
-        return UNKNOWN
-    return torch.from_numpy(np.asarray(site.static_position, np.float64))
-
-
 def station_carrier(site: Site, station: int) -> float:
     """Return the carrier [Hz] of a station."""
     if site.stations is not None and site.stations.carrier_hz is not None:
         return float(site.stations.carrier_hz[station])
     assert site.carrier_hz is not None
     return float(site.carrier_hz)
-
-
-class QueryEnds(NamedTuple):
-    """Where queries ask.
-
-    Attributes:
-        moving: (B, 3) float64 places [m]; (B, 6) of both ends where both move.
-        static: (B, 3) float64 places [m].
-        turned: (B, 3, 3) float64, the receiver's turns.
-        station: (B,) int64; `NOBODY` of a static end that is not where any station stands.
-    """
-
-    moving: Tensor
-    static: Tensor
-    turned: Tensor
-    station: Tensor
-
-
-def query_ends(site: Site, tx: Tensor, rx: Pose) -> QueryEnds:
-    """Return the ends of queries in a site's terms."""
-    count = len(tx)
-    receiver = rx.position.expand(count, -1).cpu().double()
-    turned = rx.rotation.expand(count, -1, -1).cpu().double()
-    sender = tx.cpu().double()
-    moving, static = (sender, receiver) if site.moving_end == "tx" else (receiver, sender)
-    if site.static_end is None:
-        moving = torch.cat([sender, receiver], 1)
-    if site.stations is None:
-        return QueryEnds(moving, static, turned, torch.zeros(count, dtype=torch.long))
-    known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
-    # NaN would be the minimum: stations at unknown places are infinitely far instead.
-    away, nearest = torch.cdist(static, known).nan_to_num(math.inf).min(1)
-    lost = known.isnan().any(1)  # an end at an unknown place is the first station at one
-    here = static.isnan().any(1) & lost.any()
-    away, nearest = away.masked_fill(here, 0), nearest.masked_fill(here, int(lost.int().argmax()))
-    return QueryEnds(moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY))
 
 
 def count_static_ends(groups: tuple[Group, ...]) -> int:
@@ -327,7 +277,7 @@ def _fit_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     return measured / measured.abs() if count_static_ends(groups) > 1 else measured
 
 
-def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: float = math.inf) -> tuple[Group, ...]:
+def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: int | None = None) -> tuple[Group, ...]:
     """Return at most `max_groups` groups, spread over all, of at most `max_rows` rows each, drawn evenly.
 
     Groups of as many rows keep the same ones.

@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from itertools import groupby, product
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -27,17 +28,17 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.averages import mean_at_places
-from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
+from gsparc.processes.few_rows import covering_rows
+from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
-from gsparc.processes.nearest import PlaceValues, condition_on_nearest, kriging_weights
-from gsparc.processes.neighbourhood import Neighbourhood, covering_rows, median_spacing
+from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, nearest_density
+from gsparc.processes.neighbourhood import Neighbourhood, median_spacing
 from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import from_plain, to_plain
-from gsparc.processes.two_lengths import fit_two_lengths, initial_kernel
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.stopwatch import Stopwatch
@@ -84,28 +85,28 @@ class ComplexGP(ClosedForm):
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = np.concatenate([fold.train, fold.val])
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
-        one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
+        one_run = len(np.unique(data.runs_of(known))) == 1  # factors of several need all rows
         many = len(known) > MOST_ROWS and one_run
         notes = self._fit_by_neighbours(data, known) if many else self._fit_one_factor(data, known)
         length, noise = float(self.kernel.length), self.kernel.noise
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
         return FitReport(started.seconds, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
 
-    def _candidate_kernels(self, places: Tensor, values: Tensor) -> Iterator[Kernel]:
-        """Candidates for values (n, R) at places (n, D) [m]; two lengths beside `neighbours`."""
-        assert self.site is not None and self.site.wavelength is not None
-        if self.site.phase_reference == "neighbours":
-            at = places.numpy()
-            kernel, rows = initial_kernel(self.site.wavelength, median_spacing(at)), (at, values.numpy())
-            for _ in range(REFINED):
-                kernel = fit_two_lengths(*rows, self.site.wavelength, kernel)
-            yield replace(kernel, amplitude=1.0)
-            return
-        for length in LENGTHS:
-            for noise in NOISES:
-                wavenumber = 2 * math.pi / self.site.wavelength
-                waves = IsotropicWaves(length * self.site.wavelength, 1.0, wavenumber)
-                yield Kernel((waves, WhiteNoise(noise)))
+    @property
+    def _wavelength(self) -> float:
+        wavelength = self.fitted_site.wavelength
+        assert wavelength is not None  # `fit` asks
+        return wavelength
+
+    def _choose_two_lengths(self, places: Tensor, values: Tensor) -> Kernel | None:
+        """The kernel of values (n, R) at places (n, D) [m] that were turned to neighbours; else None."""
+        if self.fitted_site.phase_reference != "neighbours":
+            return None
+        at = places.numpy()
+        kernel, rows = initial_kernel(self._wavelength, median_spacing(at)), (at, values.numpy())
+        for _ in range(REFINED):
+            kernel = fit_two_lengths(*rows, self._wavelength, kernel)
+        return replace(kernel, amplitude=1.0)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; with the kernel that was chosen, where one factor holds all rows."""
@@ -121,16 +122,17 @@ class ComplexGP(ClosedForm):
         """Rows (n,) with one factor, settings chosen on some unless given; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
-        runs = np.zeros(len(known)) if data.run is None else data.run[known]
+        runs = data.runs_of(known)
         names, run = np.unique(runs, return_inverse=True)
-        rows = Group(ANY, places, every, target, torch.from_numpy(run), every.double())
+        slot = replace(ANY, wavenumber=2 * math.pi / self._wavelength)
+        rows = Group(slot, places, every, target, torch.from_numpy(run), every.double())
         if kernel is None:
             few = rows.thin_rows(CHOSEN_ON)
             if len(few) < len(rows):
                 notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
-            kernels = self._candidate_kernels(few.places, few.target)
-            kernel = min(kernels, key=lambda k: negative_log_likelihood(*_fit_factors(k, few, len(names))))
-        factors, ((_, told),) = _fit_factors(kernel, rows, len(names))
+            kernel = self._choose_two_lengths(few.places, few.target)
+            kernel = kernel or choose_waves((few,), len(names))[0]
+        factors, ((_, told),) = fit_run_factors((rows,), [kernel.gram(places)], len(names))
         prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
         self.posterior = Exact.from_values(prior, places, told.values, None, told.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
@@ -155,10 +157,12 @@ class ComplexGP(ClosedForm):
         rows = np.c_[row, near.nearest_rows(values.places[row], row, NEAREST)]
         entries = np.random.default_rng(0).permutation(targets.shape[1])[:ENTRIES]
         at = torch.from_numpy(values.places)
-        sample = at[rows], values.values[rows][..., entries], values.count[rows], scatter[row]
-        kernels = self._candidate_kernels(at, values.values)
-        kernel = min(kernels, key=lambda one: _neighbour_nll(one, *sample))
-        power = max(float(sample[1][:, 0].abs().square().mean()), TINY)
+        some = values.values[rows][..., entries]
+        sample = NeighbourSample(at[rows], some, values.count[rows], scatter[row])
+        waves = wave_kernels(self._wavelength)
+        kernel = self._choose_two_lengths(at, values.values)
+        kernel = kernel or min(waves, key=lambda one: float(nearest_density(one, sample, 0.0)[0]))
+        power = max(float(some[:, 0].abs().square().mean()), TINY)
         prior = Prior(replace(kernel, amplitude=power))
         self.posterior = condition_on_nearest(prior, values, 0, neighbours=NEAREST)
         self.runs = RunFactors.identity()
@@ -208,27 +212,23 @@ def _mean_square(channels: np.ndarray) -> np.ndarray:
     return (np.abs(channels) ** 2).mean(1, dtype=np.float64)
 
 
-def _fit_factors(kernel: Kernel, rows: Group, runs: int) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """See `fit_run_factors`; of a kernel of unit power."""
-    gram = kernel.correlations(rows.places, rows.places)
-    gram.diagonal().add_(kernel.noise)
-    return fit_run_factors((rows,), [gram], runs)
+def wave_kernels(wavelength: float) -> Iterator[Kernel]:
+    """Yield candidates of an envelope's length, and for each of them of noise."""
+    for length, noise in product(LENGTHS, NOISES):
+        yield Kernel((IsotropicWaves(length * wavelength, 1.0, 2 * math.pi / wavelength), WhiteNoise(noise)))
 
 
-def _neighbour_nll(kernel: Kernel, at: Tensor, values: Tensor, counts: Tensor, scatter: Tensor) -> float:
-    """Negative log density of rows given their neighbours at the best power, visits to one place included.
-
-    Args:
-        kernel: of unit power.
-        at, values, counts: (T, 1 + k, D) [m], (T, 1 + k, R) and (T, 1 + k): rows first, then neighbours.
-        scatter: (T,) squares of visits about their mean.
-    """
-    covariance, noise = kernel.correlations(at, at), kernel.noise / counts
-    gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:])
-    weights, known = kriging_weights(gram, covariance[:, 0, 1:])
-    missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
-    variance, again = 1 + noise[:, 0] - known, float((counts[:, 0] - 1).sum())
-    power = float((missed.abs().square().mean(1) / variance).sum()) + float(scatter.sum()) / kernel.noise
-    spread = float(variance.log().sum()) + again * math.log(kernel.noise)
-    count = len(at) + again
-    return math.log(max(power / count, TINY)) + spread / count
+def choose_waves(groups: tuple[Group, ...], runs: int) -> tuple[Kernel, Tensor]:
+    """Return the likeliest waves, of the first group's wavelength, and factors of runs, as measured."""
+    tried: list[tuple[float, Kernel, Tensor]] = []
+    candidates = wave_kernels(2 * math.pi / groups[0].slot.wavenumber)
+    for _, kernels in groupby(candidates, lambda one: one.signals[0]):
+        first, *others = kernels
+        one = cast(IsotropicWaves, first.signals[0])
+        waves = [replace(one, wavenumber=group.slot.wavenumber) for group in groups]
+        alike = [one.covariance(own.places, own.places) for one, own in zip(waves, groups, strict=True)]
+        for kernel in (first, *others):
+            grams = [each + kernel.noise * torch.eye(len(each), dtype=each.dtype) for each in alike]
+            factors, told = fit_run_factors(groups, grams, runs)
+            tried.append((negative_log_likelihood(factors, told), kernel, factors))
+    return min(tried, key=lambda one: one[0])[1:]

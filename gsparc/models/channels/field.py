@@ -11,19 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.ends import Ends
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import (
     Group,
-    QueryEnds,
     Slot,
     SlotPlaces,
     fit_run_factors,
     group_channels,
-    query_ends,
-    static_place,
 )
 from gsparc.models.channels.common import SharedGains
 from gsparc.models.channels.initial import ChannelSettings, find_terms
@@ -36,6 +34,7 @@ from gsparc.ops.transforms import to_numpy
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
@@ -72,7 +71,7 @@ class GroupWeights:
         whole = self.given.factor.lower
         lower = whole.real.contiguous() if self.is_real else whole
         root = Factor(lower).root
-        few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
+        few = lower[evenly_spaced(len(lower), CHECKED)]
         # A query reads all n^2 entries of the root, of which single precision has half the bytes.
         short = root.to(torch.float32 if self.is_real else torch.complex64)
         squares = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
@@ -148,7 +147,7 @@ class ChannelField(ClosedForm):
                 f"channels of shape {tuple(data.target.shape[1:])}, the field has {self.channel}"
             )
         self.rows = np.asarray(rows)
-        runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
+        runs = np.unique(data.runs_of(self.rows))
         self._condition_groups(group_channels(data, self.rows, self.by_antenna), runs, None)
 
     def _condition_groups(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
@@ -177,13 +176,11 @@ class ChannelField(ClosedForm):
         """
         # The longest group's covariance with a chunk is the largest matrix of an answer.
         longest = max(len(each.group) for each in self.require_fitted(self.weights or None))
-        ends = query_ends(self.site, query.tx, query.rx)
-        if query.station is not None and self.site.stations is not None:
-            ends = ends._replace(station=query.station.cpu())
+        ends = Ends.from_query(self.site, query)
         dtype, device = query.tx.dtype, query.tx.device
         parts = [
-            self._predict_part(QueryEnds(*(each[part] for each in ends)), dtype)
-            for part in torch.arange(len(ends.moving)).split(max(ENTRIES // longest, 1))
+            self._predict_part(ends.rows(part), dtype)
+            for part in torch.arange(len(ends)).split(max(ENTRIES // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
         told = Prediction(
@@ -194,7 +191,7 @@ class ChannelField(ClosedForm):
         )
         return self.runs.apply_factors(told, query.run)
 
-    def _predict_part(self, ends: QueryEnds, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _predict_part(self, ends: Ends, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
         prior, images, size = self.prior, self.prior.find_term(Images), math.prod(self.channel)
         mean = torch.zeros(len(ends.moving), *self.channel, dtype=dtype.to_complex())
@@ -221,20 +218,21 @@ class ChannelField(ClosedForm):
                 left = known.scale * (whole - removed).clamp_min(0)
                 add_slot(at.slot, here, known.given.mean(cross), left, known.scale * whole)
         unheard = torch.tensor([one not in self.stations for one in ends.station.tolist()], dtype=torch.bool)
-        for place in ends.static[unheard].detach().unique(dim=0):
-            here = torch.nonzero(unheard & (ends.static == place).all(1)).flatten()
+        for place in ends.still[unheard].detach().unique(dim=0):
+            here = torch.nonzero(unheard & (ends.still == place).all(1)).flatten()
             if self.common is None:
                 raise ValueError("waves: one static end was learned from, which tells nothing of another")
             for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
-                slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
+                middle = torch.from_numpy(self.site.still_places[slot.station])
+                slot = replace(slot, end=slot.end + place - middle)
                 at = SlotPlaces(slot, slot.antenna_places(ends.moving[here], ends.turned[here]))
                 common, left, whole = self.common.predict(prior, at)
                 add_slot(slot, here, common[:, None].expand(-1, outputs), left, whole)
         return mean, share, after, before
 
-    def _group_by_places(self, ends: QueryEnds) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
+    def _group_by_places(self, ends: Ends) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
         """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
         alike: dict[tuple[Any, ...], list[tuple[GroupWeights, Tensor, Tensor]]] = {}
         for number in ends.station.unique().tolist():

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -23,10 +22,9 @@ from gsparc.models.channels.columns import (
     count_static_ends,
     fit_run_factors,
     group_channels,
-    negative_log_likelihood,
     thin_groups,
 )
-from gsparc.models.channels.complex_gp import LENGTHS, NOISES
+from gsparc.models.channels.complex_gp import LENGTHS, choose_waves
 from gsparc.models.channels.evidence import (
     BasisGroup,
     Grouping,
@@ -36,7 +34,7 @@ from gsparc.models.channels.evidence import (
     negative_log_evidence,
     normalise_power,
 )
-from gsparc.models.channels.kernels import isotropic_correlation, number_cells_by_bisection, spread_directions
+from gsparc.models.channels.kernels import number_cells_by_bisection, spread_directions
 from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import find_static_offset
@@ -152,7 +150,7 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, effort: Effort) -
     prior, _ = find_terms(data, rows, few, effort)
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
     both = zip(prior.signal_covariances(groups), groups, strict=True)
-    runs = np.unique(np.asarray(data.run)[rows])
+    runs = np.unique(data.runs_of(rows))
     factors, _ = fit_run_factors(groups, [a + prior.disturbance(group) for a, group in both], len(runs))
     return RunFactors(runs, factors)
 
@@ -161,17 +159,10 @@ def _fit_isotropic(data: Measurements, rows: np.ndarray, effort: Effort) -> tupl
     """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
     groups = group_channels(data, rows, False)
     looked = thin_groups(groups, COLUMNS, effort.chosen_on)
-    runs = 1 if data.run is None else len(np.unique(data.run[rows]))
-    wavelength = 2 * math.pi / groups[0].slot.wavenumber
-    tried: list[tuple[float, Tensor, float, float]] = []
-    for length in LENGTHS:
-        isotropic = partial(isotropic_correlation, length=length * wavelength)
-        bounded = [isotropic(g.places, g.places, g.slot.wavenumber) for g in looked]
-        for noise in NOISES:
-            eye = [noise * torch.eye(len(each), dtype=each.dtype) for each in bounded]
-            factors, told = fit_run_factors(looked, [a + b for a, b in zip(bounded, eye, strict=True)], runs)
-            tried.append((negative_log_likelihood(factors, told), factors, length * wavelength, noise))
-    _, factors, length, noise = min(tried, key=lambda t: t[0])
+    runs = len(np.unique(data.runs_of(rows)))
+    wavelength = 2 * math.pi / looked[0].slot.wavenumber
+    kernel, factors = choose_waves(looked, runs)
+    length, noise = kernel.length, kernel.noise
     everywhere = torch.cat([group.places for group in groups])
     extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
     reach, none = BEYOND * max(extent, wavelength), ORIGIN

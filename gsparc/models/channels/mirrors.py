@@ -21,6 +21,7 @@ from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Images
 from gsparc.models.channels.terms.term import Frame
 from gsparc.processes.density import TINY
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.worker import raise_if_cancelled
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
@@ -160,6 +161,6 @@ def planes_and_azimuth_step(probes: Probes, frame: Frame, wavelength: float) -> 
 def _approximate_precision(probe: Probe, waves: Tensor) -> Tensor:
     """`Probe.wave_precision` by that of a few: an isotropic field knows waves from everywhere alike."""
     size = waves.abs().square().sum(1)
-    few = torch.linspace(0, len(waves) - 1, min(LOOKED_AT, len(waves))).long()
+    few = evenly_spaced(len(waves), LOOKED_AT)
     share = probe.wave_precision(waves[few]).sum() / size[few].sum().clamp_min(TINY)
     return size * share

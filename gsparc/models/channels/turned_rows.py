@@ -21,7 +21,7 @@ from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.physics.decibels import TINY_POWER
 from gsparc.physics.row_factors import Freedom, align_factors
-from gsparc.processes.neighbourhood import covering_rows
+from gsparc.processes.few_rows import covering_rows
 
 COHERENT = 0.5  # share of the variance that a free phase finds again
 ROUNDS = 2  # of turning neighbours to their mean

@@ -29,8 +29,8 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.image_sources.search import NOISE
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.density import SETTLED
 from gsparc.processes.factor import Factor
+from gsparc.processes.fit_kernel import SETTLED
 from gsparc.processes.kernel import distances
 
 JITTER_M2 = 1e-14  # [m^2], what float64 needs to factor the covariance of a position

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsparc.data.ends import Ends
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, Moments
@@ -65,12 +66,8 @@ class SourceFrame:
 
         With E antennas of the static end (B E, 6): see `Rows.places`.
         """
-        rotation = query.rx.rotation.cpu().double()
-        rotation = rotation.reshape(-1, *rotation.shape[-2:])
-        position = query.rx.position if self.site.moving_end == "rx" else query.tx
-        # float64: phases need lengths to a fraction of a wavelength.
-        position = position.cpu().double().expand(len(query), -1) - self.middle
-        places = channel_places(self.site, self.antennas, position, rotation)
+        ends = Ends.from_query(self.site, query)
+        places = channel_places(self.site, self.antennas, ends.moving - self.middle, ends.turned)
         return places.flatten(0, 1), len(query)
 
     def to_left_out_rows(self, rows: Rows, predicted: Tensor) -> LeftOutRows:

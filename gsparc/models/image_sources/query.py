@@ -17,6 +17,7 @@ from gsparc.models.image_sources.scene import unit_vectors
 from gsparc.models.method import to_double
 from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.kernel import distances
 from gsparc.processes.places import moving_end
 
@@ -147,7 +148,7 @@ class RowVariance:
     """
 
     def __init__(self, member: GainPosterior, place_of: Tensor, count: int) -> None:
-        few = torch.linspace(0, len(member.rows) - 1, min(count, len(member.rows))).long()
+        few = torch.from_numpy(evenly_spaced(len(member.rows), count))
         if len(few) < len(member.rows):
             member = GainPosterior(member.rows.select_rows(few), member.scene)
         scene, kernel = member.scene, member.scene.visibility

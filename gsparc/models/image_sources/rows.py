@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.physics.waves import ranges
+from gsparc.processes import few_rows
 from gsparc.processes.places import moving_end
 
 LEAST_ROWS = 8  # that a search may be limited to
@@ -118,7 +119,7 @@ def draw_rows(data: Measurements, index: np.ndarray, limit: int, seed: int) -> R
     antennas, tones = data.target.shape[1:]
     frequency, array = data.site.tones(), static_array(data.site, antennas)
     if len(index) > limit:
-        index = index[np.sort(rng.permutation(len(index))[:limit])]
+        index = index[few_rows.draw_rows(len(index), limit, rng)]
     places = measured_places(data, index).numpy()
     per = places.shape[1]
     # Antennas first, tones from what is left of the limit.
@@ -128,7 +129,7 @@ def draw_rows(data: Measurements, index: np.ndarray, limit: int, seed: int) -> R
     for row, place in zip(index, places, strict=True):
         values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
-        for e in np.sort(rng.permutation(per)[:most]) if most < per else range(per):
+        for e in few_rows.draw_rows(per, most, rng) if most < per else range(per):
             # Antennas of unknown places are outputs of one row, so that a tone must be measured at all.
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -11,9 +10,9 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.method import MethodFactory
+from gsparc.models.powers.own_terms import OwnTerms
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.target_rows import heard_rows
-from gsparc.processes.term import Columns
 from gsparc.training.context import FitContext
 
 ONE_FACTOR = 6_000  # rows: a covariance of more is not factored as one
@@ -25,8 +24,7 @@ class LearnsTogether(MethodFactory):
     both_ends = True
     takes_effort = True
     init: InitSettings
-    own_terms: tuple[Columns, ...] = ()  # of one station's powers
-    prior: str | Path | None = None  # a file of these from before any row
+    own_terms = OwnTerms()
 
     def learns_jointly(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
@@ -40,7 +38,7 @@ class LearnsTogether(MethodFactory):
 
         Channels share waves and where their stations really stand, powers a law that few rows of one tell.
         """
-        if self.own_terms or self.prior is not None:
+        if self.own_terms.said:
             return "each", "model.terms and model.prior are of one station"
         if not self.learns_jointly(data.site) or self.init.name == "scene":
             return "each", ""
@@ -50,8 +48,7 @@ class LearnsTogether(MethodFactory):
             return "together", "channels at all stations share waves and the frame of places"
         if find_sectors(data) is not None:
             return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
-        assert data.station is not None
-        if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
+        if not np.isin(data.stations_of(fold.test), data.stations_of(fold.train)).any() and len(fold.test):
             return (
                 "together",
                 "no station of the test rows was heard: what stations share answers for them",

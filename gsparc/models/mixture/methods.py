@@ -8,14 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from gsparc.data import heeded
-from gsparc.data.prior_levels import read_prior_levels
-from gsparc.data.schema import OF_STATION, Measurements
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.mixture.candidates import CANDIDATES, Candidate, make_bearings
 from gsparc.models.mixture.mixture import Mixture
-from gsparc.models.powers.own_terms import to_terms
-from gsparc.models.powers.prior_map import PriorMap
+from gsparc.models.powers.own_terms import OwnTerms, to_terms
 from gsparc.models.terms import array_obstacle, phase_obstacle
 from gsparc.training.context import FitContext, FitReport
 
@@ -64,8 +61,7 @@ class Powers(Mixture):
 
     Args:
         *settings: of `Mixture`.
-        terms: further `Columns` of one station's powers.
-        prior: a file of levels from before any row, see `read_prior_levels`; None: nothing was predicted.
+        terms, prior: see `OwnTerms`.
         **named: see `settings`.
     """
 
@@ -81,18 +77,11 @@ class Powers(Mixture):
         **named_settings: Any,
     ) -> None:
         super().__init__(*settings, **named_settings)
-        self.own_terms, self.prior = to_terms(terms), prior
+        self.own_terms = OwnTerms(to_terms(terms), prior)
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Mixture`, with terms of the user's own."""
-        # A tuple is not noted when it is read, nor what the class that makes this was given.
-        heeded.count_reads(*["model.terms"] * bool(self.own_terms))
-        terms = self.own_terms
-        if self.prior is not None and data.site.static_end is not None:  # a map is about one end that moves
-            heeded.count_reads("model.prior")
-            station = data.site.name.rpartition(OF_STATION)[2]
-            terms = (*terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
-        return super().fit(data, fold, replace(context, terms=terms))
+        return super().fit(data, fold, replace(context, terms=self.own_terms.columns(data)))
 
     def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; `init=scene` is the process of one station that knows walls."""
@@ -103,7 +92,7 @@ class Powers(Mixture):
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        if (self.own_terms or self.prior) and data.site.stations is not None and len(data.site.stations) > 1:
+        if self.own_terms.said and data.site.stations is not None and len(data.site.stations) > 1:
             return "model.terms and model.prior are of one station's model; say stations=each"
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 

@@ -13,8 +13,8 @@ import torch
 from scipy.linalg import eigh
 from torch import Tensor
 
-from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.models.moving_array.power_gp import solve_and_leave_out
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored
 

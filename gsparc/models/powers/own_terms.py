@@ -5,13 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Site
+from gsparc.data import heeded
+from gsparc.data.prior_levels import read_prior_levels
+from gsparc.data.schema import OF_STATION, Measurements, Site
+from gsparc.models.powers.prior_map import PriorMap
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerRows
@@ -39,6 +43,35 @@ def to_terms(terms: Any) -> tuple[Columns, ...]:
 
 
 @dataclass(frozen=True)
+class OwnTerms:
+    """What a user says of one station's powers before any row; each attribute is a setting of `model`.
+
+    Attributes:
+        terms: further columns of the mean.
+        prior: a file of levels, see `read_prior_levels`; None: nothing was predicted.
+    """
+
+    terms: tuple[Columns, ...] = ()
+    prior: str | Path | None = None
+
+    @property
+    def said(self) -> list[str]:
+        """What is given, as a message begins: the setting and its verb."""
+        verbs = {"terms": "are", "prior": "is"}
+        return [f"model.{name} {verb}" for name, verb in verbs.items() if getattr(self, name)]
+
+    def columns(self, data: Measurements) -> tuple[Columns, ...]:
+        """Return all as columns for measurements of one station, and count what is used as heeded."""
+        # A tuple is not noted when it is read, nor what the class that makes a method was given.
+        heeded.count_reads(*["model.terms"] * bool(self.terms))
+        if self.prior is None or data.site.static_end is None:  # a map is about one end that moves
+            return self.terms
+        heeded.count_reads("model.prior")
+        station = data.site.name.rpartition(OF_STATION)[2]
+        return (*self.terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
+
+
+@dataclass(frozen=True)
 class UserTerm(Columns):
     """A term that is asked of both ends in the coordinates of the measurements.
 
@@ -59,9 +92,8 @@ class UserTerm(Columns):
     @classmethod
     def from_site(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
-        still = np.full_like(site.origin, np.nan) if site.static_position is None else site.static_position
-        places = [torch.from_numpy(np.asarray(one, np.float64)) for one in (site.origin, still)]
-        return cls(term, places[0], places[1])
+        origin, still = map(torch.from_numpy, (site.origin.astype(np.float64), site.still_places[0]))
+        return cls(term, origin, still)
 
     @property
     def weight_prior(self) -> tuple[float, float]:

@@ -23,8 +23,8 @@ from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.stack import best_weights
-from gsparc.processes import density
-from gsparc.processes.censored import ConditionalGaussian, PseudoValues
+from gsparc.processes.censored import ConditionalGaussian
+from gsparc.processes.fit_kernel import LOOKS, fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import (
     NOISE_SPAN,
     EndShadowing,
@@ -32,6 +32,7 @@ from gsparc.processes.kernel import (
     Kernel,
     Shadowing,
     distances,
+    median_distance,
 )
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
@@ -62,7 +63,6 @@ SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS = 30
 AMONG_ROWS = 4.0  # weight of errors among rows, of those at squares
-AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
 def process_and_notes(
@@ -257,13 +257,13 @@ def _fit_one_length(
     rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...],
     shape: type[Shadowing | ExponentialShadowing] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
 ) -> KernelCandidate:  # fmt: skip
-    distance, terms, values = rows.distances_terms_values(trend)
-    scale = float(np.median(distance.numpy())) or float(distance.max()) or 1.0
-    if len(values) < 3 or not values.any() or not distance.any():
-        amplitude = max(float(values.square().mean()), 1e-12)
+    view = rows.view(trend)
+    scale = median_distance(view.apart)
+    if len(view.values) < 3 or not view.values.any() or not view.apart.any():
+        amplitude = max(float(view.values.square().mean()), 1e-12)
         return KernelCandidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
     starts = [Kernel.from_length(scale * share, 0.1, 1.0, shape) for share in SHARES]
-    value, kernel = density.fit_kernel_by_left_out(starts, distance, terms, values, partitions=squares)
+    value, kernel = fit_kernel_by_left_out(starts, [view], partitions=squares)
     return KernelCandidate(-value - cost, trend, kernel, cost, notes)
 
 
@@ -272,11 +272,10 @@ def _search_kernel(
     base: KernelCandidate,
     starts: list[Kernel],
     cost: float = 0.0,
-    limit: int = density.LOOKS,
+    limit: int = LOOKS,
 ) -> KernelCandidate:
     """The same mean with settings of more rows, or with two lengths, for more parameters."""
-    known = rows.distances_terms_values(base.trend, starts[0])
-    value, kernel = density.fit_kernel_by_left_out(starts, *known, looks=limit)
+    value, kernel = fit_kernel_by_left_out(starts, [rows.view(base.trend, starts[0])], looks=limit)
     return replace(base, score=-value - base.cost - cost, kernel=kernel, cost=base.cost + cost)
 
 
@@ -289,7 +288,7 @@ def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
 
 
 def _median_distance(rows: PowerRows) -> float:
-    return float(np.median(distances(*(torch.from_numpy(rows.places),) * 2).numpy()))
+    return median_distance(distances(*(torch.from_numpy(rows.places),) * 2))
 
 
 def _end_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
@@ -304,8 +303,8 @@ def _end_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
 
 def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    distance, terms, values = rows.distances_terms_values(base.trend, base.kernel)
-    gram = base.kernel.amplitude * density.covariance_of(base.kernel, distance, terms)
+    view = rows.view(base.trend, base.kernel)
+    gram, values = base.kernel.amplitude * view.gram(base.kernel), view.values
     silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
     known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
@@ -316,40 +315,5 @@ def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
 
 def _fit_by_evidence(rows: PowerRows, base: KernelCandidate, limit: int) -> KernelCandidate:
     """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
-    value, kernel = fit_kernel_by_evidence([rows], base.trend, base.kernel, limit)
+    value, kernel = fit_kernel_by_evidence(base.kernel, [rows.view(base.trend, base.kernel)], limit)
     return replace(base, score=-value * len(rows.places) - base.cost, kernel=kernel)
-
-
-def fit_kernel_by_evidence(
-    parts: Sequence[PowerRows], trend: Trend, start: Kernel, limit: int
-) -> tuple[float, Kernel]:
-    """Find the kernel of largest evidence, silent rows among the rest; without looks `start` as it is.
-
-    Args:
-        parts: rows of independent processes of one prior, such as those of several stations.
-        trend: its mean.
-        start: where the search begins.
-        limit: looks at all parts.
-
-    Returns:
-        The least negative evidence [nats per row], and its kernel.
-    """
-    views = [(*part.distances_terms_values(trend, start), torch.from_numpy(part.side)) for part in parts]
-    heard = torch.cat([values[side == 0] for _, _, values, side in views])
-    most = max(AMPLITUDES_DB2[1], 4 * float(heard.square().mean()))
-    bounds = [*start.bounds(views[0][0]), (math.log(AMPLITUDES_DB2[0]), math.log(most))]
-    last, count = [list[PseudoValues]() for _ in views], sum(len(side) for *_, side in views)
-
-    def negative_log_evidence(at: Tensor) -> Tensor:
-        kernel, total = start.with_values(at[:-1]), at.new_zeros(())
-        for (distance, terms, values, side), found in zip(views, last, strict=True):
-            gram = at[-1].exp() * density.covariance_of(kernel, distance, terms)
-            total = total + density.NegativeLogEvidence.apply(gram, values[:, 0], side, found)  # type: ignore[no-untyped-call]
-        return total / count
-
-    best = np.append(start.parameters().numpy(), math.log(start.amplitude))
-    if limit:
-        best, value = density.minimise(negative_log_evidence, [best], bounds, limit, density.SETTLED / count)
-    else:
-        value = float(negative_log_evidence(torch.from_numpy(best)))
-    return value, replace(start.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))

@@ -22,7 +22,7 @@ from gsparc.field.encoding import Smoothness
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
-from gsparc.models.baselines.gp import choose_left_out_kernel, principal_components
+from gsparc.models.baselines.gp import kernel_of_targets
 from gsparc.models.splat.left_out_images import LeftOut, means_and_variances
 from gsparc.models.stack import LEAST_HELD
 from gsparc.models.target_rows import training_targets
@@ -30,6 +30,7 @@ from gsparc.ops import Pose
 from gsparc.ops.transforms import full_precision
 from gsparc.processes.factor import Factor
 from gsparc.processes.features import Features, whitened_features
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 
@@ -76,8 +77,7 @@ def _fit_kernel(data: Measurements, rows: np.ndarray, limit: int, seed: int) -> 
     draw = np.random.default_rng(seed)
     chosen = rows if len(rows) <= limit else np.sort(draw.choice(rows, limit, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
-    parts = principal_components(training_targets(data, looked_at), data.site.target, COMPONENTS)
-    return chosen, choose_left_out_kernel(data.moving[looked_at], parts.scores, len(parts.mean), 1)
+    return chosen, kernel_of_targets(data, looked_at, COMPONENTS)
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,8 @@ def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: 
     if count < LEAST_HELD:
         return None
     draws = np.random.default_rng(0)
-    pixels = torch.from_numpy(np.sort(draws.permutation(seen.images.shape[1])[:PIXELS]))
-    centres = np.sort(draws.permutation(count)[:CENTRES])
+    pixels = torch.from_numpy(draw_rows(seen.images.shape[1], PIXELS, draws))
+    centres = draw_rows(count, CENTRES, draws)
     distance = cdist(places, places)
     spacing = np.median(np.where(np.eye(count, dtype=bool), np.inf, distance).min(1))
     gaps = np.array(GAPS) * spacing

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.processes.factor import Factor
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.left_out import left_out_around
 from gsparc.processes.stored import Stored
 

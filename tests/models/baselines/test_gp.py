@@ -13,8 +13,9 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from gsparc.data.load import load, split_for
 from gsparc.data.target import TARGETS
 from gsparc.evaluation.scores import score_methods
-from gsparc.models.baselines.gp import GaussianProcess, choose_left_out_kernel, principal_components
+from gsparc.models.baselines.gp import GaussianProcess, principal_components
 from gsparc.processes.density import LeftOutDensity
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext
 

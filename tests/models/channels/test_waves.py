@@ -9,11 +9,13 @@ from closed import conditioned, fitted_to
 from rooms import WAVELENGTH, shoebox
 from scenes import answer_error
 
+from gsparc.data.ends import NOBODY, Ends
 from gsparc.data.own import from_arrays
+from gsparc.data.query import Query
 from gsparc.data.schema import Stations
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
-from gsparc.models.channels.columns import NOBODY, SlotPlaces, coherent_bands, group_channels, query_ends
+from gsparc.models.channels.columns import SlotPlaces, coherent_bands, group_channels
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
@@ -297,5 +299,5 @@ def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
     here = np.array([[1.0, 2, 3], [np.nan] * 3])
     site = replace(campaign("csi", 8, "tx").site, stations=Stations(here, ("known", "unknown")))
     asked = torch.from_numpy(np.concatenate([here[::-1], here[:1] + 1]))
-    ends = query_ends(site, asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
+    ends = Ends.from_query(site, Query(asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3))))
     assert ends.station.tolist() == [1, 0, NOBODY]

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.models.baselines.gp import choose_left_out_kernel
 from gsparc.models.splat.left_out_images import LeftOut
+from gsparc.processes.fit_kernel import choose_left_out_kernel
 
 COUNT, PIXELS = 30, 12
 

@@ -18,6 +18,7 @@ from gsparc.models.apart import keep_apart
 from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Legs, Unfolding
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, hesse_form, images
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.trend import Walls
 
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
@@ -104,7 +105,7 @@ class Mirrors:
             limit: sequences.
             hidden: whether walls end and hide; else every image is seen from everywhere.
         """
-        places = places[torch.linspace(0, len(places) - 1, min(LOOKED_FROM, len(places))).long()]
+        places = places[evenly_spaced(len(places), LOOKED_FROM)]
         candidates = [
             sequence
             for length in range(1, order + 1)

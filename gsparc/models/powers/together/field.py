@@ -17,11 +17,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.ends import NOBODY, Ends, stations_at
 from gsparc.data.errors import DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.models.channels.columns import SAME_PLACE_M
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import JointLevels, Prediction
 from gsparc.models.powers.together.learning import (
@@ -36,7 +36,7 @@ from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, r
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
-from gsparc.processes.places import moving_end, other_end
+from gsparc.processes.places import moving_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, REACH
 from gsparc.processes.prior import Prior
@@ -46,7 +46,6 @@ from gsparc.processes.trend import TINY_M
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
-NEVER = -1  # in place of a station's number: one that was never heard
 MEMORY = 3e9  # bytes of all stations' factors
 PLACES = 2 * TRIED_EACH  # that the shared process is known at in the end
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
@@ -270,19 +269,15 @@ class JointPowerField(ClosedForm):
 
     def _places_and_stations(self, query: Query) -> tuple[Tensor, Tensor]:
         """Places (B, 6) of the moving end and the station, float64 [m], and its number (B,)."""
-        sender = query.tx.cpu().double()
-        receiver = query.rx.position.expand(len(query), -1).cpu().double()
-        moving, still = (sender, receiver) if self.site.static_end == "rx" else (receiver, sender)
-        table = torch.from_numpy(self.places)
+        ends, table = Ends.from_query(self.site, query), torch.from_numpy(self.places)
+        moving, still, number = ends.moving, ends.still, ends.station
         if query.station is not None:
-            number = query.station.cpu().long()
             still = torch.where(number[:, None] >= 0, table[number.clamp_min(0)], still)
             return torch.cat([moving, still], 1), number
-        number = self._station_at(still)
-        turned = (number < 0) & (self._station_at(moving) >= 0)  # asked the other way round
-        here, there = torch.cat([moving, still], 1), torch.cat([still, moving], 1)
-        places = torch.where(turned[:, None], there, here)
-        return places, self._station_at(other_end(places))
+        here, there = (stations_at(table, one) for one in (still, moving))
+        turned = (here < 0) & (there >= 0)  # asked the other way round
+        swapped = torch.where(turned[:, None], torch.cat([still, moving], 1), torch.cat([moving, still], 1))
+        return swapped, torch.where(turned, there, here)
 
     def _process_places(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
         """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""
@@ -290,7 +285,7 @@ class JointPowerField(ClosedForm):
             return places, number
         site = self.network.site[number.clamp_min(0)]
         sector = torch.where(number < 0, len(self.network.table), number)  # the last, without a pattern
-        return torch.cat([places, sector[:, None]], 1), torch.where(number < 0, NEVER, site)
+        return torch.cat([places, sector[:, None]], 1), torch.where(number < 0, NOBODY, site)
 
     def _law_share(self, moving: Tensor) -> Tensor:
         """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.
@@ -305,12 +300,6 @@ class JointPowerField(ClosedForm):
         far = nearest_distance(tree, moving)
         law = max(1 - self.own.variance / self.whole, 0.0)
         return law * (1 - (-(far / reach).square()).exp())
-
-    def _station_at(self, places: Tensor) -> Tensor:
-        """Numbers (B,) of the stations at places (B, 3), negative where none stands."""
-        table = torch.from_numpy(self.places).nan_to_num(math.inf)
-        apart, number = torch.cdist(places.detach(), table).min(1)
-        return torch.where(apart <= SAME_PLACE_M, number, NEVER)
 
 
 def rows_per_station(stations: int) -> int:

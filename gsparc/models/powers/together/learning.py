@@ -12,20 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.settings import EVIDENCE_LOOKS, fit_kernel_by_evidence
+from gsparc.models.powers.settings import EVIDENCE_LOOKS
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.models.stack import mean_and_error
-from gsparc.processes.density import (
-    SETTLED,
-    LeftOutDensity,
-    covariance_of,
-    fit_kernel_by_left_out,
-    minimise,
-)
-from gsparc.processes.kernel import Kernel, distances
+from gsparc.processes.fit_kernel import fit_kernel_by_evidence, fit_kernel_by_left_out
+from gsparc.processes.kernel import Kernel, distances, median_distance
 from gsparc.processes.places import extra_columns, moving_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
@@ -100,21 +93,20 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
     kernel, priors = _fit_common_kernel(heard, trend, seed)
     if some_silent:
         each = min(WEIGHED_EACH, max(MOST_ROWS // len(whole.stations), 1))
-        parts = [whole.select_station(n).draw_stretches(each, seed) for n in whole.stations]
+        parts = [whole.select_station(n).draw_stretches(each, seed).view(trend) for n in whole.stations]
         # What lists hold spreads less than what they were drawn from.
-        narrow, (_, kernel) = kernel, fit_kernel_by_evidence(parts, trend, kernel, EVIDENCE_LOOKS)
+        narrow, (_, kernel) = kernel, fit_kernel_by_evidence(kernel, parts, EVIDENCE_LOOKS)
         wider = kernel.amplitude / narrow.amplitude
         for number, one in priors.items():
             own = replace(kernel, amplitude=wider * one.kernel.amplitude)
             priors[number] = Prior(own, trend)
     for number in numbers:
         if some_silent:
-            some = whole.select_station(number).draw_stretches(ENDS_FROM, seed)
-            _, own = fit_kernel_by_evidence([some], trend, priors[number].kernel, EVIDENCE_LOOKS)
+            some = whole.select_station(number).draw_stretches(ENDS_FROM, seed).view(trend)
+            _, own = fit_kernel_by_evidence(priors[number].kernel, [some], EVIDENCE_LOOKS)
         else:
-            some = heard.select_station(number).thin_rows(ENDS_ON, seed)
-            known = some.distances_terms_values(trend)
-            _, own = fit_kernel_by_left_out([kernel], *known)
+            some = heard.select_station(number).thin_rows(ENDS_ON, seed).view(trend)
+            _, own = fit_kernel_by_left_out([kernel], [some])
         priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
@@ -137,28 +129,18 @@ def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thin_rows(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
-    views = {number: few.select_station(number).distances_terms_values(trend) for number in few.stations}
+    views = {number: few.select_station(number).view(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
-    middle = float(np.median(far.numpy())) or 1.0
-    start = Kernel.from_lengths([length * middle for length in START.lengths], START.shares, START.noise)
-
-    def left_out_density(at: Tensor, number: int) -> tuple[Tensor, Tensor]:
-        distance, columns, values = views[number]
-        return LeftOutDensity.apply(covariance_of(start.with_values(at), distance, columns), values, 1, True)  # type: ignore[no-untyped-call, no-any-return]
-
-    def mean_density(at: Tensor) -> Tensor:
-        return torch.stack([left_out_density(at, number)[0] for number in views]).sum() / len(few.places)
-
-    begin, settled = [start.parameters().numpy()], SETTLED / len(few.places)
-    best, _ = minimise(mean_density, begin, start.bounds(far), settled=settled)
-    amplitudes = [float(left_out_density(torch.from_numpy(best), number)[1]) for number in views]
+    lengths = [length * median_distance(far) for length in START.lengths]
+    start = Kernel.from_lengths(lengths, START.shares, START.noise)
+    _, kernel = fit_kernel_by_left_out([start], [*views.values()], start.bounds(far))
+    amplitudes = [float(view.left_out(kernel)[1]) for view in views.values()]
     logs = np.log(np.maximum(amplitudes, LEAST_DB2))
-    count = np.array([len(values) for _, _, values in views.values()])
+    count = np.array([len(view.values) for view in views.values()])
     mean = float((count * logs).sum() / count.sum())
     logs = (count * logs + ALIKE * mean) / (count + ALIKE)
-    kernel = replace(start.with_values(torch.from_numpy(best)), amplitude=math.exp(mean))
-    return kernel, {
+    return replace(kernel, amplitude=math.exp(mean)), {
         number: Prior(replace(kernel, amplitude=math.exp(log)), trend)
         for number, log in zip(views, logs, strict=True)
     }

@@ -23,8 +23,10 @@ from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows, places_and_notes, rows_of_stations
 from gsparc.processes.censored import PseudoValues
-from gsparc.processes.density import SETTLED, NegativeLogEvidence, minimise
+from gsparc.processes.density import NegativeLogEvidence
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.fit_kernel import SETTLED, minimise
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import horizontal, moving_end, other_end
 from gsparc.processes.prior import Prior
@@ -161,7 +163,7 @@ def _fit_azimuths(
     rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
 ) -> tuple[Sectors, Tensor, float, list[str]]:
     """What `_fit_rough` returns, with azimuths that rows do not contradict, and notes on these."""
-    few = rows.subset(np.sort(np.random.default_rng(seed).permutation(len(rows.index))[:ROUGH_ON]))
+    few = rows.subset(draw_rows(len(rows.index), ROUGH_ON, seed))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
     loud = few.heard_rows
     decades = law.decades(torch.from_numpy(loud.places))

@@ -19,6 +19,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import locate_still_end, say_estimated
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
+from gsparc.processes.few_rows import draw_rows, first_rows, shuffle_groups
 from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.nearest import JITTER
 from gsparc.processes.places import NO_PLACES, moving_end
@@ -58,19 +59,9 @@ class StationRows(PowerRows):
 
         Rows where something was heard come first where there are too many, up to half of them.
         """
-        place = self._place_numbers
-        # One rank for a place: stations that share places keep the same ones.
-        rank = np.random.default_rng(seed).permutation(int(place.max()) + 1)[place]
-        chosen = []
-        for number in self.stations:
-            own = np.flatnonzero(self.station == number)
-            own = own[np.argsort(rank[own], kind="stable")]
-            if len(own) > per_station:
-                loud, quiet = own[~self.silent[own]], own[self.silent[own]]
-                share = max(round(per_station * len(loud) / len(own)), min(len(loud), per_station // 2))
-                own = np.concatenate([loud[:share], quiet[: per_station - share]])
-            chosen.append(own)
-        return self.subset(np.sort(np.concatenate(chosen)))
+        # One order of places: stations that share places keep the same ones.
+        order = shuffle_groups(self._place_numbers, seed)
+        return self.subset(first_rows(order, per_station, self.station, self.silent))
 
     def select_complete_places(self) -> Self:
         """Return those of places that have as many rows as any, if these are enough; else all."""
@@ -89,8 +80,7 @@ class StationRows(PowerRows):
         first = np.full(int(place.max()) + 1, len(self.index))
         np.minimum.at(first, place, self.index)
         stretch = np.argsort(np.argsort(first)) // STRETCH
-        rank = np.random.default_rng(seed).permutation(int(stretch.max()) + 1)[stretch[place]]
-        return self.subset(np.sort(np.argsort(rank, kind="stable")[:limit]))
+        return self.subset(np.sort(shuffle_groups(stretch[place], seed)[:limit]))
 
     @property
     def _place_numbers(self) -> np.ndarray:
@@ -101,10 +91,10 @@ class StationRows(PowerRows):
 def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
     site, notes = data.site, []
-    assert site.stations is not None and data.station is not None
+    assert site.stations is not None
     places = np.array(site.stations.position, np.float64)
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
-        own = rows[data.station[rows] == number]
+        own = rows[data.stations_of(rows) == number]
         if len(own):
             places[number] = locate_still_end(power_rows(data, own))
             said = say_estimated(places[number] + site.origin)
@@ -114,8 +104,7 @@ def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, 
 
 def rows_of_stations(data: Measurements, rows: np.ndarray, places: np.ndarray) -> StationRows:
     """Return rows (n,) of stations that stand at `places` (T, 3) [m]."""
-    assert data.station is not None
-    station = data.station[rows].astype(np.int64)
+    station = data.stations_of(rows)
     seen = power_rows(data, rows)
     ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
     return StationRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
@@ -152,8 +141,7 @@ class SharedTerms(Columns):
     def set_inducing(self, rows: StationRows, limit: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
         every = np.unique(moving_end(rows.places), axis=0)
-        order = np.random.default_rng(seed).permutation(len(every))[:limit]
-        return replace(self, inducing=torch.from_numpy(every[np.sort(order)]))
+        return replace(self, inducing=torch.from_numpy(every[draw_rows(len(every), limit, seed)]))
 
     def columns(self, places: Tensor) -> Tensor:
         """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
