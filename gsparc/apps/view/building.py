@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
 from gsparc.apps.view.scene import (
@@ -28,6 +27,7 @@ from gsparc.data.blocks import evenly_spaced
 from gsparc.data.schema import ENDS, LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
+from gsparc.prediction.levels import MAPPED
 
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
