@@ -30,6 +30,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.method import MethodFactory
 from gsparc.models.per_station import wrap_per_station
+from gsparc.processes.uncertainty import standard_error
 from gsparc.training.context import FitContext
 
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
@@ -87,7 +88,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold) -> None:
         method.predict(one)
     query = (time.process_time() - began) / SINGLE * 1e3
     # d sqrt(m) = dm / (2 sqrt(m)): the standard error of a root of a mean.
-    spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
+    spread = standard_error(squared) / (2 * rmse)
     values = (cpu, wall, query, rmse, spread, before, peak_gb(), private.most, os.getloadavg()[0])
     count = len(fold.train) + len(fold.val)
     csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))

@@ -10,12 +10,14 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.evaluation.open_runs import calibrate_and_store, collect_evidence
+from gsparc.evaluation.open_runs import Unseen
 from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Interval, Table
-from gsparc.prediction.risk import SHARES, Guarantee, calibration_facts, explain_too_few, run_trials
+from gsparc.prediction.confidence import Guarantee
+from gsparc.prediction.left_out import Evidence
+from gsparc.prediction.risk import SHARES, calibration_facts, explain_too_few, run_trials
 
 log = logging.getLogger(__name__)
 
@@ -24,12 +26,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Gather, resample, write; returns the facts of `summary.json`."""
     run_dir, settings = begin_run(config)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    evidence, known = collect_evidence(paths, settings["dataset"], settings["split"])
+    opened = [Unseen.open(path, settings["dataset"], settings["split"]) for path in paths]
+    evidence, known = Evidence.join([one.evidence for one in opened]), opened[0].facts
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, int(config.seed)
-    divisions = [run_trials(evidence, promise, "random", *draws)]
+    divisions = [run_trials(evidence, promise, False, *draws)]
     try:
-        divisions.append(run_trials(evidence, promise, "spatial", *draws))
+        divisions.append(run_trials(evidence, promise, True, *draws))
     except ValueError:
         # With fewer patches than parts no division by whole cells exists.
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
@@ -42,12 +45,12 @@ def task(config: DictConfig) -> dict[str, Any]:
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
-        for path in paths:
-            stored, bound = calibrate_and_store(path, settings["dataset"], settings["split"], *how)
+        for one in opened:
+            stored, bound = one.calibrate_and_store(*how)
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
-            stored_lines.append(f"{path}: {bound}")
+            stored_lines.append(f"{one.path}: {bound}")
     return finish_run(run_dir, facts, *calibration_tables(facts), lines=stored_lines)
 
 

@@ -14,8 +14,7 @@ from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.kmz import write_kmz
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
-from gsparc.apps.maps.promise import PromiseSettings
-from gsparc.apps.maps.promised import map_notes, read_or_gather
+from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_samples

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
-from gsparc.apps.maps.promised import read_or_gather, reopen_training
+from gsparc.apps.maps.promise import read_or_gather, reopen_training
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.models import checkpoint

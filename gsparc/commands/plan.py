@@ -12,7 +12,7 @@ from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.geojson import write_shapes
 from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
-from gsparc.apps.maps.promised import read_or_gather
+from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.summary import coordinates, write_samples

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import spearmanr
 
 from gsparc.evaluation.drawing import GREY, PALETTE, numbered_style, panels, save, style_of
 from gsparc.evaluation.metric_formats import OF_KIND, axis_of
 from gsparc.evaluation.results import own_rows
 from gsparc.evaluation.table import Row
 from gsparc.prediction.risk import bounded_loss
+from gsparc.processes.uncertainty import rank_correlation
 
 PAPER_TAU = 0.59  # of confidences between their least and largest over the test rows
 SSIM_WEIGHT = 0.2  # of 1 - SSIM in the loss of a spectrum, the rest absolute error (the paper)
@@ -78,7 +78,8 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         error = row["run"].samples["mae"][known] if spectra else loss
         scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
         scatter.set(xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C")
-        scatter.set_title(f"rank correlation {spearmanr(sure, error).statistic:.2f}")
+        alike = rank_correlation(sure, error)
+        scatter.set_title(f"rank correlation {np.nan if alike is None else alike:.2f}")
     return figure
 
 

@@ -13,7 +13,7 @@ from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import distinct_baselines
 from gsparc.models.method import Method
-from gsparc.prediction.confidence import predict_rows
+from gsparc.prediction.left_out import predict_rows
 from gsparc.processes.few_rows import evenly_spaced
 
 FILE = "predictions.npz"

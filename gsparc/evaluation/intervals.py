@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import norm
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
@@ -11,6 +10,7 @@ from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.by_station import best_server, rmse_after_constants
 from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
 from gsparc.evaluation.scores import Scores
+from gsparc.processes.uncertainty import coverage_and_width, half_width
 
 SHARE = 0.9  # of the truth that an interval is to hold
 
@@ -39,11 +39,9 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     if heard.any():
         given = [scores.samples[n][known] for n in ("heard_db", "heard_std_db") if n in scores.samples]
         middle, spread = (part[heard] for part in given or (mean_db, spread_db))
-        # z of .95 is 1.645 for the central 90 % of a normal distribution.
-        half = norm.ppf((1 + SHARE) / 2) * spread
-        error = np.abs(10 * np.log10(power[heard]) - middle)
-        figures |= {"interval/coverage_90": float((error <= half).mean())}
-        figures |= {"interval/width_db": float(2 * half.mean())}
+        error = 10 * np.log10(power[heard]) - middle
+        held, width = coverage_and_width(error, half_width(SHARE) * spread)
+        figures |= {"interval/coverage_90": held, "interval/width_db": width}
         figures |= {CALIBRATION: float(np.mean((error / spread) ** 2))}
         figures |= {"heard_above_db": float((middle - mean_db[heard]).mean())} if given else {}
     chance = scores.samples.get("heard_share", scores.variance * np.nan)[known]

@@ -27,7 +27,16 @@ from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.prediction import confidence, risk
+from gsparc.prediction import risk
+from gsparc.prediction.confidence import (
+    Guarantee,
+    Trusted,
+    calibrated_box,
+    confidence_threshold,
+    read_trusted,
+    store_trusted,
+)
+from gsparc.prediction.left_out import Evidence, gather_evidence
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
@@ -75,7 +84,7 @@ class Opened:
     def predictor(self) -> Predictor:
         """The first method, as `gsparc.load` answers by it."""
         site, extra = self.stored[0].site, self.stored[0].extra
-        return Predictor(self.methods[0], site, trusted=confidence.read_trusted(extra), extra=extra)
+        return Predictor(self.methods[0], site, trusted=read_trusted(extra), extra=extra)
 
     def retraining(self, effort: float | None = None, **others: Any) -> Learned:
         """Return the first method with what it learned from; only classes of gsparc make it unfitted.
@@ -298,78 +307,65 @@ def _trained(
     return None if were_trained_on(stored, before) is False else (data, before)
 
 
-def collect_evidence(
-    paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
-) -> tuple[risk.Evidence, dict[str, Any]]:
-    """Gather evidence of every checkpoint's own test rows, no row twice, and the facts that name them."""
-    parts, seen = [], np.zeros(0, np.int64)
-    facts: dict[str, Any] = {}
-    for path in paths:
-        run, own, fold = _unseen(path, dataset, split)
-        # Folds and seeds share test rows: a row counts in the evidence once, by the first checkpoint.
-        rows = np.setdiff1d(rows_to_score(run.split.folds[0], "test"), seen)
-        if len(rows):
-            parts.append(confidence.gather_evidence(run.methods[0], run.data, fold, rows, own))
-        seen = np.concatenate([seen, rows])
-        facts = facts or run.facts()
-    return risk.join_evidence(parts), facts
+@dataclass(frozen=True)
+class Unseen:
+    """A checkpoint with evidence of its own test rows: a bound holds for rows that nothing was chosen on.
 
-
-def calibrate_and_store(
-    path: str, dataset: dict[str, Any], split: dict[str, Any], guarantee: risk.Guarantee, kind: str,
-    spatial: bool, seed: int,
-) -> tuple[confidence.Trusted, str]:  # fmt: skip
-    """Choose and calibrate on the checkpoint's own test rows, keep it with the model, return how it went."""
-    run, own, fold = _unseen(path, dataset, split)
-    # By the checkpoint's own test rows: a bound holds only for rows that nothing was chosen on.
-    rows = rows_to_score(run.split.folds[0], "test")
-    evidence = confidence.gather_evidence(run.methods[0], run.data, fold, rows, own)
-    how = kind, spatial, seed
-    kind_used, choice, _, choose_on = risk.calibrate_threshold(evidence, guarantee, *how, tested=False)
-    threshold = confidence.confidence_threshold(kind_used, choice)
-    known, kernel = confidence.known_positions(own, fold), confidence.position_kernel(own, fold)
-    box = confidence.calibrated_box(known, evidence.position)
-    stored = confidence.Trusted(kind_used, threshold, guarantee, known, kernel, box)
-    earlier = confidence.read_trusted(run.stored[0].extra)
-    before = earlier.kind or "the model's own"
-    # Programs that read confidences get another number from now on: it is said.
-    why = f", {risk.explain_kind(evidence, choose_on)}" if kind == "auto" else ""
-    kind_changed = f"confidence={kind_used}{why}, before: {before}; "
-    if kind == "auto" and not np.isfinite(threshold):
-        # Without a promise a choice by chance would replace what falls away from the measurements.
-        stored, kind_changed = earlier, f"confidence stays {before}, the checkpoint as it was; "
-    else:
-        confidence.store_trusted(path, stored)
-    if np.isfinite(threshold):
-        share = np.mean(evidence.scores[kind_used] >= choice.value)
-        of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
-        from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
-        of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {path}"
-        return stored, f"{kind_changed}{from_there}: {of}"
-    wrong, limit = guarantee.is_bad(evidence.error), f"{guarantee.limit_db:g} dB"
-    effect = risk.design_effect(wrong, risk.number_patches(evidence.position)) if spatial else 1.0
-    bad = float(wrong.mean())
-    if few := risk.explain_too_few(len(evidence), guarantee, bad, effect):
-        return stored, f"{kind_changed}no threshold keeps the bound: {few}"
-    other = risk.relax_guarantee(evidence, guarantee, *how)
-    hint = f"limit_db={other.limit_db:g} would be" if other else f"no limit_db= up to {risk.MOST_LAX_DB} is"
-    reason = "the others are not told from them surely enough"
-    if bad < guarantee.alpha:
-        reason = f"so few do not show that at most alpha={guarantee.alpha:g} are"
-    return stored, (
-        f"{kind_changed}no threshold keeps the bound: {bad:.0%} of {len(evidence)} test positions are worse "
-        f"than {limit}, and {reason}; {hint} kept, more training rows may help"
-    )
-
-
-def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> tuple[Opened, Measurements, Fold]:
-    """A checkpoint with test rows that it has not learned from, and what it learned from.
-
-    On other test rows no promise would hold.
+    Attributes:
+        path: of the file.
+        facts: see `Opened.facts`.
+        earlier: what the file holds of its confidence.
+        rivals: by what the model learned from.
+        evidence: of the test rows.
     """
-    run = open_files([path], dataset, split, others_whole=True)
-    if run.learned != 0:
-        advice = "calibrate with the data and split of its training"
-        raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
-    own, before = run.trained or (run.data, run.split)
-    return run, own, before.folds[0]
+
+    path: str
+    facts: dict[str, Any]
+    earlier: Trusted
+    rivals: Trusted
+    evidence: Evidence
+
+    @staticmethod
+    def open(path: str, dataset: Mapping[str, Any], split: Mapping[str, Any]) -> Unseen:
+        """Ask a checkpoint about its test rows; see `open_files`.
+
+        Raises:
+            ValueError: it may have learned from some of them, so that no promise would hold.
+        """
+        run = open_files([path], dataset, split, others_whole=True)
+        if run.learned != 0:
+            advice = "calibrate with the data and split of its training"
+            raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
+        own, before = run.trained or (run.data, run.split)
+        rivals = Trusted.from_fold(own, before.folds[0])
+        rows = rows_to_score(run.split.folds[0], "test")
+        evidence = gather_evidence(run.methods[0], run.data, rows, rivals)
+        return Unseen(path, run.facts(), read_trusted(run.stored[0].extra), rivals, evidence)
+
+    def calibrate_and_store(
+        self, guarantee: Guarantee, kind: str, spatial: bool, seed: int
+    ) -> tuple[Trusted, str]:
+        """Choose a confidence and its threshold, keep them with the model, return them and how it went."""
+        evidence, how = self.evidence, (kind, spatial, seed)
+        kind_used, choice, _, choose_on = risk.calibrate_threshold(evidence, guarantee, *how, tested=False)
+        threshold = confidence_threshold(kind_used, choice)
+        box = calibrated_box(self.rivals.known, evidence.position)
+        stored = replace(self.rivals, kind=kind_used, threshold=threshold, promise=guarantee, box=box)
+        before = self.earlier.kind or "the model's own"
+        # Programs that read confidences get another number from now on: it is said.
+        why = f", {risk.explain_kind(evidence, choose_on)}" if kind == "auto" else ""
+        kind_changed = f"confidence={kind_used}{why}, before: {before}; "
+        if kind == "auto" and not np.isfinite(threshold):
+            # Without a promise a choice by chance would replace what falls away from the measurements.
+            stored, kind_changed = self.earlier, f"confidence stays {before}, the checkpoint as it was; "
+        else:
+            store_trusted(self.path, stored)
+        if np.isfinite(threshold):
+            share = np.mean(evidence.scores[kind_used] >= choice.value)
+            of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
+            from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
+            of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {self.path}"
+            return stored, f"{kind_changed}{from_there}: {of}"
+        return stored, f"{kind_changed}no threshold keeps the bound: " + risk.explain_none(
+            evidence, guarantee, *how
+        )

@@ -9,11 +9,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.stats import t
 
 from gsparc.evaluation.metric_formats import WITH_SILENT
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.table import Row
+from gsparc.processes.uncertainty import half_width, standard_error
 
 LEVEL = 0.95  # of the interval that must not hold 0
 SAME_DB = 0.005  # less is 0 in the two decimals of a table
@@ -40,8 +40,8 @@ class Lead:
     @staticmethod
     def from_gains(gains: np.ndarray, of: str) -> Lead:
         """Return the mean of differences (n,) of pairs that are `of` rows or draws."""
-        error = gains.std(ddof=1) / len(gains) ** 0.5 if len(gains) > 1 else np.nan
-        return Lead(float(gains.mean()), float(error), len(gains), of)
+        error = standard_error(gains) if len(gains) > 1 else np.nan
+        return Lead(float(gains.mean()), error, len(gains), of)
 
     @staticmethod
     def from_facts(facts: Mapping[str, Any], stem: str) -> Lead | None:
@@ -74,7 +74,7 @@ class Lead:
     @property
     def reach_db(self) -> float:
         """Return half of its 95 % interval (Student's t): few draws tell their scatter badly [dB]."""
-        return float(t.ppf((1 + LEVEL) / 2, max(self.count - 1, 1)) * self.error_db)
+        return half_width(LEVEL, max(self.count - 1, 1)) * self.error_db
 
     def __str__(self) -> str:
         error = "" if np.isnan(self.error_db) else f" ± {self.error_db:.2f}"

@@ -24,9 +24,11 @@ from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
-from gsparc.prediction.confidence import predict_rows
-from gsparc.prediction.risk import Evidence, Guarantee, Trial, bounded_loss, risk_coverage
+from gsparc.prediction.confidence import Guarantee
+from gsparc.prediction.left_out import Evidence, predict_rows
+from gsparc.prediction.risk import Trial, bounded_loss
 from gsparc.processes.sectors import NO_AZIMUTH
+from gsparc.processes.uncertainty import risk_coverage
 from gsparc.training import tracking
 
 

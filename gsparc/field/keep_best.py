@@ -14,6 +14,7 @@ from gsparc.field import edit
 from gsparc.field.distributed import first_process_value
 from gsparc.field.gradient_stage import KEPT
 from gsparc.field.module import GaussianModule
+from gsparc.processes.uncertainty import is_surely_above
 
 log = logging.getLogger(__name__)
 
@@ -94,10 +95,8 @@ class KeepBest(L.Callback):
 
 def _is_surely_less(errors: Tensor, start: Tensor) -> bool:
     """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of the differences."""
-    if len(errors) != len(start) or len(errors) < 2:
-        return len(errors) != len(start)  # a training without a look before its first step keeps the least
-    gain = start - errors
-    return bool(gain.mean() > SURE * gain.std() / len(gain) ** 0.5)
+    # A training without a look before its first step keeps the least.
+    return len(errors) != len(start) or is_surely_above((start - errors).cpu().numpy(), SURE)
 
 
 class StopAt(L.Callback):

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from scipy.optimize import nnls
-from scipy.stats import norm, t
 from torch import Tensor
 
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
@@ -24,6 +23,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import factors_to_measured
 from gsparc.physics.decibels import TINY_POWER
+from gsparc.processes.uncertainty import mean_and_error
 
 log = logging.getLogger(__name__)
 
@@ -105,22 +105,6 @@ def weights_of_fits(errors: Tensor) -> Tensor:
 def mixture_errors(weights: np.ndarray, gram: np.ndarray) -> np.ndarray:
     """Return the squared errors (n,) of a mixture (K,) from products (n, K, K)."""
     return np.einsum("k,nkl,l->n", weights, gram, weights)
-
-
-def mean_and_error(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
-    """Return the mean of differences (n,) and its standard error,
-    rows of one unit (n,) not being independent.
-
-    Of few units it is larger, so that as many normal means lie within it (Student's t). It is infinite where
-    all rows are of one unit: then nothing tells how far to trust the mean.
-    """
-    which = np.unique(unit, return_inverse=True)[1].reshape(-1)
-    mean, units = float(difference.mean()), int(which.max()) + 1
-    if units < 2:
-        return mean, float("inf")
-    sums = np.bincount(which, difference - mean)
-    few = float(t.ppf(norm.cdf(1.0), units - 1))
-    return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
 def explained_variance(predicted: Tensor, target: Tensor, remove_mean: bool) -> float:

@@ -12,80 +12,24 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.limits import SHARE, Checked, setting
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import kernel_of_targets
-from gsparc.models.method import Method, Prediction, predict_in_batches, predict_with_threads
+from gsparc.models.method import Method, Prediction, predict_with_threads
 from gsparc.prediction.query import Queries, match_input
-from gsparc.prediction.risk import KINDS, RIVALS, Evidence, Guarantee, Threshold
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
+from gsparc.processes.uncertainty import Threshold
 
+RIVALS = ("distance", "gp_variance")
+KINDS = ("learned", "expected", *RIVALS)
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
-
-
-def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Prediction:
-    """Return what a method says of rows (n,), in their order; see `predict_in_batches`."""
-    order, _, said = zip(*predict_in_batches(method, data, rows), strict=True)
-    return Prediction.joined(said, torch.from_numpy(np.argsort(np.concatenate(order))))
-
-
-def gather_evidence(
-    method: Method, data: Measurements, fold: Fold, rows: np.ndarray, seen: Measurements | None = None
-) -> Evidence:
-    """Return what `method` predicts of rows, and its confidence's rivals by `fold`, of `seen` or `data`."""
-    said = predict_rows(method, data, rows)
-    return judge_answers(said, data.targets(rows), rows, data.moving[rows], seen or data, fold)
-
-
-def judge_answers(
-    said: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, data: Measurements, fold: Fold
-) -> Evidence:
-    """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m], and their scores.
-
-    What was learned from is `fold` of `data`. A method that does not state a kind of score has none of it.
-    """
-    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
-    # A silent row has no relative error: any miss of it counts as huge.
-    error = (miss / power.clamp_min(1e-30)).double().numpy()
-    known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    every = {kind: score_answers(kind, said, places, known, kernel) for kind in KINDS}
-    # Scores with a NaN rank nothing.
-    scores = {kind: own for kind, own in every.items() if own is not None and not np.isnan(own).any()}
-    return Evidence(rows, places, error, scores)
-
-
-def score_answers(
-    kind: str, said: Prediction, places: np.ndarray | None, known: np.ndarray, kernel: Kernel | None
-) -> np.ndarray | None:
-    """Return the scores (B,) of a kind, larger is surer; None where the method states none.
-
-    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
-    (in a fade the same variance is a larger relative error), `distance` minus that of places (B, 3) to the
-    nearest of those `known` [m], `gp_variance` minus `process_variance`.
-
-    >>> score_answers("distance", None, np.array([[3.0, 4.0, 0.0]]), np.zeros((1, 3)), None)
-    array([-5.])
-    """
-    if kind == "distance":
-        return -cKDTree(known).query(places)[0]
-    if kind == "gp_variance" and kernel is not None and places is not None:
-        return -process_variance(kernel, known, places)
-    own = said.confidence
-    if kind == "expected" and (own := said.variance) is not None:
-        # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
-        own = -own / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
-    return None if own is None else own.double().numpy()
-
-
-def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
-    """Return local places (n, 3) [m] of the moving end that a method may have learned from."""
-    return data.moving[np.concatenate([fold.train, fold.val])]
 
 
 def calibrated_box(*places: np.ndarray) -> np.ndarray:
@@ -100,13 +44,6 @@ def calibrated_box(*places: np.ndarray) -> np.ndarray:
     return np.stack([every.min(axis=0) - margin, every.max(axis=0) + margin])
 
 
-def position_kernel(data: Measurements, fold: Fold) -> Kernel:
-    """Choose the rival process's kernel: length and noise by likelihood on a few known rows."""
-    known = np.concatenate([fold.train, fold.val])
-    # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
-    return kernel_of_targets(data, known[draw_rows(len(known), KERNEL_ROWS, 0)], COMPONENTS)
-
-
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
     rows = torch.from_numpy(known)
@@ -116,6 +53,28 @@ def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> n
 
 
 KEY = "confidence"
+
+
+@dataclass(frozen=True)
+class Guarantee(Stored, Checked):
+    """What is promised.
+
+    >>> Guarantee(limit_db=-10.0).is_bad(np.array([0.05, 0.5]))
+    array([False,  True])
+
+    Attributes:
+        limit_db: a prediction is bad when |e|^2 / |h|^2 exceeds this [dB].
+        alpha: largest share of bad ones among the accepted.
+        delta: probability that a calibration set misleads.
+    """
+
+    limit_db: float = -10.0
+    alpha: float = setting(0.1, SHARE)
+    delta: float = setting(0.1, SHARE)
+
+    def is_bad(self, relative_error: np.ndarray) -> np.ndarray:
+        """Tell whether predictions (n,) are bad."""
+        return relative_error > 10 ** (self.limit_db / 10)
 
 
 @dataclass(frozen=True)
@@ -138,6 +97,17 @@ class Trusted(Stored):
     kernel: Kernel | None = field(default=None, repr=False)
     box: np.ndarray | None = field(default=None, repr=False)
 
+    @staticmethod
+    def from_fold(data: Measurements, fold: Fold) -> Trusted:
+        """Return the rivals of a method's own confidence, by what it may have learned from.
+
+        Length and noise of the kernel are chosen by likelihood on a few known rows.
+        """
+        known = np.concatenate([fold.train, fold.val])
+        # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
+        kernel = kernel_of_targets(data, known[draw_rows(len(known), KERNEL_ROWS, 0)], COMPONENTS)
+        return Trusted(known=data.moving[known], kernel=kernel)
+
     def covers(self, places: np.ndarray) -> np.ndarray:
         """Tell whether local places (B, 3) [m] lie in the box, (B,) bool; all where none is known."""
         if self.box is None:
@@ -157,11 +127,27 @@ class Trusted(Stored):
         self.check_kind(kind)
         if kind in RIVALS and places is None:
             raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
-        score = score_answers(kind, prediction, places, self.known, self.kernel)
-        if score is None:
+        if (score := self.score(kind, prediction, places)) is None:
             what = "has no confidence of its own" if kind == "learned" else "states no error variance"
             raise ValueError(f"confidence={kind}: this model {what}")
         return as_confidence(kind, score).astype(np.float32)
+
+    def score(self, kind: str, said: Prediction, places: np.ndarray | None) -> np.ndarray | None:
+        """Return the scores (B,) of a kind, larger is surer; None where the method states none.
+
+        `learned` is the method's own confidence, `expected` minus its error variance over the power it
+        predicts (in a fade the same variance is a larger relative error), `distance` minus that of places
+        (B, 3) to the nearest of those `known` [m], `gp_variance` minus `process_variance`.
+        """
+        if kind == "distance":
+            return -cKDTree(self.known).query(places)[0]
+        if kind == "gp_variance" and self.kernel is not None and places is not None:
+            return -process_variance(self.kernel, self.known, places)
+        own = said.confidence
+        if kind == "expected" and (own := said.variance) is not None:
+            # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
+            own = -own / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
+        return None if own is None else own.double().numpy()
 
     def check_kind(self, kind: str) -> None:
         """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom
 
 from gsparc.data.limits import SHARE, Checked, number, setting, whole
+from gsparc.processes.uncertainty import most_failures
 from gsparc.simulate.attribution import Deliverable, SurveyProbe, list_effect_sets, list_removals
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
@@ -56,6 +56,16 @@ class AutoSettings(Checked):
     def required(self) -> Deliverable:
         """The requirement."""
         return Deliverable.parse(self.deliverable, self.quantile)
+
+    def allowed_failures(self, heard: int) -> int:
+        """Return how many of `heard` receivers may exceed the tolerance, so that the quantile follows.
+
+        0 where even none proves nothing.
+
+        >>> AutoSettings(quantile=0.95, confidence=0.85).allowed_failures(128)
+        3
+        """
+        return max(int(most_failures(heard, 1 - self.quantile, 1 - self.confidence)), 0)
 
 
 @dataclass(frozen=True)
@@ -145,7 +155,7 @@ def choose_effects(probe: SurveyProbe, settings: AutoSettings) -> Choice:
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
-    most = allowed_failures(heard, settings.quantile, settings.confidence)
+    most = settings.allowed_failures(heard)
     rows = [_row(name, probe, less, required) for name, less in list_removals(full).items()]
 
     def holds(effects: Effects) -> bool:
@@ -184,7 +194,7 @@ def choose_rays(
     """
     row = _row(f"rays > {samples}", probe, traced, settings.required)
     heard = int(probe.reached.sum())
-    enough = row.failures <= allowed_failures(heard, settings.quantile, settings.confidence)
+    enough = row.failures <= settings.allowed_failures(heard)
     table = (*choice.table, replace(row, kept=not enough))
     return replace(choice, table=table, samples=samples if enough else None)
 
@@ -192,21 +202,6 @@ def choose_rays(
 def keep_all_rays(choice: Choice) -> Choice:
     """Return the choice, whose fewer rays the held-back receivers refute."""
     return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))
-
-
-def allowed_failures(count: int, quantile: float, confidence: float) -> int:
-    """Return how many of `count` receivers may exceed the tolerance, so that the quantile follows.
-
-    Were the requirement violated, no more would exceed it with a probability of at most 1 - confidence
-    (exact binomial); 0 where even none proves nothing.
-
-    >>> allowed_failures(128, quantile=0.95, confidence=0.85)
-    3
-    """
-    wrong, risk = 1 - quantile, 1 - confidence
-    most = int(binom.ppf(risk, count, wrong))
-    # `ppf` is the least count that reaches the risk: one less stays below it.
-    return max(most - int(binom.cdf(most, count, wrong) > risk), 0)
 
 
 def relative_cost(effects: Effects, full: Effects, rays: float = 1.0) -> float:

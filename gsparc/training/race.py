@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from gsparc.processes.uncertainty import standard_error
+
 LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidate
 SURE = 1.0  # standard errors of paired rows
 FAR = 5.0  # times the error of the best: what stalls there has a part of its own that will not fall
@@ -75,7 +77,7 @@ class Race:
             squares = apart.abs().double().square().sum(1) / whole
             weight = min(max(float(gains.sum() / squares.sum().clamp_min(1e-30)), 0.0), 1.0)
             gains = weight * (2 * gains - weight * squares)
-        gain, error = float(gains.sum()), float(gains.std(correction=0)) * len(gains) ** 0.5
+        gain, error = float(gains.sum()), standard_error(gains.numpy()) * len(gains)
         known = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
         if now > FAR * mean_square(best):
             raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {known}")
@@ -89,7 +91,7 @@ def has_settled(errors: Sequence[float], missed: Tensor) -> bool:
     third, squares = len(errors) // 3, missed.abs().double().square().mean(1)
     if third < LEAST_THIRD:
         return False
-    return min(errors[:-third]) - min(errors[-third:]) < float(squares.std()) / len(squares) ** 0.5
+    return min(errors[:-third]) - min(errors[-third:]) < standard_error(squares.numpy())
 
 
 def mean_square(values: Tensor) -> float:

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,27 +11,22 @@ from refusals import refused
 from gsparc.commands.calibrate import calibration_tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.evaluation import open_runs as command
-from gsparc.evaluation.open_runs import collect_evidence
+from gsparc.evaluation.open_runs import Unseen
 from gsparc.evaluation.pictures import draw_calibration
-from gsparc.prediction.confidence import as_confidence
+from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence
+from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import (
-    Evidence,
-    Guarantee,
-    Threshold,
     Trial,
+    areas_of_kinds,
     best_kind,
     calibrate_threshold,
     calibration_facts,
-    choose_threshold,
     explain_too_few,
     number_patches,
-    rank_correlation,
-    risk_coverage,
     run_trials,
     split_choose_calibrate_test,
-    threshold_levels,
 )
+from gsparc.processes.uncertainty import least_accepted
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
@@ -47,125 +41,61 @@ def _evidence(count: int = 900, seed: int = 0) -> Evidence:
     return Evidence(np.arange(count), position, error, scores)
 
 
-@pytest.mark.parametrize(
-    ("score", "risk"),
-    [([3.0, 1, 2], [0, 0.15, 0.4]), ([0.0, 0, 0], [0.4, 0.4, 0.4])],
-    ids=["by hand", "equal"],
-)
-def test_risk_of_the_surest(score, risk) -> None:
-    """Equal scores have no order: theirs is the mean."""
-    assert np.allclose(risk_coverage(np.array(score), np.array([0.0, 0.9, 0.3])), risk)
-
-
 def test_auto_chose_another_confidence_by_chance() -> None:
     """Of thirteen rows the least area is mostly luck: a gain within the paired standard error is none."""
     evidence = _evidence()
     noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
     alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
     rows = np.random.default_rng(2).permutation(len(evidence))[:400].reshape(20, 20)
-    chosen = [best_kind(replace(evidence, scores=alike), some) for some in rows]
+    chosen = [best_kind(areas_of_kinds(replace(evidence, scores=alike), some)) for some in rows]
     assert chosen.count("learned") >= 18  # 12 of 20 had the least area
     worse = {"learned": evidence.scores["distance"], "expected": evidence.scores["learned"]}
-    assert best_kind(replace(evidence, scores=worse), np.arange(200)) == "expected"
-
-
-def test_threshold_counts_the_bad_and_bounds_their_share() -> None:
-    promise = Guarantee(alpha=0.1, delta=0.1)
-    score = np.linspace(1, 0, 400)
-    bad = np.arange(400) >= 200
-    levels = threshold_levels(score, bad, promise, 400)
-    found = choose_threshold(score, bad, levels, promise)
-    assert 180 <= found.accepted < 230 and found.bad == max(0, found.accepted - 200)
-    assert found.bound(0.1) <= 0.1 + 1e-9
-    assert choose_threshold(score, np.ones(400, bool), levels, promise).value == float("inf")
-    assert Threshold(0.0, 0, 0).bound(0.1) == 1.0
-
-
-def test_too_few_to_test_promise_nothing() -> None:
-    score = np.linspace(1, 0, 15)
-    good, promise = np.zeros(15, bool), Guarantee(alpha=0.1, delta=0.1)
-    found = choose_threshold(score, good, threshold_levels(score, good, promise, 15), promise)
-    assert found.accepted == 0  # 0.9^15 = 0.2 > delta
-    refused("above 0 and below 1", Guarantee, alpha=1.5)
+    assert best_kind(areas_of_kinds(replace(evidence, scores=worse), np.arange(200))) == "expected"
 
 
 def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
     """The laxest of levels from six scores mostly accepts fewer than eleven of thirteen others."""
     good, promise = replace(_evidence(32), error=np.full(32, 0.01)), Guarantee(0.0, alpha=0.2)
     accepted = [calibrate_threshold(good, promise, "auto", False, seed)[1].accepted for seed in range(50)]
-    assert min(accepted) >= promise.least  # 19 of 50 accepted none
+    assert min(accepted) >= least_accepted(0.2, 0.1)  # 19 of 50 accepted none
     assert explain_too_few(13, promise).startswith("13 test positions are too few: alpha=0.2, delta=0.1 with")
     assert explain_too_few(14, promise) is None and "44 in all" in explain_too_few(32, promise, 0.1)
     assert explain_too_few(13, promise, 0.9) == explain_too_few(13, promise)
-    # Valid still: a fifth and more of all are bad, whatever the score, and one set in ten is misled.
-    assert 0.02 < _accepting(0.2 * np.ones(19), 6, promise) < 0.1
-
-
-def _accepting(share: np.ndarray, aside: int, promise: Guarantee, least: float = -np.inf, sets: int = 300):
-    """Of sets of rows that are bad with `share` (n,), surest first, how many accept scores below `least`."""
-    rng = np.random.default_rng(0)
-    found = 0
-    for _ in range(sets):
-        row = rng.permutation(len(share))
-        score, bad = -row / len(share), rng.random(len(share)) < share[row]
-        levels = threshold_levels(score[:aside], bad[:aside], promise, len(share) - aside)
-        threshold = choose_threshold(score[aside:], bad[aside:], levels, promise)
-        found += threshold.accepted > 0 and (least == -np.inf or threshold.value < least)
-    return found / sets
-
-
-@pytest.mark.parametrize("share", [0.08, 0.22])
-def test_one_bad_row_of_the_surest_ended_the_search(share) -> None:
-    """Of 60 rows the first test was one of five: sets that promised something were .67 and .24 of all."""
-    promise = Guarantee(alpha=0.3, delta=0.2)
-    assert _accepting(np.full(60, share), 12, promise, sets=200) > (0.95 if share == 0.08 else 0.42)
-
-
-def test_where_the_search_begins_misleads_no_more_sets_than_promised() -> None:
-    """With `alpha` bad at every threshold, and with errors that grow beyond half of the rows."""
-    promise = Guarantee(alpha=0.3, delta=0.2)
-    assert _accepting(np.full(60, 0.3), 12, promise) < 0.2
-    growing = np.where(np.arange(60) < 30, 0.3, 0.6)
-    assert _accepting(growing, 12, promise) < 0.2 and _accepting(growing, 12, promise, -0.5) < 0.1
 
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
-    evidence, run = _evidence(), SimpleNamespace(methods=[0], data=0, split=SimpleNamespace(folds=[0]))
-    run.stored = [SimpleNamespace(extra={})]
-    monkeypatch.setattr(command, "_unseen", lambda *_: (run, 0, 0))
-    monkeypatch.setattr(command, "rows_to_score", lambda *_: None)
-    for name in ("known_positions", "position_kernel"):
-        monkeypatch.setattr(command.confidence, name, lambda *_: evidence.position)
-    kept = []
-    monkeypatch.setattr(command.confidence, "store_trusted", lambda *stored: kept.append(stored))
-    monkeypatch.setattr(command.confidence, "gather_evidence", lambda *_: evidence)
-    how = "auto", False, 0
-    stored, said = command.calibrate_and_store("", {}, {}, Guarantee(-40.0), *how)
+    evidence, kept = _evidence(), []
+    monkeypatch.setattr("gsparc.evaluation.open_runs.store_trusted", lambda *stored: kept.append(stored))
+    how, unseen = (
+        ("auto", False, 0),
+        Unseen("a.ckpt", {}, Trusted(), Trusted(known=evidence.position), evidence),
+    )
+    stored, said = unseen.calibrate_and_store(Guarantee(-40.0), *how)
     # A choice among confidences replaced the model's own though nothing was promised.
     assert "confidence stays the model's own, the checkpoint as it was; " in said and not kept
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0
-    stored, said = command.calibrate_and_store("a.ckpt", {}, {}, Guarantee(better), *how)
+    stored, said = unseen.calibrate_and_store(Guarantee(better), *how)
     assert f"confidence={stored.kind}, chosen by the mean error of the surest 1, 2, ... of 180 rows: " in said
     assert "before: the model's own; accepted from" in said and len(kept) == 1
     assert re.search(r"accepted from \S+, \d+% of 900 test positions: at most 10% of the accepted are", said)
     assert said.endswith("which fails in at most 10% of cases; threshold stored in a.ckpt")
-    assert "no threshold" in command.calibrate_and_store("", {}, {}, Guarantee(better - 1), *how)[1]
+    assert "no threshold" in unseen.calibrate_and_store(Guarantee(better - 1), *how)[1]
     # Fewer than alpha were bad, and a confidence was blamed; rows of patches that err together were too few.
     evidence.error[:] = np.where(np.arange(900) % 8 == 0, 10.0, 0.01)
-    said = command.calibrate_and_store("", {}, {}, Guarantee(alpha=0.144), "auto", False, 2)[1]
+    said = unseen.calibrate_and_store(Guarantee(alpha=0.144), "auto", False, 2)[1]
     assert "so few do not show that at most alpha=0.144 are" in said
     evidence.error[:] = np.where(number_patches(evidence.position) % 8 == 0, 10.0, 0.01)
-    said = command.calibrate_and_store("", {}, {}, Guarantee(alpha=0.2), "distance", True, 0)[1]
+    said = unseen.calibrate_and_store(Guarantee(alpha=0.2), "distance", True, 0)[1]
     assert "as neighbours err alike" in said
     evidence.error[:] = 10.0
-    assert "no limit_db= up to 6 is kept" in command.calibrate_and_store("", {}, {}, Guarantee(), *how)[1]
+    assert "no limit_db= up to 6 is kept" in unseen.calibrate_and_store(Guarantee(), *how)[1]
 
 
 @pytest.mark.parametrize("how", ["random", "spatial"])
 def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
-    trial = run_trials(_evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how, 200)
+    trial = run_trials(_evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how == "spatial", 200)
     facts = trial.summarise()
     assert trial.kind == "learned" and trial.coverage.mean() > 0.2
     # Resampled from one pool: the share itself scatters by about 0.02.
@@ -176,7 +106,7 @@ def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
 
 def test_parts_are_disjoint_and_cells_stay_whole() -> None:
     evidence = _evidence()
-    parts = split_choose_calibrate_test(evidence, "spatial", np.random.default_rng(0))
+    parts = split_choose_calibrate_test(evidence, True, np.random.default_rng(0))
     assert len(np.unique(np.concatenate(parts))) == sum(map(len, parts)) == len(evidence)
     cell = np.floor((evidence.position[:, :2] - evidence.position[:, :2].min(0)) / (2 / 6) * 0.9999)
     names = [set(map(tuple, cell[part])) for part in parts]
@@ -208,10 +138,10 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     rng = np.random.default_rng(0)
     two = _evidence(40)
     two.position[:] = np.where(np.arange(40)[:, None] < 20, 0.0, 5.0)
-    assert len(split_choose_calibrate_test(two, "random", rng)[2]) == 16
+    assert len(split_choose_calibrate_test(two, False, rng)[2]) == 16
     with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
-        split_choose_calibrate_test(two, "spatial", rng)
-    refused("2 positions cannot be parted", split_choose_calibrate_test, _evidence(2), "random", rng)
+        split_choose_calibrate_test(two, True, rng)
+    refused("2 positions cannot be parted", split_choose_calibrate_test, _evidence(2), False, rng)
 
 
 def test_positions_on_a_plumb_line_have_patches() -> None:
@@ -225,14 +155,14 @@ def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
     exact = replace(_evidence(30), error=np.zeros(30))
     facts = calibration_facts(exact, [], Guarantee())
     assert facts["confidence/learned/area_below_distance"] is None
-    assert rank_correlation(np.zeros(3), np.arange(3.0)) is None
+    assert facts["confidence/learned/rank_correlation"] is None
     assert len(calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[0].rows) == 2
 
 
 def test_trials_beside_a_promise_of_other_trials_read_as_a_broken_one() -> None:
     """14% of accepting trials stood beside a promise about all; fewer answers than above had no reason."""
     promise = Guarantee(limit_db=-5, alpha=0.2)
-    facts = calibration_facts(_evidence(), [run_trials(_evidence(), promise, "random", 5)], promise)
+    facts = calibration_facts(_evidence(), [run_trials(_evidence(), promise, False, 5)], promise)
     trials = calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[1]
     heads = [column.name for column in trials.columns]
     at = heads.index("too many bad, of all trials")
@@ -253,11 +183,11 @@ def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_pa
     often = "callbacks.checkpoint.interval=10"
     _, objects = train(compose(*brief(file, often)), tmp_path / "run")
     for path in (tmp_path / "run" / "last.ckpt", tmp_path / "run" / "refit" / "last.ckpt"):
-        assert len(collect_evidence([str(path)], {}, {})[0]) == len(objects.split.folds[0].test)
+        assert len(Unseen.open(str(path), {}, {}).evidence) == len(objects.split.folds[0].test)
         found, _, _ = evaluate_files([path], split={"redraw": True, "seed": 5})
         assert re.match(r"another split \(random\): [1-9]\d* of these 8 test", found.facts["split/foreign"])
         with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
-            collect_evidence([str(path)], {}, {"name": "sparse"})
+            Unseen.open(str(path), {}, {"name": "sparse"})
 
 
 def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(tmp_path) -> None:
@@ -284,16 +214,16 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
         with pytest.raises(
             ValueError, match=r": [1-9]\d* of these \d+ test rows are at places that were TRAINED"
         ):
-            collect_evidence([path], file, {})
+            Unseen.open(path, file, {})
             pytest.fail(name)
     elsewhere = written("elsewhere", every, 0.05)
-    again = collect_evidence([path], elsewhere, {"name": "random"})[0]
+    again = Unseen.open(path, elsewhere, {"name": "random"}).evidence
     assert len(again) == len(objects.split.folds[0].test)
     (tmp_path / "own.npz").unlink()
     with pytest.raises(
         ValueError, match=r"\(content hashes differ\); these test rows may have been TRAINED on"
     ):
-        collect_evidence([path], elsewhere, {})
+        Unseen.open(path, elsewhere, {})
 
 
 def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest(tmp_path) -> None:
@@ -303,18 +233,20 @@ def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest
     arrays["tx_position"] = arrays["tx_position"] + 0.05
     np.savez(tmp_path / "later.npz", **arrays)
     other = {"file": str(tmp_path / "later.npz")}
-    evidence, facts = collect_evidence([path], other, {"name": None})
+    unseen = Unseen.open(path, other, {"name": None})
+    evidence, facts = unseen.evidence, unseen.facts
     assert len(evidence) == len(arrays["tx_position"]) and facts["split/name"] == "whole"
     assert facts["split/foreign"] is None  # nothing of it was learned from
-    trusted, _ = command.calibrate_and_store(path, other, {}, Guarantee(), "distance", False, 0)
+    trusted, _ = unseen.calibrate_and_store(Guarantee(), "distance", False, 0)
     assert len(trusted.known) == 32 and trusted.covers(evidence.position).all()
 
 
 def test_a_threshold_of_distances_accepted_none_of_the_test_positions(tmp_path) -> None:
     """`accepted from 0.9933, 0% of 64`: minus metres were compared with a confidence."""
     path = str(_trained(tmp_path).checkpoints[0])
-    evidence, _ = collect_evidence([path], {}, {})
-    trusted, said = command.calibrate_and_store(path, {}, {}, Guarantee(60, 0.4, 0.4), "distance", False, 0)
+    unseen = Unseen.open(path, {}, {})
+    evidence = unseen.evidence
+    trusted, said = unseen.calibrate_and_store(Guarantee(60, 0.4, 0.4), "distance", False, 0)
     accepted = np.mean(as_confidence("distance", evidence.scores["distance"]) >= trusted.threshold)
     assert accepted > 0 and f", {accepted:.0%} of {len(evidence)} test positions" in said
 
@@ -323,13 +255,13 @@ def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
     """With another split, or one whose file is gone, a threshold was chosen on rows that were fitted to."""
     objects = _trained(tmp_path)
     path, rows = str(objects.checkpoints[0]), len(objects.split.folds[0].test)
-    assert len(collect_evidence([path], {}, {})[0]) == rows
+    assert len(Unseen.open(path, {}, {}).evidence) == rows
     with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
-        collect_evidence([path], {}, {"name": "corner"})
+        Unseen.open(path, {}, {"name": "corner"})
     split = tmp_path / "run" / "split.json"
     path = str(_trained(tmp_path, "split=file", f"split.path={split}", run="other").checkpoints[0])
-    assert len(collect_evidence([path], {}, {})[0]) == rows
+    assert len(Unseen.open(path, {}, {}).evidence) == rows
     other = split.rename(tmp_path / "kept.json")
-    assert collect_evidence([path], {}, {"path": str(other)})[1]["split/foreign"] is None  # by its hash
+    assert Unseen.open(path, {}, {"path": str(other)}).facts["split/foreign"] is None  # by its hash
     with pytest.raises(ValueError, match="another split; these test rows may have been TRAINED on"):
-        collect_evidence([path], {}, {"name": "corner"})
+        Unseen.open(path, {}, {"name": "corner"})

@@ -15,7 +15,6 @@ from drives import city_drive, write_table
 from refusals import refused_as
 
 import gsparc
-from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.promise import Promise
 from gsparc.commands.check import main as check
 from gsparc.commands.listing import COMMANDS
@@ -28,6 +27,7 @@ from gsparc.evaluation.answers import predict_file
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.left_out import HeldOutLevels
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 

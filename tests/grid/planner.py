@@ -23,7 +23,6 @@ from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.apps.maps.covered import covered_between
-from gsparc.apps.maps.levels import joint_levels
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import coarse_grid, plan_measurements
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
@@ -37,6 +36,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.powers.together import network as network_learning
 from gsparc.models.powers.together.network import check_azimuths
+from gsparc.prediction.levels import joint_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext

@@ -12,7 +12,6 @@ from gsparc.models.stack import (
     choose_weights,
     error_products,
     explained_variance,
-    mean_and_error,
     mixture_errors,
     relative_to_row,
 )
@@ -129,15 +128,6 @@ def test_weights_are_the_best_of_a_grid():
     least = float(best_weights(gram) @ gram @ best_weights(gram))
     grid = [np.array([a, b, 1 - a - b]) for a in np.linspace(0, 1, 41) for b in np.linspace(0, 1 - a, 41)]
     assert least <= min(float(w @ gram @ w) for w in grid) + 1e-9
-
-
-def test_rows_of_one_unit_count_as_one():
-    difference = np.repeat(np.random.default_rng(0).normal(size=20), 10)
-    alone = mean_and_error(difference, np.arange(200))[1]
-    together = mean_and_error(difference, np.repeat(np.arange(20), 10))[1]
-    assert together == pytest.approx(difference[::10].std(ddof=1) / np.sqrt(20), rel=0.03)
-    assert together > 3 * alone
-    assert mean_and_error(difference, np.zeros(200)) == (pytest.approx(difference.mean()), np.inf)
 
 
 def test_a_mixture_is_taken_where_it_pays():

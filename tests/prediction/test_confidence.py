@@ -9,19 +9,11 @@ from refusals import refused
 from towns import trained
 
 import gsparc
-from gsparc.evaluation.open_runs import calibrate_and_store
+from gsparc.evaluation.open_runs import Unseen
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.prediction.confidence import (
-    Trusted,
-    as_confidence,
-    calibrated_box,
-    gather_evidence,
-    known_positions,
-    position_kernel,
-    store_trusted,
-)
-from gsparc.prediction.risk import Guarantee
+from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, calibrated_box, store_trusted
+from gsparc.prediction.left_out import gather_evidence
 from gsparc.processes.kernel import WhiteNoise
 from gsparc.training.context import FitContext
 
@@ -39,10 +31,9 @@ def site(campaign, folds, tmp_path):
 def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     data, fold, file = site
     method, _ = loading.load(file)
-    evidence = gather_evidence(method, data, fold, fold.test)
-    store_trusted(
-        file, Trusted("distance", 0.2, Guarantee(), known_positions(data, fold), position_kernel(data, fold))
-    )
+    rivals = Trusted.from_fold(data, fold)
+    evidence = gather_evidence(method, data, fold.test, rivals)
+    store_trusted(file, replace(rivals, kind="distance", threshold=0.2, promise=Guarantee()))
     world = data.tx[fold.test] + data.site.origin
     for kind, score in evidence.scores.items():
         answered = gsparc.load(file, confidence=kind).confidence(tx=world)
@@ -57,13 +48,19 @@ def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     assert re.fullmatch(said, repr(plain.trusted))
 
 
+def test_a_share_above_one_was_promised() -> None:
+    refused("above 0 and below 1", Guarantee, alpha=1.5)
+
+
 def test_two_moving_ends_are_accepted_where_both_were_measured(tmp_path) -> None:
     rng = np.random.default_rng(0)
     ends = [np.column_stack([rng.uniform(0, 20, (60, 2)), np.full(60, 1.5)]) for _ in range(2)]
     loss = -30 - 25 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1) + 1)
     np.savez(tmp_path / "ends.npz", tx_position=ends[0], rx_position=ends[1], rssi_db=loss)
     path = trained(tmp_path / "ends.npz", "gp", "split.test_fraction=0.5")
-    trusted, _ = calibrate_and_store(str(path), {}, {}, Guarantee(0.0, 0.3, 0.2), "auto", False, 0)
+    trusted, _ = Unseen.open(str(path), {}, {}).calibrate_and_store(
+        Guarantee(0.0, 0.3, 0.2), "auto", False, 0
+    )
     assert trusted.box.shape == (2, 6)
     near, far, place = [5.0, 5, 1.5], [40.0, 10, 1.5], [10.0, 10, 1.5]
     accepted = gsparc.load(path).accepts(tx=[near, far, near], rx=[place, place, far])
@@ -76,9 +73,8 @@ def test_what_was_never_stored_is_said(site) -> None:
     refused("no threshold is stored", gsparc.load(file).accepts, tx=world)
     refused(r"gsparc calibrate ckpt=FILE stores it", gsparc.load, file, confidence="distance")
     refused("expected one of learned", gsparc.load, file, confidence="hope")
-    store_trusted(
-        file, Trusted("learned", 0.5, Guarantee(), known_positions(data, fold), position_kernel(data, fold))
-    )
+    own = replace(Trusted.from_fold(data, fold), kind="learned", threshold=0.5, promise=Guarantee())
+    store_trusted(file, own)
     with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
         gsparc.load(file, confidence="distance").accepts(tx=world)
 
@@ -87,10 +83,10 @@ def test_what_was_never_stored_is_said(site) -> None:
 def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None:
     """Variances above 1 were cut off: a threshold there accepted a place 900 km away."""
     data, fold, file = site
-    known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    kernel = replace(kernel, terms=(*kernel.terms[:-1], WhiteNoise(0.5)))
+    rivals = Trusted.from_fold(data, fold)
+    kernel = replace(rivals.kernel, terms=(*rivals.kernel.terms[:-1], WhiteNoise(0.5)))
     laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
-    store_trusted(file, Trusted(kind, float(laxest), Guarantee(), known, kernel))
+    store_trusted(file, Trusted(kind, float(laxest), Guarantee(), rivals.known, kernel))
     near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
     assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()
 
@@ -98,11 +94,10 @@ def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None
 def test_a_place_outside_of_all_measurements_was_accepted(site) -> None:
     """A model that found sources is sure 30 m beyond its room."""
     data, fold, file = site
-    known, kernel = known_positions(data, fold), position_kernel(data, fold)
-    trusted = Trusted("learned", 0.0, Guarantee(), known, kernel)
+    trusted = replace(Trusted.from_fold(data, fold), kind="learned", threshold=0.0, promise=Guarantee())
     near = data.tx[fold.train[:2]] + data.site.origin
     places = np.concatenate([near, near + np.array([30.0, 0, 0])])
     store_trusted(file, trusted)
     assert gsparc.load(file).accepts(tx=places).all()  # as files of before
-    store_trusted(file, replace(trusted, box=calibrated_box(known)))
+    store_trusted(file, replace(trusted, box=calibrated_box(trusted.known)))
     assert gsparc.load(file).accepts(tx=places).tolist() == [True, True, False, False]

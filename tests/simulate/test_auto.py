@@ -120,7 +120,8 @@ def test_one_odd_receiver_does_not_keep_everything():
 ])  # fmt: skip
 def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
     """Drawn: a violated requirement passes no more often than promised."""
-    assert auto.allowed_failures(probes, quantile, confidence) == most
+    settings = AutoSettings(quantile=quantile, confidence=confidence)
+    assert settings.allowed_failures(probes) == most
     if probes > 60:  # fewer prove nothing, even without a failure
         outside = np.random.default_rng(0).random((20_000, probes)) < 1 - quantile
         assert (outside.sum(1) <= most).mean() < 1 - confidence + 0.01

@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsparc.apps.link.adaptation import Rates
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.prediction.risk import binomial_interval
+from gsparc.processes.uncertainty import binomial_interval
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),

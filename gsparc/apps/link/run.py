@@ -17,8 +17,8 @@ from gsparc.apps.link.pusch import NEEDED, RECEIVERS, Pusch, frequency_correlati
 from gsparc.data.limits import SHARE, or_null
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid
-from gsparc.prediction.confidence import as_confidence, confidence_threshold
-from gsparc.prediction.risk import Guarantee, calibrate_threshold
+from gsparc.prediction.confidence import Guarantee, as_confidence, confidence_threshold
+from gsparc.prediction.risk import calibrate_threshold
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch
 from gsparc.data.executor import run_all
-from gsparc.prediction.risk import binomial_interval
+from gsparc.processes.uncertainty import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
 FALLBACK = "lmmse", "ls"  # the first that is sent

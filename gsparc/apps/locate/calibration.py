@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.search import PlaceSearch
+from gsparc.processes.uncertainty import conformal_quantile
 
 # Bounds of the search, within which `decode_trust` clips the simplex.
 TEMPERATURES, TAILS, INFLATIONS = (1e-4, 1.0), (0.5, 100.0), (0.05, 50.0)
@@ -49,13 +50,10 @@ def calibrate_level(
 ) -> Trust:
     """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit.
 
-    The level is the quantile of masses down to the truth that conformal prediction takes (V. Vovk et al.,
-    "Algorithmic Learning in a Random World" (2005)): whatever the model's errors, areas of that level hold
-    the share of places that are exchangeable with these.
+    The level is the conformal quantile of masses down to the truth: whatever the model's errors, areas of
+    that level hold the share of places that are exchangeable with these.
     """
     levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
-    # Of n exchangeable masses and one more the ceil((n + 1) share)-th: split conformal prediction.
-    rank = int(np.ceil((len(levels) + 1) * share))
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
-    level = float(np.sort(levels)[rank - 1]) if rank <= len(levels) else 1.0
+    level = min(conformal_quantile(levels, share), 1.0)
     return replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))

@@ -11,9 +11,10 @@ from gsparc.apps.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import evenly_spaced
+from gsparc.processes.uncertainty import central_interval, standard_error
 
 SQUARES, STRONGEST, DRAWS = 300, 4, 400  # drawn together: squares, stations in each, times
-ENDS = (0.05, 0.95)
+SHARE = 0.9
 
 
 def covered_between(field: FieldMap, predictor: Predictor, promise: Promise) -> tuple[float, float]:
@@ -61,16 +62,14 @@ def draw_errors(covariance: np.ndarray, seed: int = 0) -> np.ndarray:
 
 def share_between(drawn: np.ndarray, expected: float) -> tuple[float, float]:
     """Return the ends of the 90 % interval of a share (DRAWS,), about what all squares expect of it."""
-    low, high = np.quantile(drawn, ENDS) - drawn.mean() + expected
-    return max(float(low), 0.0), min(float(high), 1.0)
+    low, high = (end - float(drawn.mean()) + expected for end in central_interval(drawn, SHARE))
+    return max(low, 0.0), min(high, 1.0)
 
 
 def mean_error_variance(promise: Promise) -> float:
     """Return the squared standard error of the mean error of measured rows, over held-out blocks [dB^2]."""
-    heard = promise.evidence.subset(np.flatnonzero(promise.evidence.side == 0))
-    error, block = heard.level_db - heard.mean_db, np.unique(heard.block, return_inverse=True)[1]
-    total = np.bincount(block.reshape(-1), error - error.mean())
-    return float((total**2).sum() / len(error) ** 2 * len(total) / max(len(total) - 1, 1))
+    heard = promise.evidence.subset(promise.evidence.heard)
+    return standard_error(heard.level_db - heard.mean_db, heard.block) ** 2
 
 
 def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:

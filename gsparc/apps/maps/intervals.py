@@ -8,12 +8,14 @@ distance). Farther than any held-out row nothing is known, and nothing is said.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.stats import norm
-from sklearn.isotonic import IsotonicRegression
+from scipy.optimize import isotonic_regression
+from scipy.special import ndtr
+
+from gsparc.prediction.left_out import HeldOutLevels
+from gsparc.processes.uncertainty import conformal_level, coverage_and_width, weighted_quantiles
 
 LEAST_ROWS = 40  # held out, for any promise
 ROWS_OF_A_BIN, BLOCKS_OF_A_BIN = 150, 8
@@ -22,42 +24,7 @@ PARTS = 5  # of blocks, that are calibrated without by turns
 ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
 LEAST_SPREAD = 0.1  # of the median deviation: of a station with few rows some are next to 0
-COMPLETED = 100  # passes over censored rows
 TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
-
-
-@dataclass(frozen=True)
-class HeldOutLevels:
-    """Rows predicted by models that did not learn from the block of places around them.
-
-    Attributes:
-        level_db: (n,) measured [dB]; of censored rows, the level they lie below or above.
-        mean_db, spread_db: (n,) predicted, and its deviation [dB].
-        distance: (n,) to the nearest place that was learned from [m].
-        block: (n,) int64, rows of one were held out together.
-        station: (n,) int64; 0 where there is one.
-        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
-    """
-
-    level_db: np.ndarray
-    mean_db: np.ndarray
-    spread_db: np.ndarray
-    distance: np.ndarray
-    block: np.ndarray
-    station: np.ndarray
-    side: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.level_db)
-
-    def subset(self, rows: np.ndarray) -> HeldOutLevels:
-        """Return some of them."""
-        return HeldOutLevels(*(getattr(self, field.name)[rows] for field in fields(self)))
-
-    @property
-    def error(self) -> np.ndarray:
-        """Measured less predicted (n,), in deviations; of censored rows what bounds it."""
-        return (self.level_db - self.mean_db) / self.spread_db
 
 
 @dataclass(frozen=True)
@@ -96,15 +63,19 @@ class IntervalScales:
         half, rms = (scaled * np.interp(distance, self.distance, factor) for factor in (self.half, self.rms))
         return half, rms
 
+    def half_of(self, rows: HeldOutLevels) -> np.ndarray:
+        """Return half the interval (n,) [dB] of rows, NaN out of reach."""
+        return self.half_and_error(rows.spread_db, rows.distance, rows.station)[0]
+
     def probability_below(
         self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray
     ) -> np.ndarray:
         """Return the probability (n,) that a measurement lies below a level; NaN where it is not known."""
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
-            return norm.cdf(standard)
+            return ndtr(standard)
         # Beyond the rarest error that was seen it is rarer still, as of a normal one.
-        known, normal = np.interp(standard, self.tail, TAIL), norm.cdf(standard)
+        known, normal = np.interp(standard, self.tail, TAIL), ndtr(standard)
         chance = np.where(standard > self.tail[-1], np.maximum(known, normal), known)
         chance = np.where(standard < self.tail[0], np.minimum(known, normal), chance)
         return np.where(np.isfinite(standard), chance, np.nan)
@@ -120,15 +91,15 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     Raises:
         ValueError: too few rows.
     """
-    used = evidence.subset(np.flatnonzero(np.isfinite(evidence.error)))
-    heard = used.side == 0
+    used = evidence.subset(np.isfinite(evidence.error))
+    heard = used.heard
     if heard.sum() < LEAST_ROWS:
         fault = f"{heard.sum()} of them were held out, {LEAST_ROWS} at least are needed"
         raise ValueError(f"too few rows to test intervals ({fault}); promised=false draws without a promise")
     least = LEAST_SPREAD * float(np.median(used.spread_db))
     used = replace(used, spread_db=np.maximum(used.spread_db, least))
     blocks = len(np.unique(used.block))
-    level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
+    level = conformal_level(share, blocks)
     station = _of_stations(used, level)
     used = replace(used, spread_db=used.spread_db * station[used.station])
     count = int(np.clip(min(heard.sum() // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
@@ -137,80 +108,32 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     first = sorted({float(part[0]) for part in np.array_split(away, count)} - {float(away[0])})
     count = len(first) + 1
     which = np.searchsorted(first, used.distance, side="right")
-    bins = [used.subset(np.flatnonzero(which == number)) for number in range(count)]
-    middle = np.array([float(np.median(one.distance)) for one in bins])
-    spreads = [error_distribution(one) for one in bins]
-    half = np.array([weighted_quantiles(np.abs(error), mass, level) for error, mass in spreads])
-    rms = np.array([float(np.sqrt(mass @ error**2)) for error, mass in spreads])
-    typical = np.array([float(np.median(one.spread_db)) for one in bins])
-    weight = np.array([len(one) for one in bins], float)
-    rising, order = IsotonicRegression().fit_transform, np.arange(count)
-    half, rms = (rising(order, one * typical, sample_weight=weight) / typical for one in (half, rms))
-    tail = None
-    if heard.all():
-        tail = np.quantile(used.error / np.interp(used.distance, middle, rms), TAIL)
+    bins = [used.subset(which == number) for number in range(count)]
+    middle, typical = np.array([(np.median(one.distance), np.median(one.spread_db)) for one in bins]).T
+    scales, weight = np.array([_half_and_rms(one, level) for one in bins]).T, [len(one) for one in bins]
+    half, rms = (isotonic_regression(one * typical, weights=weight).x / typical for one in scales)
+    scaled = used.error / np.interp(used.distance, middle, rms)
+    tail = np.quantile(scaled, TAIL) if heard.all() else None
     reach = float(np.quantile(used.distance, REACH))
     return IntervalScales(share, middle, half, rms, tail, reach, station, least)
 
 
-def error_distribution(evidence: HeldOutLevels) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (m,) in deviations and their masses, those of censored rows spread over the errors they
-    allow.
-
-    The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row that allows
-    no measured error counts as the least that its own can be in size.
-    """
-    bound, side = evidence.error, evidence.side.astype(np.int64)
-    order = np.argsort(bound, kind="stable")
-    bound, side = bound[order], side[order]
-    heard = bound[side == 0]
-    low, high = heard[[0, -1]] if len(heard) else (np.inf, -np.inf)
-    alone = ((side > 0) & (bound < low)) | ((side < 0) & (bound > high))
-    error = np.where(alone, side * np.minimum(side * bound, 0.0), bound)
-    exact = np.sort(error[(side == 0) | alone])
-    below = np.searchsorted(exact, bound[(side > 0) & ~alone], side="right")
-    above = np.searchsorted(exact, bound[(side < 0) & ~alone], side="left")
-    mass = np.full(len(exact), 1 / len(exact))
-    for _ in range(COMPLETED if len(below) + len(above) else 0):
-        total = np.r_[0.0, np.cumsum(mass)]
-        share = np.zeros(len(exact) + 1)
-        np.add.at(share, below, 1 / total[below])
-        shared = np.cumsum(share[::-1])[::-1][1:]  # an error takes its part of all rows that allow it
-        share[:] = 0.0
-        np.add.at(share, above, 1 / (total[-1] - total[above]).clip(np.finfo(float).tiny))
-        mass = (1 + mass * (shared + np.cumsum(share)[:-1])) / len(bound)
-    return exact, mass
-
-
-def weighted_quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Return values, of (n,) with masses (n,), below which shares lie; of equal ones as `np.quantile`."""
-    order = np.argsort(values, kind="stable")
-    before = np.cumsum(mass[order]) - mass[order]
-    return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])
+def _half_and_rms(part: HeldOutLevels, level: float) -> tuple[float, float]:
+    """Which size a share `level` of errors is below, and their root mean square, in deviations."""
+    error, mass = part.distribution()
+    return float(weighted_quantiles(np.abs(error), mass, level)), float(np.sqrt(mass @ error**2))
 
 
 def _of_stations(used: HeldOutLevels, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
-
-    def typical(part: HeldOutLevels) -> float:
-        error, mass = error_distribution(part)
-        return float(weighted_quantiles(np.abs(error), mass, level))
-
-    whole = typical(used)
-    factors = np.ones(int(used.station.max()) + 1)
+    whole, factors = _half_and_rms(used, level)[0], np.ones(int(used.station.max()) + 1)
     for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
-        own = used.subset(np.flatnonzero(used.station == number))
-        if (own.side == 0).sum() >= LEAST_ROWS:
+        own = used.subset(used.station == number)
+        if own.heard.sum() >= LEAST_ROWS:
             blocks = len(np.unique(own.block))
-            ratio = max(typical(own), 1e-3 * whole) / whole
+            ratio = max(_half_and_rms(own, level)[0] / whole, 1e-3)
             factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
     return factors
-
-
-def interval_coverage(calibration: IntervalScales, evidence: HeldOutLevels) -> tuple[np.ndarray, np.ndarray]:
-    """Tell whether measured levels (n,) lie in their intervals; widths (n,) [dB], NaN out of reach."""
-    half = calibration.half_and_error(evidence.spread_db, evidence.distance, evidence.station)[0]
-    return np.abs(evidence.level_db - evidence.mean_db) <= half, 2 * half
 
 
 @dataclass(frozen=True)
@@ -235,23 +158,9 @@ def cross_validate(evidence: HeldOutLevels, share: float) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
     part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
-    heard = evidence.side == 0
-    inside, width = np.zeros(len(evidence), bool), np.full(len(evidence), np.nan)
+    half = np.full(len(evidence), np.nan)
     for turn in range(min(PARTS, len(blocks))):
-        rest, tried = np.flatnonzero(part != turn), np.flatnonzero((part == turn) & heard)
-        calibration = calibrate(evidence.subset(rest), share)
-        inside[tried], width[tried] = interval_coverage(calibration, evidence.subset(tried))
-    known = np.isfinite(width)
-    return Coverage(float(inside[known].mean()), float(width[known].mean()), int(known.sum()), len(blocks))
-
-
-def nearest_distances(
-    known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
-) -> np.ndarray:
-    """Return how far places (n, D) are from the nearest `known` one (m, D) of their station, else any [m]."""
-    distance = np.full(len(places), np.inf)
-    for number in np.unique(station):
-        own = known[known_station == number]
-        chosen = station == number
-        distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
-    return distance
+        tried = (part == turn) & evidence.heard
+        half[tried] = calibrate(evidence.subset(part != turn), share).half_of(evidence.subset(tried))
+    held, width = coverage_and_width(evidence.level_db - evidence.mean_db, half)
+    return Coverage(held, width, int(np.isfinite(half).sum()), len(blocks))

@@ -8,14 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from scipy.stats import norm
 
 from gsparc.apps.maps import field_map
 from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.field_map import FieldMap, best_server, server_chance, sinr
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.intervals import IntervalScales
-from gsparc.apps.maps.levels import MAPPED, joint_levels, predicted_levels
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.data import limits
@@ -27,8 +25,10 @@ from gsparc.data.schema import Site
 from gsparc.data.spacing import neighbour_distance
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
+from gsparc.prediction.levels import MAPPED, joint_levels, predicted_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import query_ends, to_local
+from gsparc.processes.uncertainty import half_width
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 MOST_DB = 1000.0  # of a level
@@ -162,8 +162,9 @@ def predict_map(
 
 def uncalibrated(share: float) -> IntervalScales:
     """Return intervals and errors as the model states them, everywhere."""
-    half = np.array([norm.ppf((1 + share) / 2)])
-    return IntervalScales(share, np.zeros(1), half, np.ones(1), None, np.inf, np.zeros(0))
+    return IntervalScales(
+        share, np.zeros(1), np.array([half_width(share)]), np.ones(1), None, np.inf, np.zeros(0)
+    )
 
 
 def choose_stations(
@@ -261,7 +262,7 @@ def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: floa
     if promise is None:
         return floor
     for row, number in enumerate(numbers):
-        own = promise.evidence.subset(np.flatnonzero(promise.evidence.station == number))
+        own = promise.evidence.subset(promise.evidence.station == number)
         if len(own):
             quiet = own.level_db[own.side > 0]
             # The least level: those of lists are of their weakest cells, far above what is heard.

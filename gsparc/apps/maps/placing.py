@@ -11,12 +11,11 @@ from scipy.spatial.distance import cdist
 from scipy.stats import t
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.covered import DRAWS, ENDS, draw_errors, draw_strongest, shadowing, share_between
+from gsparc.apps.maps.covered import DRAWS, SHARE, draw_errors, draw_strongest, shadowing, share_between
 from gsparc.apps.maps.geojson import draws_shapes
-from gsparc.apps.maps.intervals import HeldOutLevels, error_distribution
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
-from gsparc.apps.maps.promise import Promise, held_out_evidence
+from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_all
 from gsparc.data.limits import (
@@ -33,10 +32,12 @@ from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site, Stations
 from gsparc.data.splits import Fold
 from gsparc.models.powers.together.network import ONE_BAND, number_sites
+from gsparc.prediction.left_out import HeldOutLevels, leave_out
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 from gsparc.processes.few_rows import evenly_spaced
+from gsparc.processes.uncertainty import central_interval
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth
@@ -119,9 +120,10 @@ class NewStationError:
     def from_evidence(cls, parts: Sequence[HeldOutLevels]) -> NewStationError:
         """Return what rows of sites tell, each of which was left out as a whole."""
         # With silent rows: of lists those alone that were heard are the strong ones.
-        mean, square = np.array([[p @ e, p @ np.square(e)] for e, p in map(error_distribution, parts)]).T
+        errors = (one.distribution() for one in parts)
+        mean, square = np.array([[mass @ e, mass @ e**2] for e, mass in errors]).T
         stated = [np.square(one.spread_db).mean() for one in parts]
-        within = np.average(square - mean**2, weights=[(one.side == 0).sum() for one in parts])
+        within = np.average(square - mean**2, weights=[one.heard.sum() for one in parts])
         return cls(float(np.sqrt(np.mean(mean**2 * stated))), float(np.sqrt(within)), len(parts))
 
 
@@ -197,7 +199,7 @@ def place_station(
         level, spread = _new(predictor, place, cells, antenna)
         new = ~old & (level[:, None] + spread[:, None] * own + offset >= threshold_db)
         share = share_between((old | new).mean(0), before + new.mean())
-        return np.array([new.mean(), *share, *np.quantile(new.mean(0), ENDS)])
+        return np.array([new.mean(), *share, *central_interval(new.mean(0), SHARE)])
 
     scores = np.array(run_all(tried, list(candidates), "candidates"))
     if promise is None or not error.stations:
@@ -266,8 +268,8 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     for one in chosen:
         own = site == one
         inner = Fold(known[~own], known[:0], known[own])
-        parts.append(held_out_evidence(learned.unlearn(inner), data, inner, np.full(int(own.sum()), one)))
-    parts = [one for one in parts if (one.side == 0).any()]  # of silent rows alone no error is known
+        parts.append(leave_out(learned, inner, np.full(int(own.sum()), one)))
+    parts = [one for one in parts if one.heard.any()]  # of silent rows alone no error is known
     return NewStationError.from_evidence(parts) if parts else NewStationError()
 
 

@@ -1,28 +1,29 @@
-"""Evidence for a promise: the model's method fitted anew without whole blocks, and asked about them."""
+"""What a map promises: by the model's method fitted anew without whole blocks, and asked about them."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsparc.apps.maps import intervals
-from gsparc.apps.maps.intervals import HeldOutLevels, IntervalScales, calibrate
-from gsparc.apps.maps.levels import measured_levels, predicted_levels
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.intervals import Coverage, IntervalScales, calibrate, cross_validate
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_all
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings
-from gsparc.models.method import Method, predict_in_batches
-from gsparc.prediction.predictor import update_extra
+from gsparc.data.splits import SplitSettings
+from gsparc.evaluation.open_runs import check_dataset, open_files
+from gsparc.models import checkpoint
+from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
 from gsparc.prediction.refit import Learned
 
+log = logging.getLogger(__name__)
+
 KEY = "map"
-CHUNK = 512  # rows predicted at a time
 SIDES = (1.0, 2.0)  # of blocks, by turns: near and far rows alike
 SHARE_OUT, ROWS_OUT = 0.2, 100  # of the rows, held out by each fit, and by all together at least
 
@@ -76,19 +77,19 @@ class Promise:
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
         """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
-        return intervals.nearest_distances(self.known, self.station, places, np.full(len(places), station))
+        return nearest_distances(self.known, self.station, places, np.full(len(places), station))
 
     def expected_errors(self, places: np.ndarray, station: np.ndarray, spread_db: np.ndarray) -> np.ndarray:
         """Return root mean square errors (n,) [dB] of levels at local places (n, D) of stations (n,).
 
         NaN where they are refused: farther from what was learned than any error was tested.
         """
-        far = intervals.nearest_distances(self.known, self.station, places, station)
+        far = nearest_distances(self.known, self.station, places, station)
         return self.calibration().half_and_error(spread_db, far, station)[1]
 
     def store(self, path: str | Path) -> None:
         """Store in a checkpoint; the file is rewritten whole or not at all."""
-        update_extra(path, {KEY: asdict(self)})
+        checkpoint.update_extra(path, {KEY: asdict(self)})
 
 
 def read_promise(extra: Mapping[str, Any]) -> Promise | None:
@@ -127,39 +128,86 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         split = SplitSettings("blocks", side_m=wide, share=SHARE_OUT, val_fraction=0.1)
         cut = learned.cut_folds(1, settings.seed + number // len(SIDES), split)
         inner = learned.drop_unlearned(cut.folds[0])
-        less = learned.unlearn(inner, split)
         rng = np.random.default_rng([settings.seed, number])
         tried = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Blocks of two folds are never one, though they may hold the same rows.
         unit = cut.unit[tried] + number * (len(data) + 1)
-        return held_out_evidence(less, data, replace(inner, test=tried), unit)
+        return leave_out(learned, replace(inner, test=tried), unit, split)
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     parts = run_all(evidence_without, folds, "fits without blocks of places")
-    evidence = HeldOutLevels(
-        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(HeldOutLevels))
-    )
-    return Promise(evidence, places, data.stations_of(learned.rows), side)
+    return Promise(HeldOutLevels.join(parts), places, data.stations_of(learned.rows), side)
 
 
-def held_out_evidence(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> HeldOutLevels:
-    """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together."""
-    rows, known = fold.test, np.concatenate([fold.train, fold.val])
-    mean, spread = predict_rows(method, data, rows)
-    level, side = measured_levels(data, rows)
-    station = data.stations_of(rows)
-    before = data.moving[known], data.stations_of(known)
-    far = intervals.nearest_distances(*before, data.moving[rows], station)
-    evidence = HeldOutLevels(level, mean, spread, far, block, station, side)
-    return evidence.subset(np.flatnonzero(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread)))
+def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
+    """Return the evidence stored with a model, or gathered from its training data and then stored.
 
+    Args:
+        path: the model's file.
+        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of conf/map.yaml.
 
-def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the level and deviation (n,) [dB] that `method` predicts for rows (n,).
-
-    NaN where it has no answer.
+    Raises:
+        DataError: the training data are gone, or are others.
     """
-    mean, spread = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
-        mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
-    return mean, spread
+    how = PromiseSettings(**settings["promise"])
+    check_dataset(path, settings["dataset"])
+    if not settings["promised"]:
+        return None
+    stored = checkpoint.read(path)
+    promise = None if settings.get("renew") else read_promise(stored.extra)
+    # Blocks of another size are other evidence.
+    if promise is not None and how.block_m in (None, promise.block_m):
+        return promise
+    learned = reopen_training(path, settings["dataset"])
+    log.info("testing the intervals of maps: fits without blocks of places")
+    promise = gather_promise(learned, how)
+    cross_validate(promise.evidence, how.share)  # too little evidence is said before anything is stored
+    promise.store(path)
+    return promise
+
+
+def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
+    """Return a model with the very data and rows that it was trained on.
+
+    Raises:
+        DataError: they are gone, or are others.
+    """
+    try:
+        run = open_files([path], dataset)
+        learned = run.retraining()
+    except (ValueError, OSError) as error:
+        why = f"{error}; held-out blocks need the training data"
+        raise DataError(f"{why}: dataset.file=..., or promised=false") from None
+    # Rows of other data are no evidence of what this model has not seen.
+    if run.learned != 0 or run.foreign is not None:
+        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
+    return learned
+
+
+def map_notes(
+    field: FieldMap, coverage: Coverage | None, covered: tuple[float, float] | None = None
+) -> list[str]:
+    """Return what a reader of the map must know; `covered` is of `covered_between`."""
+    notes = [*field.notes]
+    figures = field.summarise()
+    if (unsure := figures["map/server_unsure"]) and len(field.stations) > 1:
+        notes.append(f"best_server: in {unsure:.1%} of squares (hatched) it is more likely another, or none")
+    if (outage := figures["map/outage"]) is not None:
+        level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
+        ends = "" if covered is None else " (90 % interval {:.1%} to {:.1%})".format(*covered)
+        left = (field.grid.inside & field.refused).sum() / max(field.grid.inside.sum(), 1)
+        only = f" ({left:.0%} of the area is refused, and not among them)" * bool(left)
+        notes.append(f"{1 - float(outage):.1%}{ends} of the predicted squares{only} with {level}")
+    if field.unit == "dB":
+        notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
+    if coverage is None:
+        own = "they are the model's own deviations, and no place is refused as too far from data"
+        return [*notes, f"intervals are not tested: {own}"]
+    tested = f"tested on {coverage.rows} heard rows of {coverage.blocks} held-out blocks"
+    held = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in their mean"
+    of_map = f"in the map {figures['map/width_db']:.1f} dB, the strongest's over predicted squares"
+    notes.append(f"{field.share:.0%} intervals, {tested}: {held}; {of_map}")
+    if figures["map/refused"]:
+        squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"
+        notes.append(f"{squares} are refused: too far from what was measured")
+    return notes

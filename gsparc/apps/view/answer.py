@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.apps.maps.levels import predicted_levels
 from gsparc.prediction.channels import Paths
+from gsparc.prediction.levels import predicted_levels
 from gsparc.prediction.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown

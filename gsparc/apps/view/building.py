@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.levels import MAPPED
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
 from gsparc.apps.view.scene import (
@@ -27,6 +26,7 @@ from gsparc.apps.view.viewed import Measured, Viewed
 from gsparc.data.schema import ENDS, LIGHT, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
+from gsparc.prediction.levels import MAPPED
 from gsparc.processes.few_rows import evenly_spaced
 
 MOST_NAMES = 5  # stations that are named at once

@@ -16,6 +16,7 @@ import torch
 from gsparc.data.conventions import CONVENTIONS, convert_conventions
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.physics.lags import SpectrumLags, pixel_exponent
+from gsparc.processes.uncertainty import is_surely_above
 
 ROWS = 16  # looked at
 UNEXPLAINED = 0.01  # share of the energy outside the lags, that measured spectra need not reach
@@ -103,7 +104,7 @@ def carrier_warnings(data: Measurements) -> list[str]:
 def _clear(gain: np.ndarray) -> bool:
     """Whether a gain (n,), NaN where unknown, is above 0 by more than chance."""
     gain = gain[np.isfinite(gain)]
-    return len(gain) > 2 and gain.mean() > max(LEAST_GAIN, CLEAR * gain.std(ddof=1) / np.sqrt(len(gain)))
+    return len(gain) > 2 and is_surely_above(gain, CLEAR, LEAST_GAIN)
 
 
 def _along_direct_path(data: Measurements) -> np.ndarray:

@@ -12,6 +12,7 @@ from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, n
 from gsparc.evaluation.paired import Lead, lead_over_runs
 from gsparc.evaluation.results import distinct_baselines, own_rows
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
+from gsparc.processes.uncertainty import central_interval
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
 DRAWS = 1000
@@ -41,8 +42,7 @@ def bootstrap_interval(
     below = np.ones_like(values) if weights is None else weights
     # 1e-300: a draw of silent rows alone has no power to divide by.
     means = values[draw].sum(1) / np.maximum(below[draw].sum(1), 1e-300)
-    tail = (1 - LEVEL) / 2
-    return float(np.quantile(means, tail)), float(np.quantile(means, 1 - tail))
+    return central_interval(means, LEVEL)
 
 
 def interval_of_figure(row: Row, figure: str) -> Interval | None:

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.apps.link import pictures
-from gsparc.prediction.risk import binomial_interval
+from gsparc.processes.uncertainty import binomial_interval
 
 
 def test_points_without_any_failed_block_were_drawn_as_rates(tmp_path, monkeypatch):

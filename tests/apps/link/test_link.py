@@ -21,7 +21,7 @@ from gsparc.apps.link.study import beam_facts, beam_gain, beam_loss_db, find_cro
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.prediction.channels import centred_grid, interpolate_tones, resource_grid
-from gsparc.prediction.risk import binomial_interval
+from gsparc.processes.uncertainty import binomial_interval
 
 needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsparc.apps.maps.intervals import (
-    LEAST_ROWS,
-    HeldOutLevels,
-    calibrate,
-    cross_validate,
-    interval_coverage,
-    nearest_distances,
-)
+from gsparc.apps.maps.intervals import LEAST_ROWS, calibrate, cross_validate
+from gsparc.prediction.left_out import HeldOutLevels
+from gsparc.processes.uncertainty import coverage_and_width
+
+
+def held(scales, rows):
+    """Share of rows in their intervals, of those in reach."""
+    return coverage_and_width(rows.level_db - rows.mean_db, scales.half_of(rows))[0]
 
 
 def evidence(count=3000, seed=0, heavy=False, stations=1):
@@ -34,8 +34,7 @@ def evidence(count=3000, seed=0, heavy=False, stations=1):
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.9])
 def test_as_many_lie_inside_as_promised(heavy, share):
     learned, fresh = evidence(heavy=heavy), evidence(seed=1, heavy=heavy)
-    inside, width = interval_coverage(calibrate(learned, share), fresh)
-    assert abs(inside[np.isfinite(width)].mean() - share) < 0.03
+    assert abs(held(calibrate(learned, share), fresh) - share) < 0.03
     assert abs(cross_validate(learned, share).share - share) < 0.03
 
 
@@ -56,8 +55,7 @@ def test_the_model_without_any_sense_of_distance_still_gets_wider():
 
 def test_each_station_holds_its_own_share():
     known, fresh = evidence(stations=3), evidence(seed=1, stations=3)
-    inside, _ = interval_coverage(calibrate(known), fresh)
-    shares = [inside[fresh.station == t].mean() for t in range(3)]
+    shares = [held(calibrate(known), fresh.subset(fresh.station == t)) for t in range(3)]
     assert max(shares) - min(shares) < 0.08
     assert calibrate(known).station[2] > 1.5 * calibrate(known).station[0]
 
@@ -81,8 +79,7 @@ def test_silent_rows_are_as_wide_as_what_they_hide(side):
     censored = HeldOutLevels(**{**vars(known), **parts})
     found, whole = calibrate(censored), calibrate(known)
     assert found.tail is None and found.half.mean() == pytest.approx(whole.half.mean(), rel=0.1)
-    inside, width = interval_coverage(found, fresh)
-    assert abs(inside[np.isfinite(width)].mean() - 0.9) < 0.03
+    assert abs(held(found, fresh) - 0.9) < 0.03
     said = cross_validate(censored, 0.9)
     assert abs(said.share - 0.9) < 0.04 and said.rows <= (censored.side == 0).sum()
 
@@ -94,12 +91,6 @@ def test_one_station_without_a_deviation_made_all_errors_thousands_of_decibels()
     spread[:20] = 1e-6
     found, whole = calibrate(replace(known, spread_db=spread)), calibrate(known)
     assert found.rms.max() < 3 * whole.rms.max()
-
-
-def test_distance_is_to_rows_of_the_same_station():
-    known, station = np.array([[0.0, 0, 0], [10, 0, 0]]), np.array([0, 1])
-    places = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert nearest_distances(known, station, places, np.array([0, 1, 2])).tolist() == [1.0, 9.0, 1.0]
 
 
 def test_too_little_evidence_promises_nothing():

@@ -21,17 +21,16 @@ from gsparc.apps.maps.field_map import (
     server_chance,
     sinr,
 )
-from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.making import _hearing_floors, choose_stations, predict_map
 from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
-from gsparc.apps.maps.promise import Promise
-from gsparc.apps.maps.promised import map_notes
+from gsparc.apps.maps.promise import Promise, map_notes
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.models.registry import method_class
+from gsparc.prediction.left_out import HeldOutLevels
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 

@@ -12,7 +12,6 @@ from towns import MASTS, town_file, town_model
 import gsparc
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.geojson import draws_shapes
-from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import (
     NewAntenna,
@@ -22,13 +21,14 @@ from gsparc.apps.maps.placing import (
     new_station_error,
     place_station,
 )
-from gsparc.apps.maps.promise import Promise, held_out_evidence
+from gsparc.apps.maps.promise import Promise
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.left_out import HeldOutLevels, held_out_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
@@ -48,7 +48,7 @@ def together(tmp_path_factory):
 def promise(together):
     method, data, _ = together
     rows, out = np.arange(len(data)), data.place % 2 == 1
-    evidence = held_out_evidence(method, data, Fold(rows[~out], rows[:0], rows[out]), rows[out])
+    evidence = held_out_levels(method, data, Fold(rows[~out], rows[:0], rows[out]), rows[out])
     return Promise(evidence, data.moving, data.station.astype(np.int64), 10.0)
 
 
@@ -106,16 +106,15 @@ def test_sectors_left_out_one_by_one_were_told_by_others_of_their_site(together,
     data = replace(data, site=replace(data.site, stations=four), station=rows % 4)
     left, rng = [], np.random.default_rng(0)
 
-    def evidence(method, data, fold, block):
+    def evidence(learned, fold, block):
         left.append(set(data.station[fold.test].tolist()))
         error, nothing = rng.normal(0, 6, 2000), np.zeros(2000)
         heard = error > 3  # the others are below a level that a list ends with
         side, level = (~heard).astype(np.int8), np.where(heard, error, 3.0)
         return HeldOutLevels(level, nothing, nothing + 6, nothing, nothing, nothing, side)
 
-    monkeypatch.setattr("gsparc.apps.maps.placing.held_out_evidence", evidence)
+    monkeypatch.setattr("gsparc.apps.maps.placing.leave_out", evidence)
     monkeypatch.setattr("gsparc.apps.maps.placing.LEAST_STATIONS", 2)
-    monkeypatch.setattr(Learned, "unlearn", lambda self, inner: method)
     fold = Fold(rows, rows[:0], rows[:1])
     found = new_station_error(Learned(method, method_class("distance_law"), data, fold, FitContext()))
     assert sorted(map(sorted, left)) == [[0, 1], [2, 3]] and found.stations == 2
@@ -136,7 +135,7 @@ def test_refused_squares_counted_as_not_served(together):
     method, data, path = together
     rows, west = np.arange(len(data)), data.station == 0
     out = data.place % 2 == 1
-    evidence = held_out_evidence(method, data, Fold(rows[~out], rows[:0], rows[out]), rows[out])
+    evidence = held_out_levels(method, data, Fold(rows[~out], rows[:0], rows[out]), rows[out])
     promise = Promise(evidence, data.moving[west], data.station[west].astype(np.int64), 10.0)
     how = {"threshold_db": -75.0, "promise": promise}
     found = place_station(gsparc.load(path), [-80, 0, 80, 60], count=9, **how)

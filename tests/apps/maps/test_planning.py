@@ -9,13 +9,13 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, weigh_goal
-from gsparc.apps.maps.intervals import HeldOutLevels
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.data.errors import DataError
 from gsparc.models.method import JointLevels
 from gsparc.prediction.jointly import JointMixin
+from gsparc.prediction.left_out import HeldOutLevels
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,11 @@ from scipy.linalg import cholesky
 from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.intervals import cross_validate
-from gsparc.apps.maps.promise import PromiseSettings, gather_promise, held_out_evidence, predict_rows
+from gsparc.apps.maps.promise import PromiseSettings, gather_promise
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
+from gsparc.prediction.left_out import held_out_levels
 from gsparc.prediction.refit import Learned
 from gsparc.training.context import FitContext
 
@@ -40,10 +41,9 @@ def test_intervals_of_thirty_towns_hold_a_measurement_as_often_as_promised_and_t
         method.fit(data, fold, context)
         learned = Learned(method, GaussianProcess, data, fold, context)
         promise = gather_promise(learned, PromiseSettings(seed=seed))
-        mean, spread = predict_rows(method, data, fold.test)
-        far = promise.distance(data.moving[fold.test], 0)
-        half, _ = promise.calibration(SHARE).half_and_error(spread, far, np.zeros(len(far), int))
-        missed = (np.abs(one[fold.test] - mean) for one in (level, field))
+        tried = held_out_levels(method, data, fold, fold.test)
+        far, half = tried.distance, promise.calibration(SHARE).half_of(tried)
+        missed = (np.abs(one[fold.test] - tried.mean_db) for one in (level, field))
         found = np.column_stack([far, *(miss <= half for miss in missed), np.full(len(far), seed % 2)])
         parts.append(found[np.isfinite(half)])
     far, measured, true, noisy = np.concatenate(parts).T
@@ -73,4 +73,4 @@ def test_a_fold_without_test_rows_ended_in_a_reshape():
     every, method = np.arange(ROWS), GaussianProcess()
     fold = Fold(every, every[:0], every[:0])
     method.fit(data, fold, FitContext())
-    assert len(held_out_evidence(method, data, fold, every[:0])) == 0
+    assert len(held_out_levels(method, data, fold, every[:0])) == 0

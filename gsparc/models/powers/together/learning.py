@@ -16,7 +16,6 @@ import torch
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.settings import EVIDENCE_LOOKS
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
-from gsparc.models.stack import mean_and_error
 from gsparc.processes.fit_kernel import fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import Kernel, distances, median_distance
 from gsparc.processes.places import extra_columns, moving_end
@@ -25,6 +24,7 @@ from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
 from gsparc.processes.trend import Trend
+from gsparc.processes.uncertainty import mean_and_error
 
 START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
 LEAST_DB2 = 1e-6  # of a station's process: levels that are equal to the last digit leave none

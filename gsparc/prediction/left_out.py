@@ -1,0 +1,164 @@
+"""Rows that a method did not learn from, and what it says of them: what tells how sure it may be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings
+from gsparc.models.method import Method, Prediction, predict_in_batches
+from gsparc.prediction.confidence import KINDS, Trusted
+from gsparc.prediction.levels import measured_levels, predicted_levels
+from gsparc.prediction.refit import Learned
+from gsparc.processes.uncertainty import censored_distribution
+
+CHUNK = 512  # rows whose levels are predicted at a time
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Positions a method did not learn from.
+
+    Attributes:
+        row: (n,) rows of the dataset.
+        position: (n, 3) [m].
+        error: (n,) |e|^2 / |h|^2; for powers, of the linear power.
+        scores: by kind, (n,) each, larger is surer.
+    """
+
+    row: np.ndarray
+    position: np.ndarray
+    error: np.ndarray
+    scores: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    @staticmethod
+    def join(parts: Sequence[Evidence]) -> Evidence:
+        """Join folds, a row of several of them by the first; scores that not every part has are dropped."""
+        first = np.sort(np.unique(np.concatenate([part.row for part in parts]), return_index=True)[1])
+        kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
+        scores = {kind: np.concatenate([part.scores[kind] for part in parts])[first] for kind in kinds}
+        facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
+        row, position, error = (np.concatenate(values)[first] for values in facts)
+        return Evidence(row, position, error, scores)
+
+
+def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Prediction:
+    """Return what a method says of rows (n,), in their order; see `predict_in_batches`."""
+    order, _, said = zip(*predict_in_batches(method, data, rows), strict=True)
+    return Prediction.joined(said, torch.from_numpy(np.argsort(np.concatenate(order))))
+
+
+def gather_evidence(method: Method, data: Measurements, rows: np.ndarray, rivals: Trusted) -> Evidence:
+    """Return the errors of what `method` predicts of rows (n,), its confidence and those of rivals."""
+    return judge_answers(
+        predict_rows(method, data, rows), data.targets(rows), rows, data.moving[rows], rivals
+    )
+
+
+def judge_answers(
+    said: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, rivals: Trusted
+) -> Evidence:
+    """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m], and their scores.
+
+    A method that does not state a kind of score has none of it.
+    """
+    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
+    # A silent row has no relative error: any miss of it counts as huge.
+    error = (miss / power.clamp_min(1e-30)).double().numpy()
+    every = {kind: rivals.score(kind, said, places) for kind in KINDS}
+    # Scores with a NaN rank nothing.
+    scores = {kind: own for kind, own in every.items() if own is not None and not np.isnan(own).any()}
+    return Evidence(rows, places, error, scores)
+
+
+@dataclass(frozen=True)
+class HeldOutLevels:
+    """Rows predicted by models that did not learn from the block of places around them.
+
+    Attributes:
+        level_db: (n,) measured [dB]; of censored rows, the level they lie below or above.
+        mean_db, spread_db: (n,) predicted, and its deviation [dB].
+        distance: (n,) to the nearest place that was learned from [m].
+        block: (n,) int64, rows of one were held out together.
+        station: (n,) int64; 0 where there is one.
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
+    """
+
+    level_db: np.ndarray
+    mean_db: np.ndarray
+    spread_db: np.ndarray
+    distance: np.ndarray
+    block: np.ndarray
+    station: np.ndarray
+    side: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.level_db)
+
+    def subset(self, rows: np.ndarray) -> HeldOutLevels:
+        """Return some of them, by their numbers or a mask (n,)."""
+        return HeldOutLevels(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @staticmethod
+    def join(parts: Sequence[HeldOutLevels]) -> HeldOutLevels:
+        """Return the rows of all."""
+        names = [field.name for field in fields(HeldOutLevels)]
+        return HeldOutLevels(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
+
+    @property
+    def heard(self) -> np.ndarray:
+        """Whether a level was measured (n,)."""
+        return self.side == 0
+
+    @property
+    def error(self) -> np.ndarray:
+        """Measured less predicted (n,), in deviations; of censored rows what bounds it."""
+        return (self.level_db - self.mean_db) / self.spread_db
+
+    def distribution(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return errors (m,) in deviations and their masses, see `censored_distribution`."""
+        return censored_distribution(self.error, self.side)
+
+
+def leave_out(
+    learned: Learned, fold: Fold, block: np.ndarray, split: SplitSettings | None = None
+) -> HeldOutLevels:
+    """Return the test rows of a fold cut by `split` as its other rows predict them, see `held_out_levels`."""
+    return held_out_levels(learned.unlearn(fold, split), learned.data, fold, block)
+
+
+def held_out_levels(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> HeldOutLevels:
+    """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together.
+
+    Without rows that have no level, or of which the method predicts none.
+    """
+    rows, known = fold.test, np.concatenate([fold.train, fold.val])
+    mean, spread = np.full((2, len(rows)), np.nan)
+    for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
+        mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
+    level, side = measured_levels(data, rows)
+    station = data.stations_of(rows)
+    far = nearest_distances(data.moving[known], data.stations_of(known), data.moving[rows], station)
+    every = HeldOutLevels(level, mean, spread, far, block, station, side)
+    return every.subset(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread))
+
+
+def nearest_distances(
+    known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
+) -> np.ndarray:
+    """Return how far places (n, D) are from the nearest `known` one (m, D) of their station, else any [m]."""
+    distance = np.full(len(places), np.inf)
+    for number in np.unique(station):
+        own = known[known_station == number]
+        chosen = station == number
+        distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
+    return distance
