@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 import torch
@@ -75,17 +77,20 @@ def _draw_others(method: Method, lists: StrongestLists, asked: Measurements, min
         asked, mine: n rows, and their stations (n,).
     """
     places, which = np.unique(asked.moving, axis=0, return_inverse=True)
-    level = _levels_near(method, lists, asked.site, places)
-    count = level.shape[2]
-    rng, result, kept = np.random.default_rng(0), np.empty((len(asked), DRAWS)), -lists.length
-    for place in range(len(places)):
+    result, kept = np.empty((len(asked), DRAWS)), -lists.length
+    for place, drawn in enumerate(_draw_levels(_levels_near(method, lists, asked.site, places))):
         rows = which.reshape(-1) == place
-        mean, spread = level[:, place, :, None]
-        drawn = mean + spread.clip(0) * rng.normal(size=(count, DRAWS))
         beyond, last = np.partition(drawn, (kept - 1, kept), axis=0)[[kept - 1, kept]]
         # One that has a place itself leaves the others one less.
         result[rows] = np.where(drawn[mine[rows]] >= last, beyond, last)
     return result
+
+
+def _draw_levels(level: np.ndarray) -> Iterator[np.ndarray]:
+    """Draws (T, DRAWS) [dB] at each of M places, of levels with their deviations (2, M, T)."""
+    rng = np.random.default_rng(0)
+    for mean, spread in level.swapaxes(0, 1)[..., None]:
+        yield mean + spread.clip(0) * rng.normal(size=(len(mean), DRAWS))
 
 
 def _levels_near(method: Method, lists: StrongestLists, site: Site, places: np.ndarray) -> np.ndarray:
@@ -127,11 +132,9 @@ def never_listed(
     if not len(absent):
         return table
     moment, first = np.unique(asked.place, return_index=True)
-    mean, spread = _levels_near(method, lists, asked.site, asked.moving[first])
-    rng, floor = np.random.default_rng(0), np.nanmin(lists.level)
-    parts = [table]
-    for here, *level in zip(moment, mean, spread, strict=True):
-        drawn = level[0][:, None] + level[1].clip(0)[:, None] * rng.normal(size=(len(level[0]), DRAWS))
+    draws = _draw_levels(_levels_near(method, lists, asked.site, asked.moving[first]))
+    parts, floor = [table], np.nanmin(lists.level)
+    for here, drawn in zip(moment, draws, strict=True):
         last = np.partition(drawn, -lists.length, axis=0)[-lists.length]
         share = (drawn[absent] >= np.maximum(last, floor)).mean(1)
         parts.append(pd.DataFrame({"station": absent, "moment": here, "share": share}))

@@ -45,7 +45,7 @@ def draw_strongest(
     station = station[rank, at]
     places, spread = field.grid.places(square)[at], error[station, square[at]]
     # The mean of all errors is known no better than the blocks tell it: the correlations hold none of it.
-    block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error_variance(promise))
+    block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error(promise) ** 2)
     alike = _pair_correlation(predictor, places, field.number[station], block_m)
     drawn = few[station, at][:, None] + draw_errors(np.outer(spread, spread) * alike + common)
     best = np.full((len(square), DRAWS), -np.inf)
@@ -66,10 +66,10 @@ def share_between(drawn: np.ndarray, expected: float) -> tuple[float, float]:
     return max(low, 0.0), min(high, 1.0)
 
 
-def mean_error_variance(promise: Promise) -> float:
-    """Return the squared standard error of the mean error of measured rows, over held-out blocks [dB^2]."""
+def mean_error(promise: Promise) -> float:
+    """Return the standard error of the mean error of measured rows, over held-out blocks [dB]."""
     heard = promise.evidence.subset(promise.evidence.heard)
-    return standard_error(heard.level_db - heard.mean_db, heard.block) ** 2
+    return standard_error(heard.level_db - heard.mean_db, heard.block)
 
 
 def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:
