@@ -36,7 +36,7 @@ class Snapshots:
     @classmethod
     def from_rows(cls, data: Measurements, rows: np.ndarray) -> Snapshots:
         """Arrange rows (S,): the i-th visit of each station to a place is one moment."""
-        station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+        station = data.station_numbers(rows)
         moment = number_moments(data, rows)
         _, first = np.unique(moment, return_index=True)
         target = np.asarray(data.target[rows])

@@ -357,6 +357,11 @@ class Measurements:
         """Return `censored` of rows (n,), (n,) int8."""
         return np.zeros(len(rows), np.int8) if self.censored is None else self.censored[rows].astype(np.int8)
 
+    def station_numbers(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Return which station rows (n,), or all, are of, (n,) int64; 0 where there is one."""
+        number = np.zeros(len(self), np.int64) if self.station is None else self.station
+        return number[rows].astype(np.int64, copy=False)
+
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Return targets of the given rows as float32 or complex64, in stored units."""
         chosen = torch.from_numpy(np.ascontiguousarray(self.target[np.asarray(index)]))

@@ -106,22 +106,21 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
         near = np.flatnonzero(gap[t] <= SAME_PLACE_M).tolist()
         if alike or len(near) == 1:
             number[t] = (alike or near)[0]
-    assert data.station is not None
-    known = number[data.station] >= 0
+    known = number[data.station_numbers()] >= 0
     if not known.all():
         told = _explain_unknown(data.site.name, ours, theirs, number < 0)
         if whole or not known.any():
             raise ValueError(told + "; dataset.stations=[NAME,...] keeps the others" * bool(known.any()))
         log.warning("%s: %d of %d rows are left out", told, (~known).sum(), len(known))
         data = data.subset(np.flatnonzero(known))
-        assert data.station is not None
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
     end = "tx" if facts.static_end == "tx" else "rx_position"
-    there = (theirs.position - shift)[number[data.station]]
+    station = number[data.station_numbers()]
+    there = (theirs.position - shift)[station]
     # Of a place that one of both does not know, all is as the model learned it.
     both = np.isfinite(there + getattr(data, end))
     still = np.where(both, getattr(data, end), there)
-    return replace(data, station=number[data.station], site=facts, **{end: still})
+    return replace(data, station=station, site=facts, **{end: still})
 
 
 def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.ndarray) -> str:

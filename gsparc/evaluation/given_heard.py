@@ -43,7 +43,7 @@ def levels_given_heard(
     """
     level = levels_db(learned, np.arange(len(learned)))
     silent = learned.censored_side(np.arange(len(learned))) > 0
-    mine, own = (np.zeros(len(d), int) if d.station is None else d.station for d in (asked, learned))
+    mine, own = asked.station_numbers(), learned.station_numbers()
     told = method.uses_censored and (spread_db > 0).any()
     others = _draw_others(method, lists, asked, mine) if told and lists is not None else None
     chance, mean, spread = np.full(len(asked), np.nan), mean_db.copy(), spread_db.copy()
@@ -126,8 +126,8 @@ def never_listed(
     table = pd.DataFrame({"station": [], "moment": [], "share": []}, dtype=float)
     if not method.uses_censored:
         return table
-    assert data.station is not None and asked.place is not None
-    heard = data.station[data.censored_side(np.arange(len(data))) <= 0]
+    assert asked.place is not None
+    heard = data.station_numbers(data.censored_side(np.arange(len(data))) <= 0)
     absent = np.setdiff1d(np.flatnonzero(np.isfinite(lists.level).any(0)), heard)
     if not len(absent):
         return table
@@ -147,7 +147,7 @@ def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -
     Every station that was listed nearby is asked about, listed here or not: what a list of the strongest
     leaves out is weaker. Of k stations tied as predicted strongest a right one counts 1 / k.
     """
-    assert asked.station is not None and asked.place is not None
+    assert asked.place is not None
     _, first, which = np.unique(asked.place, return_index=True, return_inverse=True)
     which = which.reshape(-1)
     if method.name == "nearest":  # the nearest moment as it was, not each station's own
@@ -158,7 +158,7 @@ def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -
         level = _levels_near(method, lists, asked.site, asked.moving[first])[0]
     measured = np.full(level.shape, -np.inf)
     heard = np.flatnonzero(asked.censored_side(np.arange(len(asked))) <= 0)
-    np.maximum.at(measured, (which[heard], asked.station[heard]), levels_db(asked, heard))
+    np.maximum.at(measured, (which[heard], asked.station_numbers(heard)), levels_db(asked, heard))
     best, told = (one == one.max(1, keepdims=True) for one in (measured, level))
     told &= np.isfinite(level)
     share = (best & told).sum(1) / np.maximum(told.sum(1), 1)
@@ -171,9 +171,9 @@ def levels_of_nearest_moment(learned: Measurements, asked: Measurements) -> np.n
     The strongest of the nearest moment, as anyone would tell a best server; levels of each station's own
     nearest moments tell it worse (simulated lists of three .30 to .36 for .48 to .76 of the places).
     """
-    assert learned.station is not None and asked.station is not None
+    mine, own = asked.station_numbers(), learned.station_numbers()
     heard = np.flatnonzero(learned.censored_side(np.arange(len(learned))) <= 0)
     places, which = np.unique(learned.moving[heard], axis=0, return_inverse=True)
-    table = np.zeros((len(places), max(learned.station.max(), asked.station.max()) + 1))
-    np.maximum.at(table, (which.reshape(-1), learned.station[heard]), learned.target[heard, 0])
-    return table[cKDTree(places).query(asked.moving)[1], asked.station]
+    table = np.zeros((len(places), max(own.max(), mine.max()) + 1))
+    np.maximum.at(table, (which.reshape(-1), own[heard]), learned.target[heard, 0])
+    return table[cKDTree(places).query(asked.moving)[1], mine]

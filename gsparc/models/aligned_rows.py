@@ -108,7 +108,7 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
 
 def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
     """Return the first of `rows` at each place and station, and measurements where these are the means."""
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    station = data.station_numbers(rows)
     packets, seen = np.c_[data.moving[rows], station], None if data.mask is None else data.mask[rows]
     first, mean, count = mean_at_places(packets, data.target[rows], seen)
     if len(first) == len(rows):
@@ -126,7 +126,7 @@ def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, M
 
 def _group_snapshots(data: Measurements, rows: np.ndarray) -> list[Snapshots]:
     """Rows (n,) of all stations where most are heard at each moment, else those of each station alone."""
-    numbers = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    numbers = data.station_numbers(rows)
     stations = np.unique(numbers)
     if len(rows) >= SHARED * len(stations) * (number_moments(data, rows).max() + 1):
         return [Snapshots.from_rows(data, rows)]

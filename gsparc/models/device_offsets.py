@@ -32,7 +32,7 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
         return data
     names, rows = data.site.device_names, fold.train[data.censored_side(fold.train) == 0]
     level = 10 * np.log10(np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny))
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    station = data.station_numbers(rows)
     most = int(np.clip(MOST_ROWS / len(np.unique(station)), LEAST_OF_STATION, MOST_OF_STATION))
     order = np.random.default_rng(0).permutation(len(rows))
     some = np.sort(np.concatenate([order[station[order] == one][:most] for one in np.unique(station)]))

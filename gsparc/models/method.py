@@ -272,7 +272,7 @@ def predict_in_batches(
     One station after the other: each may have a model of its own, whose matrices are read for every batch.
     Where rows have factors of their own (`Site.freedom`), answers are turned to what was measured.
     """
-    order = np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
+    order = np.argsort(data.station_numbers(rows), kind="stable")
 
     def predict_batches() -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
         for start in range(0, len(rows), size):

@@ -226,8 +226,7 @@ class PerStation(Method):
 
     def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""
-        assert data.station is not None
-        rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+        rows = np.flatnonzero((number == UNHEARD) | (data.station_numbers() == number))
         return rows, data.subset(rows, self._site_of_copy(data.site, number))
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:

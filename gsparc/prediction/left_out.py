@@ -146,8 +146,8 @@ def held_out_levels(method: Method, data: Measurements, fold: Fold, block: np.nd
     for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
         mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
     level, side = measured_levels(data, rows)
-    station = station_numbers(data, rows)
-    far = nearest_distances(data.moving[known], station_numbers(data, known), data.moving[rows], station)
+    before, station = data.station_numbers(known), data.station_numbers(rows)
+    far = nearest_distances(data.moving[known], before, data.moving[rows], station)
     every = HeldOutLevels(level, mean, spread, far, block, station, side)
     return every.subset(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread))
 
@@ -162,8 +162,3 @@ def nearest_distances(
         chosen = station == number
         distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
     return distance
-
-
-def station_numbers(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Return numbers (n,) int64; 0 where there is one."""
-    return np.zeros(len(rows), np.int64) if data.station is None else data.station[rows].astype(np.int64)

@@ -69,5 +69,4 @@ class Learned:
             return fold
         # A station that was fitted on all rows may have too few of them in a fold.
         learnable = stations_of_fold(self.method.factory, self.data, fold).learnable
-        assert self.data.station is not None
-        return replace(fold, test=fold.test[learnable[self.data.station[fold.test]]])
+        return replace(fold, test=fold.test[learnable[self.data.station_numbers(fold.test)]])

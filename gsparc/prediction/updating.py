@@ -322,7 +322,7 @@ def level_rows(data: Measurements, site: Site) -> LevelRows:
     if data.mask is not None:
         rows = rows[data.mask[rows].reshape(len(rows)) | (data.censored_side(rows) != 0)]
     side = data.censored_side(rows)
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    station = data.station_numbers(rows)
     level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
     return LevelRows(data.moving[rows], level, station, side)
 

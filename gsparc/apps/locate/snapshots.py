@@ -52,7 +52,7 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
     site = data.site
     rows = np.sort(np.asarray(rows))
     count = 1 if site.stations is None else len(site.stations)
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    station = data.station_numbers(rows)
     moment = np.arange(len(rows)) if count == 1 else number_moments(data, rows)
     _, first, which = np.unique(moment, return_index=True, return_inverse=True)
     measured = flatten_targets(data.targets(rows))

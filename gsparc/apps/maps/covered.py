@@ -45,7 +45,10 @@ def draw_strongest(
     station = station[rank, at]
     places, spread = field.grid.places(square)[at], error[station, square[at]]
     # The mean of all errors is known no better than the blocks tell it: the correlations hold none of it.
-    block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error(promise) ** 2)
+    block_m, common = 1.0, 0.0
+    if promise is not None:
+        heard = promise.evidence.subset(promise.evidence.heard)
+        block_m, common = promise.block_m, standard_error(heard.level_db - heard.mean_db, heard.block) ** 2
     alike = _pair_correlation(predictor, places, field.number[station], block_m)
     drawn = few[station, at][:, None] + draw_errors(np.outer(spread, spread) * alike + common)
     best = np.full((len(square), DRAWS), -np.inf)
@@ -64,12 +67,6 @@ def share_between(drawn: np.ndarray, expected: float) -> tuple[float, float]:
     """Return the ends of the 90 % interval of a share (DRAWS,), about what all squares expect of it."""
     low, high = (end - float(drawn.mean()) + expected for end in central_interval(drawn, SHARE))
     return max(low, 0.0), min(high, 1.0)
-
-
-def mean_error(promise: Promise) -> float:
-    """Return the standard error of the mean error of measured rows, over held-out blocks [dB]."""
-    heard = promise.evidence.subset(promise.evidence.heard)
-    return standard_error(heard.level_db - heard.mean_db, heard.block)
 
 
 def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:

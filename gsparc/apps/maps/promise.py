@@ -18,7 +18,7 @@ from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.splits import SplitSettings
 from gsparc.evaluation.open_runs import check_dataset, open_files
 from gsparc.models import checkpoint
-from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances, station_numbers
+from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
 from gsparc.prediction.refit import Learned
 
 log = logging.getLogger(__name__)
@@ -136,7 +136,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     parts = run_all(evidence_without, folds, "fits without blocks of places")
-    return Promise(HeldOutLevels.join(parts), places, station_numbers(data, learned.rows), side)
+    return Promise(HeldOutLevels.join(parts), places, data.station_numbers(learned.rows), side)
 
 
 def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:

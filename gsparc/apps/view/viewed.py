@@ -15,7 +15,6 @@ from gsparc.data.schema import End, Measurements, Site
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.open_runs import open_files
 from gsparc.prediction import levels
-from gsparc.prediction.left_out import station_numbers
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 
@@ -96,7 +95,7 @@ class Viewed:
             return None
         data, stations = self.data, self.site.stations
         number = 0 if station is None or stations is None else stations.name.index(station)
-        rows = np.flatnonzero(station_numbers(data, np.arange(len(data))) == number)
+        rows = np.flatnonzero(self.data.station_numbers() == number)
         places = data.moving[rows][:, -3:] + data.site.origin
         if data.site.kind == "spectrum":
             chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))

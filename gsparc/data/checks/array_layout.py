@@ -30,7 +30,7 @@ NEAR = 0.9  # cosine of an angle to the nearest pixel: of places a little below 
 def layout_warnings(data: Measurements) -> list[str]:
     """Name the grid or plane that spectra seem to be of instead of the declared ones."""
     site = data.site
-    first = np.arange(len(data)) if data.station is None else np.flatnonzero(data.station == 0)
+    first = np.flatnonzero(data.station_numbers() == 0)
     if site.kind != "spectrum" or site.grid is None or site.array is None or not len(first):
         return []
     carrier = site.carrier_hz if data.carrier_hz is None else float(data.carrier_hz[first[0]])

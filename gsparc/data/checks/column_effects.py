@@ -78,9 +78,8 @@ class LevelsAtPlaces:
     def of(data: Measurements) -> tuple[LevelsAtPlaces, np.ndarray]:
         """Return those of powers that were measured, and (n,) their rows."""
         rows = np.flatnonzero((data.censored_side(np.arange(len(data))) == 0) & (data.target[:, 0] > 0))
-        station = np.zeros(len(data), np.int64) if data.station is None else data.station
         level = 10 * np.log10(data.target[rows, 0].astype(np.float64))
-        return LevelsAtPlaces(data.moving[rows], station[rows], level), rows
+        return LevelsAtPlaces(data.moving[rows], data.station_numbers(rows), level), rows
 
     def take(self, rows: np.ndarray) -> LevelsAtPlaces:
         """Return some of them."""

@@ -86,7 +86,7 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
     stations = data.site.stations
     run = np.zeros(len(data), np.int64) if data.run is None else data.run
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    station = data.station_numbers()
     single = data.site.kind == "csi" and data.target.shape[1] == 1
     if stations is None or data.place is None or len(stations) < COHERENT or not single:
         return data, run * (int(station.max()) + 1) + station

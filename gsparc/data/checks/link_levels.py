@@ -56,7 +56,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     if site.kind != "rssi" or site.static_end is None:
         return None
     stations = site.stations
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    station = data.station_numbers()
     place = np.arange(len(data)) if data.place is None else data.place
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
     count = 1 if stations is None else len(stations)

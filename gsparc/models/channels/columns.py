@@ -178,7 +178,7 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
 
 def _order_in_station(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station, as they were taken."""
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    station = data.station_numbers()
     taken = np.arange(len(data)) if data.sequence is None else data.sequence
     order = np.empty(len(data))
     for number in np.unique(station):

@@ -50,8 +50,8 @@ class LearnsTogether(MethodFactory):
             return "together", "channels at all stations share waves and the frame of places"
         if find_sectors(data) is not None:
             return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
-        assert data.station is not None
-        if not np.isin(data.station[fold.test], data.station[fold.train]).any() and len(fold.test):
+        tested, heard = data.station_numbers(fold.test), data.station_numbers(fold.train)
+        if not np.isin(tested, heard).any() and len(tested):
             return (
                 "together",
                 "no station of the test rows was heard: what stations share answers for them",

@@ -114,8 +114,7 @@ def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, 
 
 def rows_of_stations(data: Measurements, rows: np.ndarray, places: np.ndarray) -> StationRows:
     """Return rows (n,) of stations that stand at `places` (T, 3) [m]."""
-    assert data.station is not None
-    station = data.station[rows].astype(np.int64)
+    station = data.station_numbers(rows)
     seen = power_rows(data, rows)
     ends = np.concatenate([seen.places.astype(np.float64), places[station]], 1)
     return StationRows(ends, seen.decibels, seen.side, station, np.asarray(rows, np.int64))
