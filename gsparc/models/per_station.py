@@ -154,7 +154,7 @@ class PerStation(Method):
             rows, part = self._rows_and_measurements(data, number)
             # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            before = watch.seconds
+            before, cpu_before = watch.seconds, watch.cpu_seconds
             try:
                 copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
             except KeyboardInterrupt:
@@ -166,7 +166,8 @@ class PerStation(Method):
             if resumable and len(numbers) > 1:
                 extra = fitting.run_extra(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
-            watch.charge(max(report.seconds - (watch.seconds - before), 0.0))  # by the interrupted run
+            more = report.seconds - (watch.seconds - before), report.cpu_s - (watch.cpu_seconds - cpu_before)
+            watch.charge(*(max(spent, 0.0) for spent in more))  # by the interrupted run
             return copy, report
 
         fits = run_all(fit_station, range(len(numbers)), f"stations of {self.name}")
@@ -182,7 +183,7 @@ class PerStation(Method):
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
         cost = sum((one.cost for one in reports), Cost())
-        return FitReport(watch.seconds, tuple(notes), cost)
+        return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 
     def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.
