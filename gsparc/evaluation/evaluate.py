@@ -164,7 +164,7 @@ def evaluate(
     beside_it = {name: fit.methods[0] for name, fit in fits.items() if fit is not same}
     shown = beside_it | {methods[0].name: methods[0]}
     rows = rows_to_score(split.folds[0], eval_on)
-    examples = Examples.of_methods(shown, data, rows) if data.site.kind == "spectrum" else None
+    examples = Examples.of_methods(shown, data, rows) if data.site.target.is_image else None
     return Evaluation(facts, columns, station_columns({"": scores, **beside}, data), examples)
 
 
@@ -259,7 +259,7 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
         **scores.samples, **paired_values(scores.samples),
     }  # fmt: skip
-    if data.site.kind == "rssi":
+    if data.site.target.in_decibels:
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     if data.station is not None and data.site.stations is not None:

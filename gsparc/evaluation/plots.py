@@ -21,6 +21,7 @@ from gsparc.evaluation.metric_formats import (
     OF_KIND,
     axis_of,
     heading_of,
+    is_ratio,
     lower_is_better,
     score_heading,
     score_of,
@@ -106,7 +107,7 @@ def draw_distributions(
             axes.step(*_shares(draws), lw=0.8, label=method, **line_of)
             axes.axvline(np.median(np.concatenate(draws)), lw=0.6, ls="--", color=line_of["color"])
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
-        if name in (TIMES, "mse", "nmse"):
+        if name == TIMES or is_ratio(name):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)
     line[0].set_ylabel("share of samples")
     handles, shown = line[0].get_legend_handles_labels()

@@ -78,19 +78,20 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
     """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
     several = data.site.stations is not None and len(data.site.stations) > 1
-    if data.site.kind == "spectrum":
+    if data.site.target.is_image:
         return None, ""
     power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side(np.arange(len(data))) < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
-    value = power[row, entry] if data.site.kind == "csi" else 10 * np.log10(power[row, entry])
+    in_decibels, value = data.site.target.in_decibels, power[row, entry]
     # Powers of channels are averaged linearly, levels of a station in decibels.
+    value = 10 * np.log10(value) if in_decibels else value
     each = [which[row]]
-    if data.site.kind == "rssi" and data.station is not None:
+    if in_decibels and data.station is not None:
         each.append(data.station[row])
     level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
-    if data.site.kind == "rssi":
+    if in_decibels:
         of = " of the strongest station" if several else ""
         return level, f"received power{of} [{data.site.level_unit}]"
     with np.errstate(divide="ignore"):
@@ -133,11 +134,10 @@ def draw_site(
 
 
 def _title(data: Measurements, places: Spots) -> str:
-    kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
-    stations = data.site.stations
+    stations, called = data.site.stations, data.site.target.called
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
     apart = spacing_words(distinct_places(data), data.site.wavelength).partition(";")[0]
-    return f"{data.site.name}: {len(data)} {kind} at {len(places.place)} places{at}\n{apart}"
+    return f"{data.site.name}: {len(data)} {called} at {len(places.place)} places{at}\n{apart}"
 
 
 def static_positions(data: Measurements) -> np.ndarray:

@@ -35,7 +35,7 @@ BESIDE = {  # figures beside the score, and their headings, by their columns
     "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
     **{
         name: (name, Column(heading_of(name), number_format(name), of=name))
-        for name in ("psnr_db_median", "ssim_gauss_median", "snr_db_p50", "mae_db_median")
+        for name in dict.fromkeys(name for figures in OF_KIND.values() for name in figures.compared)
     },
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
