@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.files import SUMMARY, load_yaml
-from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import dotted_settings
+from gsparc.models.registry import plain_methods
 from gsparc.prediction.timing import p50_p95
 
 # Columns by the facts of a summary that they hold: of the run, of its own method, of any method.
@@ -86,7 +86,7 @@ class Run:
         return any(o.lstrip("+~").startswith(f"{name}=") for o in self.overrides)
 
     def rows(self, shared: Iterable[str] = ()) -> list[dict[str, Any]]:
-        """Return its row of the table of results, then those of plain baselines, in the order of `PLAIN`.
+        """Return its row of the table of results, then those of plain baselines, in their order.
 
         `shared` are overrides that tell it from no other run.
         """
@@ -102,7 +102,7 @@ class Run:
         beside = {row["method"]: row for row in others if row["value"] is not None}
         rows += [
             beside[name] | {"setting": " ".join([f"{name} (baseline)", *of])}
-            for name in PLAIN if name in beside
+            for name in plain_methods() if name in beside
         ]  # fmt: skip
         return [row | {"run": self} for row in rows]
 

@@ -20,7 +20,7 @@ from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.experiment.cells import plugin_contenders
+from gsparc.evaluation.experiment.cells import unlisted_contenders
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 
@@ -62,7 +62,8 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     predictor = gsparc.load(objects.checkpoints[0])  # its class is out of a file, and of a plugin: trusted
     assert predictor.rssi(rx=[30.0, 1.0, 1.5]).shape == (1,)
     assert datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name == "corridor"
-    assert plugin_contenders()["nearest_k"].overrides(None) == ["model=nearest_k"]
+    assert unlisted_contenders()["nearest_k"].overrides(None) == ["model=nearest_k"]
+    assert {*unlisted_contenders()} == {"nearest_k", "other_carriers", "direct_beam", "ridge"}
     again, *_ = evaluate_files([objects.checkpoints[0]])
     assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.experiment.runner import TIMED
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
@@ -25,6 +24,7 @@ from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Row, Table, value_with_error
+from gsparc.models.registry import plain_methods
 
 BESIDE = {  # figures beside the score, and their headings, by their columns
     "coverage": ("interval/coverage_90", Column("in 90 % interval", ".2f", of="coverage")),
@@ -162,7 +162,7 @@ def title_of(block: pd.DataFrame) -> str:
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     """Return what the table shows about simple baselines and about our own default, favourable or not."""
-    rows = list(block.itertuples())
+    rows, plain = list(block.itertuples()), plain_methods()
     first = rows[0]
     level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
     lines = [f"first: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
@@ -177,12 +177,12 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
         lines.append(gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure))
-    if first.method in PLAIN and not block.method.isin(PLAIN).all():
+    if first.method in plain and not block.method.isin(plain).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
         if own is None or lead is None or lead.sure:
             lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
     for row in rows[1:]:
-        if own is None or row.method not in PLAIN or row.score_db <= own.score_db:
+        if own is None or row.method not in plain or row.score_db <= own.score_db:
             continue
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
