@@ -27,7 +27,7 @@ from gsparc.evaluation.metric_formats import (
     score_of,
 )
 from gsparc.evaluation.report.tables import groups_of, interval_of_figure
-from gsparc.evaluation.results import Run, distinct_baselines, own_rows
+from gsparc.evaluation.results import Run, average, distinct_baselines, own_rows
 from gsparc.evaluation.table import Row
 from gsparc.prediction.pareto import pareto_front
 
@@ -127,8 +127,7 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] =
     if not names:  # nothing was tested
         return
     labels = {}
-    for setting, group in groups_of(own).items():
-        seconds, ms = group.train_s.mean(), group.query_ms.dropna().mean()
+    for setting, seconds, ms in average(own, ["setting"], ["train_s", "query_ms"])["mean"].itertuples():
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
         labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
     figure = draw_distributions(rows, names, labels)

@@ -165,6 +165,20 @@ def distinct_baselines(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows.baseline].drop_duplicates(["rows", "setting"])
 
 
+def average(rows: pd.DataFrame, by: list[str], names: list[str]) -> pd.DataFrame:
+    """Return averages of the figures `names` of a frame, a row per group by columns `by`.
+
+    Columns are, of each name, its `mean` over draws of the split, seeds of each draw averaged first, and
+    the `error` of that, the standard error, NaN of one draw; `std`, `least` and `largest` are of all values,
+    what seeds change where there is one draw. NaN of figures that the frame does not have.
+    """
+    known = rows.reindex(columns=[*dict.fromkeys([*rows, *names])]).astype(dict.fromkeys(names, float))
+    draws = known.groupby([*by, "draw"], dropna=False, sort=False)[names].mean().reset_index()
+    of_draws, every = (one.groupby(by, dropna=False, sort=False)[names] for one in (draws, known))
+    spread = {"std": every.std(), "least": every.min(), "largest": every.max()}
+    return pd.concat({"mean": of_draws.mean(), "error": of_draws.sem(), **spread}, axis=1)
+
+
 def read_run(folder: Path) -> Run:
     """Return the run in a directory.
 

@@ -17,6 +17,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.runner import Job, time_queries
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.ledger import measurements_hash
+from gsparc.evaluation.results import average
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import loading
 from gsparc.models.refined_places import move_rows
@@ -147,12 +148,13 @@ def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: C
         NaN where there is no spread.
     """
     every, job = ask_moved(fits, conditions), fits.job.iloc[0]
-    every = every.astype(dict.fromkeys(("value", "train_s", "train_cpu_s"), float))
+    every = every.astype(dict.fromkeys(("train_s", "train_cpu_s"), float))
     # The model of the last round is timed: rounds differ in weights, not in size.
     last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
     median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
-    groups = every.groupby(["variant", "what", "amount"], sort=False)
-    rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
+    by = ["variant", "what", "amount"]
+    rows, averages = every.groupby(by, sort=False).agg(**last, **median), average(every, by, ["value"])
+    rows = rows.assign(value=averages["mean"].value, spread=averages["std"].value).reset_index()
     order = [list(fits.variant.unique()).index(variant) for variant in rows.variant]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     # Conditions that share a training share its model and its time: a file is timed once.

@@ -21,7 +21,7 @@ from gsparc.evaluation.metric_formats import (
     score_heading,
 )
 from gsparc.evaluation.paired import lead_over_runs
-from gsparc.evaluation.results import score_db
+from gsparc.evaluation.results import average, score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Row, Table, value_with_error
 from gsparc.models.registry import plain_methods
@@ -94,19 +94,20 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     own: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
     cells = pd.DataFrame([{**row, **_scored(row)} for row in own])
-    cells = cells.astype(dict.fromkeys(["effort", *means], float))
+    cells = cells.astype({"effort": float})
     # Draws with the same test rows are seeds.
     drawn = cells.groupby(PROBLEM)[["draw", "seed"]].transform("nunique")
     cells["draws"] &= (drawn["draw"] > 1) | (drawn["seed"] == 1)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
-    rows = groups[means].mean()
+    averages = average(cells, GROUP, means)
+    rows = averages["mean"].copy()
     rows[["figure", "second_figure"]] = groups[["figure", "second_figure"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
     rows["results"] = groups["result"].agg(list)
     rows["draws"] = several
-    # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
-    rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
-    rows["value_error"] = groups["value"].sem().where(several)
+    # Over draws the mean is what is told, hence its error; over seeds the scatter of one training.
+    rows["spread_db"] = averages["error"].score_db.where(several, averages["std"].score_db)
+    rows["value_error"] = averages["error"].value
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
-from gsparc.evaluation.results import distinct_baselines, own_rows
+from gsparc.evaluation.results import average, distinct_baselines, own_rows
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
@@ -67,18 +67,14 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
     return (values, None) if len(values) > 1 else None
 
 
-def pooled_interval(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
-    """Return the mean over draws of the split and its standard error, seeds of each averaged.
-
-    Of one draw with the least and largest over seeds; None where none has a value.
-    """
-    known = pd.DataFrame({"value": values, "draw": draws}).dropna()
-    means = known.groupby("draw").value.mean()
-    if len(means) > 1:
-        return Interval(means.mean(), error=means.sem())
+def _interval(average: pd.Series) -> Interval | None:
+    """Mean and standard error over draws; of one draw mean, least and largest over seeds."""
+    if np.isnan(average["mean"]):
+        return None
+    if not np.isnan(average["error"]):
+        return Interval(average["mean"], error=average["error"])
     # A single seed has no spread: no brackets.
-    ends = (known.value.min(), known.value.max()) if len(known) > 1 else ()
-    return Interval(known.value.mean(), *ends) if len(known) else None
+    return Interval(average["mean"], *([] if np.isnan(average["std"]) else average[["least", "largest"]]))
 
 
 def has_draws(rows: pd.DataFrame) -> bool:
@@ -152,11 +148,12 @@ def table_of_seeds(rows: pd.DataFrame) -> Table:
     """
     differs, several, spread = differing_settings(rows), has_draws(rows), _spread_columns(rows)
     also = [Column("differs, too", "")] if any(differs.values()) else []
-    lines = []
-    for setting, group in groups_of(pd.concat([own_rows(rows), distinct_baselines(rows)])).items():
+    lines, shown = [], pd.concat([own_rows(rows), distinct_baselines(rows)])
+    averages = average(shown, ["setting"], names := [str(column.of) for column in spread])
+    for setting, group in groups_of(shown).items():
         seeds = group.seed.nunique(dropna=False)
         counts = [group.draw.nunique(), seeds] if several else [len(group)]
-        values = [pooled_interval(group.apply(column.value, axis=1), group.draw) for column in spread]
+        values = [_interval(averages.loc[setting].xs(name, level=1)) for name in names]
         lines.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
     counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
     note = "Brackets: least and largest over seeds, on the same test rows: split.seed draws others "
