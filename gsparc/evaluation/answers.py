@@ -14,7 +14,7 @@ import torch
 
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_archive
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.data.target import Kind, Target
@@ -288,9 +288,7 @@ def write_answers(
         # A float32 is written with as many digits as tell it from its neighbours, .1 and not .10000000149.
         write_samples(path, {name: list(values) for name, values in columns.items()})
         return
-    # An open file: given a name without .npz, which that of an unfinished file is, NumPy appends it.
-    with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **columns)
+    write_archive(path, columns)
 
 
 def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]:

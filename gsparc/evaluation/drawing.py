@@ -93,6 +93,11 @@ def numbered_style(number: int) -> dict[str, Any]:
     return {"color": PALETTE[colour], "linestyle": STROKES[turn % len(STROKES)]}
 
 
+def spread_out(rows: np.ndarray, most: int) -> np.ndarray:
+    """Return at most so many rows (n, ...), spread over them, the first and the last among them."""
+    return rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]
+
+
 def panels(
     width: float, height: float, rows: int = 1, columns: int = 1, *, grid: bool = True, **how: Any
 ) -> tuple[Figure, np.ndarray]:

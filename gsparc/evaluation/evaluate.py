@@ -210,9 +210,8 @@ def time_methods(
             "out; warm, plans made before; no file, no picture"
         ),
     }
-    for room, (p50, p95, to_copy, _) in ((name, own.values()) for name, own in one.items()):
-        times = {"render_ms_p50": p50, "render_ms_p95": p95, "ratio_to_copy": to_copy}
-        facts |= {f"{room}/{key}": value for key, value in times.items()}
+    for room, times in one.items():
+        facts |= {f"{room}/{fact}": times[name] for name, fact in timing.FACTS.items()}
         together = float(np.median(many[room])) / BATCH if room in many else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
     return facts

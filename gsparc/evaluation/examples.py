@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_archive
 from gsparc.data.schema import Measurements
+from gsparc.evaluation.drawing import spread_out
 from gsparc.evaluation.results import distinct_baselines
 from gsparc.models.method import Method
 from gsparc.prediction.confidence import predict_rows
@@ -41,7 +42,7 @@ class Examples:
     def of_methods(cls, methods: Mapping[str, Method], data: Measurements, rows: np.ndarray) -> Examples:
         """Ask fitted methods, the run's own last, about a few of `rows` (n,)."""
         assert data.site.grid is not None
-        few = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(int)]
+        few = spread_out(rows, MOST)
         said = {name: predict_rows(method, data, few) for name, method in methods.items()}
         own = [*said.values()][-1].confidence
         sure = np.full(len(few), np.nan) if own is None else own.numpy()
@@ -53,8 +54,7 @@ class Examples:
         images = {f"of {name}": values for name, values in self.predicted.items()} | {"truth": self.truth}
         arrays = {name: values.astype(np.float16) for name, values in images.items()}
         arrays |= {"rows": self.rows, "edges": self.edges, "confidence": self.confidence}
-        with whole_file(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        write_archive(path, arrays)
 
     @classmethod
     def read(cls, path: Path) -> Examples | None:

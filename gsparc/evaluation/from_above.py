@@ -12,6 +12,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
 
+from gsparc.evaluation.drawing import spread_out
+
 MOST_POINTS = 1500  # measured places that are drawn
 # A city's mesh has millions of triangles; the short ones are not seen at this scale.
 MOST_WALLS = 50_000
@@ -64,11 +66,23 @@ def draw_sectors(axis: Any, places: np.ndarray, azimuth: np.ndarray) -> None:
 def draw_measured(axis: Any, places: np.ndarray) -> None:
     """Mark places (n, 2) [m] that are seen on cells of any colour, the more the smaller."""
     if len(places):
-        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        few = spread_out(places, MOST_POINTS)
         # By the root of their number, so that the area that marks hide stays the same.
         size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
         rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}
         axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
+
+
+def draw_values(
+    axis: Any, places: np.ndarray, values: np.ndarray, size: float, clipped: float, **bar: Any
+) -> None:
+    """Mark places (n, 2) [m] in the colours of values (n,), told by a `bar`.
+
+    A share `clipped` of the values has the colour at either end: a few outliers would leave one for the rest.
+    """
+    low, high = np.quantile(values, [clipped, 1 - clipped])
+    dots = axis.scatter(*places.T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    axis.figure.colorbar(dots, ax=axis, **bar)
 
 
 def draw_walls(axis: Any, triangles: np.ndarray) -> None:

@@ -186,7 +186,7 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
         return
     trend = field.network
-    heard = rows_of_stations(data, np.r_[fold.train, fold.val], field.places).measured_rows
+    heard = rows_of_stations(data, fold.learned(), field.places).measured_rows
     count = np.bincount(heard.station, minlength=len(field.places))
     azimuth, stations = trend.table[:, 0].numpy(), data.site.stations
     # Without an azimuth there is no angle to draw over.

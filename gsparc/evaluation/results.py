@@ -17,7 +17,7 @@ from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import dotted_settings
 from gsparc.models.registry import plain_methods
-from gsparc.prediction.timing import p50_p95
+from gsparc.prediction.timing import FACTS, p50_p95
 
 # Columns by the facts of a summary that they hold: of the run, of its own method, of any method.
 OF_RUN = {
@@ -29,8 +29,8 @@ OF_MODEL = {
     "label": "model/label", "gaussians": "model/num_gaussians", "memory_mb": "memory/peak_mb",
 }  # fmt: skip
 COSTS = {
-    "train_s": "train_s", "train_cpu_s": "train_cpu_s", "query_ms": "render_ms_p50",
-    "query_p95_ms": "render_ms_p95", "batch_ms": "render_ms_batch64",
+    "train_s": "train_s", "train_cpu_s": "train_cpu_s", "batch_ms": "render_ms_batch64",
+    **{name: FACTS[name] for name in ("query_ms", "query_p95_ms")},
 }  # fmt: skip
 STUDY = ["dataset", "split"]  # figures of one are comparable
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training

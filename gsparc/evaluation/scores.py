@@ -112,9 +112,7 @@ def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
     """
     if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
-    # Rows of `val` are not among those learned from where they are the ones scored.
-    learned = fold.train if eval_on == "val" else np.concatenate([fold.train, fold.val])
-    return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
+    return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[fold.learned(eval_on)])
 
 
 def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
@@ -181,8 +179,7 @@ def score_methods(
         # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
-        # Rows of `val` are not among those learned from where they are the ones scored.
-        known = np.sort(taught.train if eval_on == "val" else np.concatenate([taught.train, taught.val]))
+        known = np.sort(taught.learned(eval_on))
         if method.name == "nearest" and data.site.target.in_decibels and data.station is not None:
             scored["served"] = levels_of_nearest_moment(own.subset(known), data.subset(rows))
         if limited:

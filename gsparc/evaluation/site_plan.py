@@ -22,7 +22,15 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import OUTLINE, annotate, draw_stations, frame_of, legend_below, set_bounds
+from gsparc.evaluation.from_above import (
+    OUTLINE,
+    annotate,
+    draw_stations,
+    draw_values,
+    frame_of,
+    legend_below,
+    set_bounds,
+)
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
@@ -166,12 +174,9 @@ def _draw_map(
         if (inside & ~known).any():
             silent = places.place[inside & ~known]
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
-        # 1 and 99 %: a few outliers would leave one colour for the rest.
-        limits = dict(zip(("vmin", "vmax"), np.percentile(places.level_db[known], [1, 99]), strict=True))
-        dots = axis.scatter(*places.place[known].T, c=places.level_db[known], s=size, linewidths=0, **limits)
+        bar: dict[str, Any] = {"label": places.label, "extend": "both", "shrink": 0.85, "pad": 0.02}
+        draw_values(axis, places.place[known], places.level_db[known], size, 0.01, **bar)
         axis.scatter([], [], s=25, c="0.4", linewidths=0, label=name)  # whose colours are the bar's
-        assert axis.figure is not None
-        axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
     side = propose_side(data)
     test = np.zeros(0, np.int64) if side is None else held_out_block_rows(data, side)
     if len(test):

@@ -55,7 +55,7 @@ class Condition:
         if self.what not in ("train", "train_known"):
             return data, fold
         # Both ends of learning: validation rows are measured with the same instrument.
-        moved = add_position_errors(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
+        moved = add_position_errors(data, fold.learned(), self.amount, seed)
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
 
@@ -120,7 +120,7 @@ def ask_moved(fits: pd.DataFrame, conditions: Sequence[Condition]) -> pd.DataFra
             continue
         folds = [condition.change_training(data, fold, fit["seed"])[1] for fold in split.folds]
         own = {**fit, **asdict(condition), "model": fit["run"].checkpoints[0]}
-        own["rows"] = float(np.mean([len(fold.train) + len(fold.val) for fold in folds]))
+        own["rows"] = float(np.mean([len(fold.learned()) for fold in folds]))
         if condition.what == "query":
             tested = np.concatenate([fold.test for fold in split.folds])
             moved = add_position_errors(data, tested, condition.amount, fit["seed"])
@@ -245,7 +245,7 @@ def thin_fold(fold: Fold, keep: float, seed: int) -> Fold:
         keep: a share of the rows up to 1; above, a number of rows.
         seed: of the choice.
     """
-    every = len(fold.train) + len(fold.val)
+    every = len(fold.learned())
     # Never more than there are.
     total = min(round(keep * every if keep <= 1 else keep), every)
     # One validation row at least, where there is one: it decides when to stop.

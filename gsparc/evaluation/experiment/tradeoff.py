@@ -23,7 +23,7 @@ from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import Settings
 from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import ClockSettings, time_beside_copy
+from gsparc.prediction.timing import FACTS, ClockSettings, time_beside_copy
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ POINT = (  # columns of the table of points
     Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
     Column("ms p95", ".3g", of="render_ms_p95"),
 )  # fmt: skip
-TIMES = {"render_ms_p50": "query_ms", "render_ms_p95": "query_p95_ms", "ratio_to_copy": "to_copy"}
 MADE = ["settings", "figure", "value", "score"]  # columns that are not in `tradeoff.csv`
 CLOSEST_DB = 100.0  # the precision of float32
 
@@ -60,7 +59,6 @@ def measure_points(
         ValueError: these rows do not define the deciding figure.
     """
     ways: list[dict[str, Any]] = []
-    asked: list[Method] = []
     for number, (settings, method) in enumerate(candidates):
         means: list[Tensor] = []
         own = pool_figures(score_methods([method], data, split, eval_on, means=means), data, split)
@@ -68,12 +66,12 @@ def measure_points(
         if not ways:
             whole = answers
         own |= {"closeness_db": closeness_db(answers, whole), "front": 0, "kept_with_model": 0}
+        knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
         for used in threads:
             label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
             sizes = {"threads": used, "num_gaussians": method.count_components(), "settings": settings}
-            knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
-            ways.append({"label": label, **dict.fromkeys(TIMES), **own, **sizes, **knobs})
-            asked.append(method)
+            row = {"label": label, **dict.fromkeys(FACTS.values()), **own, **sizes, **knobs}
+            ways.append(row | {"method": method})
         if number % 10 == 9:
             log.info("%d of %d faster variants scored", number + 1, len(candidates))
     figure, count = deciding_figure(ways[0], data.site.scored), len(ways)
@@ -81,13 +79,13 @@ def measure_points(
         fitted = fit_baseline(name, data, split, eval_on)
         own = pool_figures(fitted.scores, data, split)
         if own[figure] is not None:
-            ways.append({**own, "label": name, "threads": 1})
-            asked.append(fitted.methods[0])
+            ways.append({**own, "label": name, "threads": 1, "method": fitted.methods[0]})
+    rows = pd.DataFrame(ways, dtype=object)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
-    calls = {i: Predictor(method, data.site).cycle_places(places) for i, method in enumerate(asked)}
-    times = pd.DataFrame(time_beside_copy(calls, clock, {i: way["threads"] for i, way in enumerate(ways)})).T
-    rows = pd.DataFrame(ways, dtype=object).assign(**{name: times[of] for name, of in TIMES.items()})
+    calls = {i: Predictor(method, data.site).cycle_places(places) for i, method in rows.pop("method").items()}
+    times = pd.DataFrame(time_beside_copy(calls, clock, rows.threads.to_dict())).T
+    rows = rows.assign(**{fact: times[name] for name, fact in FACTS.items()})
     rows = rows.assign(figure=figure, value=[defined_figure(way, figure) for way in ways])
     rows["score"] = [score_of(figure, value) for value in rows.value]
     points, beside = rows[:count].copy(), rows[count:]
