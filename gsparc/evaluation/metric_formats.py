@@ -61,6 +61,9 @@ FIGURES = {
     "snr_db_p50": Figure("median SNR dB", ".2f"),
     "mae_db_median": Figure("median error dB", ".2f", "smaller"),
     "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
+    "interval/coverage_90": Figure("in 90 % interval", ".2f"),
+    "outage/brier": Figure("outage, Brier score", ".4f", "smaller"),
+    "rmse_db_after_constant": Figure("after a constant, dB", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
 GIVEN_HEARD = "rmse_db: of levels given that they are heard or listed"

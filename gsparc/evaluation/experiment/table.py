@@ -17,26 +17,28 @@ from gsparc.evaluation.metric_formats import (
     WITH_SILENT,
     heading_of,
     lower_is_better,
-    number_format,
     score_heading,
 )
 from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.results import average, score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
-from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Row, Table, value_with_error
+from gsparc.evaluation.table import (
+    CPU,
+    P50,
+    P95,
+    TRAIN,
+    Column,
+    Interval,
+    Row,
+    Table,
+    figure_column,
+    value_with_error,
+)
 from gsparc.models.registry import plain_methods
 
-BESIDE = {  # figures beside the score, and their headings, by their columns
-    "coverage": ("interval/coverage_90", Column("in 90 % interval", ".2f", of="coverage")),
-    "outage": ("outage/brier", Column("outage, Brier score", ".4f", of="outage")),
-    "after_constant": (
-        "rmse_db_after_constant", Column("after a constant, dB", ".2f", of="after_constant"),
-    ),
-    "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
-    **{
-        name: (name, Column(heading_of(name), number_format(name), of=name))
-        for name in dict.fromkeys(name for figures in OF_KIND.values() for name in figures.compared)
-    },
+BESIDE = {  # figures beside the score, by their columns
+    "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
+    "chi2": CALIBRATION, **{name: name for figures in OF_KIND.values() for name in figures.compared},
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
@@ -59,7 +61,7 @@ def _scored(own: Row) -> dict[str, Any]:
     label = str(own["label"] or "")
     return {
         "result": own, "score_db": score_db(own), "second_figure": second, "second_value": own.get(second),
-        **{name: own.get(key) for name, (key, _) in BESIDE.items()},
+        **{name: own.get(figure) for name, figure in BESIDE.items()},
         "label": label[label.find(" (") :] if " (" in label else "",
     }  # fmt: skip
 
@@ -215,7 +217,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second_figure.iloc[0], of="second_value")),
-        *((block[name].notna().any(), column) for name, (_, column) in BESIDE.items()),
+        *((block[n].notna().any(), figure_column(beside, of=n)) for n, beside in BESIDE.items()),
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]

@@ -11,7 +11,7 @@ import pandas as pd
 from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
 from gsparc.evaluation.results import average, distinct_baselines, own_rows
-from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
+from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table, figure_column
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
 DRAWS = 1000
@@ -97,11 +97,6 @@ def _judged(rows: pd.DataFrame, figure: str) -> list[Row]:
     return rows.assign(figure=figure, value=rows.get(figure)).to_dict("records")  # type: ignore[return-value]
 
 
-def accuracy_column(figure: str, note: str = "") -> Column:
-    """Return a test figure, with its interval."""
-    return Column(heading_of(figure), number_format(figure), note, partial(interval_of_figure, figure=figure))
-
-
 def _figures(rows: pd.DataFrame) -> list[str]:
     """Figures of these data, first the one that decides: with silent rows it is none of the usual ones.
 
@@ -127,8 +122,9 @@ def table_of_results(rows: pd.DataFrame) -> Table:
     """
     note = "95 % interval: bootstrap over test samples"
     columns = [
-        *_run_columns(rows), *(accuracy_column(f, note) for f in _figures(rows)),
-        Column(heading_of(CALIBRATION), number_format(CALIBRATION), "1: deviations are right", CALIBRATION),
+        *_run_columns(rows),
+        *(figure_column(f, note, partial(interval_of_figure, figure=f)) for f in _figures(rows)),
+        figure_column(CALIBRATION, "1: deviations are right"),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
         Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
@@ -187,7 +183,7 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
 
 
 def _spread_columns(rows: pd.DataFrame) -> list[Column]:
-    figures = [Column(heading_of(f), number_format(f), of=f) for f in _figures(rows)]
+    figures = [figure_column(figure) for figure in _figures(rows)]
     if rows.alone.notna().any():
         deciding = rows.figure.iloc[0]
         name = f"{heading_of(deciding)} of Gaussians alone"
