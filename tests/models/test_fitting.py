@@ -99,8 +99,13 @@ def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     assert found.cpu_s == 50.0
 
 
-def test_processor_seconds_of_stations_that_were_finished_before_were_left_out(town, tmp_path):
+@pytest.mark.parametrize("where", ["here", pytest.param("joblib", marks=pytest.mark.slow)])
+def test_processor_seconds_of_stations_that_were_finished_before_were_left_out(
+    town, tmp_path, elsewhere, where
+):
     Resumable.stop_at = 0
+    if where != "here":
+        elsewhere(where)
     fitting.fit_or_resume(PerStation(Resumable()), *town, FitContext(tmp_path / "run"))
     for file in (tmp_path / "run").glob("station*/model.ckpt"):
         stored = checkpoint.read(file)
