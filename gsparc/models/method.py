@@ -99,8 +99,8 @@ class MethodFactory(ABC):
     has_parts = False  # whether it resumes parts in folders of their own
     takes_effort = False  # whether `FitContext.effort` changes its fit
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
-    # Its place in tables among plain methods, which a reader could have without gsparc; of this class alone.
-    plain: ClassVar[int | None] = None
+    # In tables, among plain methods, which a reader could have without gsparc; of this class alone.
+    plain_place: ClassVar[int | None] = None
     kinds: ClassVar[tuple[Kind, ...]] = ()  # of data beside whose other methods it stands; empty for all
 
     @abstractmethod

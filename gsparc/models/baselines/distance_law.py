@@ -200,7 +200,7 @@ class DistanceLaw(Differentiable):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"
-    plain = 70
+    plain_place = 70
     kinds = ("rssi",)
     stored = ("law",)
     uses_censored = True

@@ -27,7 +27,7 @@ class Ridge(UplinkMethod):
     """
 
     name = "ridge"
-    plain = 110
+    plain_place = 110
 
     @classmethod
     def stands_beside(cls, data: Measurements, fold: Fold) -> bool:

@@ -61,7 +61,7 @@ class ComplexGP(ClosedForm):
     """
 
     name = "complex_gp"
-    plain = 100
+    plain_place = 100
     kinds = ("csi",)
     both_ends = True
     count_gaussians = 0  # type: ignore[assignment]
