@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from campaigns import compose, spectra
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.errors import MissingConfigException
 from invented import invent
 from refusals import refused
@@ -44,6 +45,7 @@ def installed(tmp_path, monkeypatch):
         importlib.invalidate_caches()
         offer_plugins()
 
+    Plugins.instance()  # before the copy: they store choices, which later tests need
     monkeypatch.setattr(ConfigStore.instance(), "repo", {**ConfigStore.instance().repo})
     for group in ("model", "dataset"):
         ConfigStore.instance().repo[group] = {**ConfigStore.instance().repo.get(group, {})}
