@@ -39,7 +39,7 @@ class Pictures(Checked, L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Draw when it is time."""
         step = trainer.global_step
-        if not trainer.is_global_zero or module.site.kind != "spectrum":
+        if not trainer.is_global_zero or not module.site.target.is_image:
             return
         if step % to_steps(self.every, module.total_steps) and step != trainer.max_steps:
             return
