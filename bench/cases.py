@@ -25,11 +25,11 @@ from gsparc.commands.train import train_job
 from gsparc.evaluation.experiment.cells import plan_jobs
 from gsparc.evaluation.experiment.runner import run_jobs
 from gsparc.evaluation.experiment.table import average_cells
+from gsparc.models.registry import plain_methods
 from gsparc.physics.waves import point_wave
 
 MEASURED = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROWS = 900  # of a case, of more
-PLAIN = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 COLUMNS = ["case", "split", "gsparc", "best plain", "its error", "ratio", "processor s"]
 Arrays = dict[str, np.ndarray | float]
 Case = tuple[str, float, Arrays]  # name, side of squares [m], measurements under the schema's names
@@ -180,7 +180,8 @@ def main() -> None:
         for side, names in squares.items():
             cut = {"choose": ["split=blocks", f"split.side_m={side}"], "draws": 1, "datasets": names}
             config["splits"][f"squares_{side:g}m"] = cut
-        config["methods"] = {name: config["methods"][name] for name in (*PLAIN, "gsparc")}
+        wanted = {*plain_methods(), "gsparc"}
+        config["methods"] = {name: own for name, own in config["methods"].items() if name in wanted}
         config["only"] = [f"{name}*" for name in words if "=" not in name]
         filled = run_jobs(plan_jobs(config, Path(folder) / "cells"), train_job, True, None)
     rows = average_cells(filled)

@@ -12,7 +12,7 @@ import torch
 
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
-from gsparc.evaluation.drawing import save
+from gsparc.evaluation.drawing import save, spread_out
 from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.field.schedule import INTERVAL, to_steps
@@ -39,7 +39,7 @@ class Pictures(Checked, L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Draw when it is time."""
         step = trainer.global_step
-        if not trainer.is_global_zero or module.site.kind != "spectrum":
+        if not trainer.is_global_zero or not module.site.target.is_image:
             return
         if step % to_steps(self.every, module.total_steps) and step != trainer.max_steps:
             return
@@ -48,7 +48,7 @@ class Pictures(Checked, L.Callback):
         if not len(candidates):
             return
         # The same rows at every step, so that pictures can be compared.
-        rows = candidates[np.linspace(0, len(candidates) - 1, min(self.count, len(candidates))).astype(int)]
+        rows = spread_out(candidates, self.count)
         ledger = next((one for one in trainer.callbacks if isinstance(one, CostLedger)), None)  # type: ignore[attr-defined]
         with nullcontext() if ledger is None else ledger.paused(), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)

@@ -8,17 +8,16 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.output import begin_run, finish_run, tables_of
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
-from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.confidence_pictures import PICTURES, draw_confidences
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.plots import draw_sweep
 from gsparc.evaluation.results import Run, frame_of_runs
-from gsparc.evaluation.summary import remarks, results_table
+from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint
 
 
@@ -80,8 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_confidences(PICTURES, rows, f"{data.site.name}, {config.eval_on} rows", run_dir)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.title}, {config.eval_on}"
-    results = results_table(facts, facts["model/label"], title, config.eval_on)
     # Who opened the files has warned of it, and warnings are repeated below the table.
     said = remarks({**facts, "split/foreign": None}, config.eval_on)
-    worst = worst_stations(evaluation.stations, facts["model/label"])
-    return finish_run(run_dir, facts, results, *worst, lines=said)
+    tables = tables_of(facts, title, config.eval_on, evaluation.stations)
+    return finish_run(run_dir, facts, *tables, lines=said)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,11 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.output import finish_run, run_directory
+from gsparc.data.files import SUMMARY
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.report.page import write_report
-from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns
+from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns, read_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -39,5 +39,5 @@ def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
     """Swept fronts in and below the directories, with the names of their datasets."""
     # Sorted, as the order of a file system differs from machine to machine.
     files = [file for path in paths for file in sorted(path.rglob("tradeoff.csv"))]
-    texts = ((file.parent / "summary.json").read_text(encoding="utf-8") for file in files)
-    return [(str(json.loads(t)["dataset/name"]), read_columns(f)) for t, f in zip(texts, files, strict=True)]
+    facts = (read_summary(file.parent / SUMMARY) or {} for file in files)
+    return [(str(of.get("dataset/name")), read_columns(file)) for of, file in zip(facts, files, strict=True)]

@@ -57,11 +57,12 @@ def task(config: DictConfig) -> None:
         raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     predictor = load(config.ckpt, unit=config.unit)
     predictor = predictor if config.station is None else predictor.select_station(config.station)
+    site, powers = predictor.site, predictor.site.target.in_decibels
     # Powers of all stations are one answer; channels and spectra are of one station each.
-    if predictor.site.static_end is None or (predictor.site.stations and predictor.site.kind != "rssi"):
+    if site.static_end is None or (site.stations and not powers):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
     keep = partial(keep_versions, config.ckpt, predictor) if config.updates else None
-    if keep is not None and (config.station is not None or predictor.site.kind != "rssi"):
+    if keep is not None and (config.station is not None or not powers):
         raise DataError("updates=true: is of powers, and of all stations of the model")
     app = build_application(predictor, limits, token, keep)
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)

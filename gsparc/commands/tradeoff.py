@@ -47,7 +47,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     """Measure, draw and write."""
     data, method = run.data, run.methods[0]
     # What each component contributes is measured on rows that were learned from: test rows choose nothing.
-    learned = np.sort(np.concatenate([run.split.folds[0].train, run.split.folds[0].val]))
+    learned = np.sort(run.split.folds[0].learned())
     inputs = method.reduction_inputs(data, learned)
     settings = list(list_settings(method, to_dict(config.grid)))
     single = config.threads is None and not method.threads_pay

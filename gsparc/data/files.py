@@ -16,6 +16,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from gsparc.data.errors import DataError, readable
@@ -150,6 +151,13 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     """Write text, in UTF-8, or bytes, whole or not at all."""
     with whole_file(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_archive(path: str | Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name as npz, whole or not at all."""
+    # An open file: given a name without .npz, which that of an unfinished file is, NumPy appends it.
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 @contextmanager

@@ -35,6 +35,10 @@ class Fold:
     val: np.ndarray
     test: np.ndarray
 
+    def learned(self, eval_on: str = "test") -> np.ndarray:
+        """Return rows that are learned from; those of `val` are not where they are the ones scored."""
+        return self.train if eval_on == "val" else np.concatenate([self.train, self.val])
+
     def map(self, change: Callable[[np.ndarray], np.ndarray]) -> Fold:
         """Return the three parts changed alike."""
         return Fold(*map(change, (self.train, self.val, self.test)))

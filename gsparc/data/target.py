@@ -20,17 +20,23 @@ class Target(ABC):
 
     Attributes:
         kind: its name in files and settings.
+        called: several of them, in words.
         numbers: real numbers of an entry.
         exponent: of an entry's magnitude that is its power.
         axes: of an array of them, rows among them.
         is_complex: whether entries have a phase.
+        is_image: whether its entries lie beside each other, as directions.
+        in_decibels: whether errors are counted in decibels, as of what is one level.
     """
 
     kind: ClassVar[Kind]
+    called: ClassVar[str]
     numbers: ClassVar[int] = 1
     exponent: ClassVar[int] = 2
     axes: ClassVar[int] = 3
     is_complex: ClassVar[bool] = False
+    is_image: ClassVar[bool] = False
+    in_decibels: ClassVar[bool] = False
 
     @abstractmethod
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
@@ -76,7 +82,8 @@ class Target(ABC):
 class Spectrum(Target):
     """Amplitudes over directions (H, W), in [0, 1]."""
 
-    kind = "spectrum"
+    kind, called = "spectrum", "spectra"
+    is_image = True
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""
@@ -95,7 +102,7 @@ class Spectrum(Target):
 class Channel(Target):
     """Complex gains (antennas, subcarriers)."""
 
-    kind = "csi"
+    kind, called = "csi", "channels"
     numbers = 2
     is_complex = True
 
@@ -117,7 +124,8 @@ class Channel(Target):
 class Power(Target):
     """Received powers (1,), linear; their errors are of decibels."""
 
-    kind = "rssi"
+    kind, called = "rssi", "powers"
+    in_decibels = True
     exponent = 1
     axes = 2
 

@@ -14,10 +14,10 @@ import torch
 
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_archive
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
-from gsparc.data.target import Kind
+from gsparc.data.target import Kind, Target
 from gsparc.data.units import PowerUnit, power_in_decibels
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.method import Prediction
@@ -107,7 +107,7 @@ def predict_file(
             places, int(far.sum()), len(far), margin, say_height_error(world, site, far),
             queries.rows[int(np.argmax(far))],
         )  # fmt: skip
-    power = site.power_unit(predictor.unit) if site.kind == "rssi" else None
+    power = site.power_unit(predictor.unit) if site.target.in_decibels else None
     if tested is not None and power is not None and predictions.said.variance is not None:
         local = np.hstack([world[end] - site.origin for end in ("tx", "rx") if end in world])
         predictions = _with_tested(predictions, local[predictions.place], power, tested)
@@ -210,7 +210,7 @@ def predict_places(
     # Blocks may end in any order in other processes.
     for block, prediction in run_each(predicted, range(len(blocks)), "blocks of places"):
         if not parts:
-            check_fits(path, predictor.site.kind, tuple(prediction.mean.shape[1:]))
+            check_fits(path, predictor.site.target, tuple(prediction.mean.shape[1:]))
         parts[block] = prediction
     for line in silent:
         log.warning(line)
@@ -249,15 +249,15 @@ def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
     return path
 
 
-def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
+def check_fits(path: Path, target: Target, shape: tuple[int, ...]) -> None:
     """Refuse what is no table: spectra, and channels of many entries."""
     if path.suffix.lower() == ".npz":
         return
     count = int(np.prod(shape))
-    if kind == "spectrum":
+    if target.is_image:
         size = " x ".join(map(str, shape))
         raise DataError(f"out={path}: spectra of {size} directions are no columns; say out=FILE.npz")
-    if kind == "csi" and count > MOST_ENTRIES:
+    if count > MOST_ENTRIES:
         size = f"{shape[0]} antennas x {shape[1]} subcarriers"
         raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
 
@@ -274,12 +274,12 @@ def write_answers(
     archive = path.suffix.lower() == ".npz"
     columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
     said, mean = predictions.said, predictions.said.mean.numpy()
-    if kind == "rssi":
+    if power is not None:
         columns[name] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], np.float32(np.nan))
     if said.variance is not None:
         # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
         columns[f"{name}_std"] = said.variance.sqrt().float().numpy()
-    if kind != "rssi":
+    if power is None:
         columns |= {kind: mean} if archive else _entries(mean)
     columns |= {} if said.confidence is None else {"confidence": said.confidence.numpy()}
     columns |= {} if predictions.refused is None else {"refused": predictions.refused.astype(np.int8)}
@@ -288,9 +288,7 @@ def write_answers(
         # A float32 is written with as many digits as tell it from its neighbours, .1 and not .10000000149.
         write_samples(path, {name: list(values) for name, values in columns.items()})
         return
-    # An open file: given a name without .npz, which that of an unfinished file is, NumPy appends it.
-    with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **columns)
+    write_archive(path, columns)
 
 
 def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]:

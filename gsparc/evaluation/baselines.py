@@ -14,42 +14,20 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score_methods
-from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.per_station import stations_of_fold
-from gsparc.models.registry import all_methods, method_class
+from gsparc.models.registry import all_methods, method_class, plain_methods
 from gsparc.training.context import FitContext, FitReport
 
 log = logging.getLogger(__name__)
 
-# What a reader could have without gsparc, in the order of tables. `zero` has NMSE 1 by definition: what is
-# worse is worse than saying nothing.
-PLAIN = ("zero", "mean", "nearest", "idw", "other_carriers", "direct_beam", "distance_law", "kriging", "gp",
-         "complex_gp", "ridge")  # fmt: skip
-
 
 def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
     """Return names of all plain methods that serve these measurements and rows."""
-    powers, channels = data.site.kind == "rssi", data.site.kind == "csi"
-    # Both fit decibels over distance, which only powers have; a linear map is of a band from the other.
-    serves = {"distance_law": powers, "kriging": powers, "ridge": data.uplink is not None}
-    serves["other_carriers"] = serves["direct_beam"] = carriers_obstacle(data.site) is None
-    serves["complex_gp"] = channels and _have_carriers(data) and _know_all_stations(data, split)
-    return tuple(name for name in PLAIN if serves.get(name, True))
-
-
-def _have_carriers(data: Measurements) -> bool:
-    """Whether a kernel that oscillates with the wavelength is defined."""
-    site = data.site
-    carriers = (site.carrier_hz, None if site.stations is None else site.stations.carrier_hz)
-    return any(one is not None for one in carriers)
-
-
-def _know_all_stations(data: Measurements, split: Split) -> bool:
-    """Whether enough rows of all stations of test rows are learned."""
-    folds = split.folds if data.station is not None else ()
-    few = (stations_of_fold(method_class("complex_gp")(), data, fold).only_tested.any() for fold in folds)
-    return not any(few)
+    return tuple(
+        name
+        for name in plain_methods()
+        if all(method_class(name).stands_beside(data, fold) for fold in split.folds)
+    )
 
 
 def same_as_baseline(config: DictConfig, method: MethodFactory) -> str | None:

@@ -92,7 +92,7 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
 
     Of stations with scored rows; silent ones count in `rmse_db_with_silent`. Empty without stations.
     """
-    if data.site.kind != "rssi" or data.station is None or data.site.stations is None:
+    if data.station is None or data.site.stations is None:
         return {}
     columns: dict[str, Any] = {}
     for stem, one in methods.items():

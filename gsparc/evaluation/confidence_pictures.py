@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from gsparc.evaluation.drawing import GREY, PALETTE, numbered_style, panels, save, style_of
-from gsparc.evaluation.metric_formats import OF_KIND, axis_of
+from gsparc.evaluation.metric_formats import OF_KIND, axis_of, lower_is_better
 from gsparc.evaluation.results import own_rows
 from gsparc.evaluation.table import Row
 from gsparc.prediction.risk import bounded_loss
@@ -30,7 +30,8 @@ def draw_confidences(
     every: list[Row] = own_rows(rows).to_dict("records")  # type: ignore[assignment]
     runs = [row for row in every if _states(row)]
     for name in names if runs else ():
-        if name != "snr_brackets" or runs[0]["kind"] != "rssi":  # powers have no ratio to an error
+        # Powers have no ratio to an error.
+        if name != "snr_brackets" or not lower_is_better(OF_KIND[runs[0]["kind"]].of_sample):
             figure = PICTURES[name](runs)
             figure.suptitle(title, fontsize=9)
             save(figure, folder / f"{name}{end}.png")
@@ -49,7 +50,7 @@ def _loss(row: Row) -> np.ndarray:
     own = row["run"].samples
     if "error_db" in own:
         return np.abs(own["error_db"])
-    if row["kind"] != "spectrum":
+    if "error_power" in own:
         return bounded_loss(own["error_power"] / np.maximum(own["target_power"], 1e-300))
     # Images smaller than the window have no SSIM: the absolute error alone tells.
     return (1 - SSIM_WEIGHT) * own["mae"] + SSIM_WEIGHT * (1 - np.nan_to_num(own["ssim_gauss"], nan=1.0))
@@ -74,7 +75,7 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         names = ["lowest", "2", "3", "4", "highest"]
         fifths.boxplot([sure[part == number] for number in range(5)], tick_labels=names)
         fifths.set(xlabel="fifth of the loss", ylabel="confidence C")
-        spectra = row["kind"] == "spectrum"
+        spectra = "ssim_gauss" in row["run"].samples
         error = row["run"].samples["mae"][known] if spectra else loss
         scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
         scatter.set(xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C")

@@ -164,7 +164,7 @@ def evaluate(
     beside_it = {name: fit.methods[0] for name, fit in fits.items() if fit is not same}
     shown = beside_it | {methods[0].name: methods[0]}
     rows = rows_to_score(split.folds[0], eval_on)
-    examples = Examples.of_methods(shown, data, rows) if data.site.kind == "spectrum" else None
+    examples = Examples.of_methods(shown, data, rows) if data.site.target.is_image else None
     return Evaluation(facts, columns, station_columns({"": scores, **beside}, data), examples)
 
 
@@ -210,9 +210,8 @@ def time_methods(
             "out; warm, plans made before; no file, no picture"
         ),
     }
-    for room, (p50, p95, to_copy, _) in ((name, own.values()) for name, own in one.items()):
-        times = {"render_ms_p50": p50, "render_ms_p95": p95, "ratio_to_copy": to_copy}
-        facts |= {f"{room}/{key}": value for key, value in times.items()}
+    for room, times in one.items():
+        facts |= {f"{room}/{fact}": times[name] for name, fact in timing.FACTS.items()}
         together = float(np.median(many[room])) / BATCH if room in many else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
     return facts
@@ -259,7 +258,7 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
         **scores.samples, **paired_values(scores.samples),
     }  # fmt: skip
-    if data.site.kind == "rssi":
+    if data.site.target.in_decibels:
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     if data.station is not None and data.site.stations is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import whole_file
+from gsparc.data.files import write_archive
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import distinct_baselines
 from gsparc.models.method import Method
@@ -54,8 +54,7 @@ class Examples:
         images = {f"of {name}": values for name, values in self.predicted.items()} | {"truth": self.truth}
         arrays = {name: values.astype(np.float16) for name, values in images.items()}
         arrays |= {"rows": self.rows, "edges": self.edges, "confidence": self.confidence}
-        with whole_file(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        write_archive(path, arrays)
 
     @classmethod
     def read(cls, path: Path) -> Examples | None:

@@ -73,6 +73,18 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
         axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
 
 
+def draw_values(
+    axis: Any, places: np.ndarray, values: np.ndarray, size: float, clipped: float, **bar: Any
+) -> None:
+    """Mark places (n, 2) [m] in the colours of values (n,), told by a `bar`.
+
+    A share `clipped` of the values has the colour at either end: a few outliers would leave one for the rest.
+    """
+    low, high = np.quantile(values, [clipped, 1 - clipped])
+    dots = axis.scatter(*places.T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    axis.figure.colorbar(dots, ax=axis, **bar)
+
+
 def draw_walls(axis: Any, triangles: np.ndarray) -> None:
     """Draw upright triangles (n, 3, 3) [m] as lines; at most `MOST_WALLS`, the longest."""
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -1,4 +1,4 @@
-"""Figures of merit as they are shown and compared; `metrics.py` computes them."""
+"""Figures of merit by kind of target: what computes them, how they are shown and compared."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from gsparc.data.schema import Scored
+from gsparc.evaluation.metrics import (
+    AlignedChannelMetrics,
+    ChannelMetrics,
+    PowerMetrics,
+    SampleMetric,
+    SpectrumMetrics,
+)
 
 
 @dataclass(frozen=True)
@@ -18,11 +25,13 @@ class Figure:
         heading: of its column and axis.
         form: format of its numbers.
         better: which values are better; a `ratio` of powers is compared in decibels, smaller is better.
+        of_sample: the column of `per_sample.csv` that it is made of; empty: its own name.
     """
 
     heading: str
     form: str = ".4f"
     better: Literal["larger", "smaller", "ratio"] = "larger"
+    of_sample: str = ""
 
 
 # SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default; the first also of
@@ -34,14 +43,14 @@ FIGURES = {
     "ssim_padded": Figure("SSIM (Gauss 11, zero padded)"),
     "mse": Figure("MSE", ".3g", "ratio"),
     "mae": Figure("MAE", ".3g", "smaller"),
-    "nmse": Figure("NMSE", ".3g", "ratio"),
-    "nmse_aligned": Figure("NMSE, rows aligned", ".3g", "ratio"),
+    "nmse": Figure("NMSE", ".3g", "ratio", "error_power"),
+    "nmse_aligned": Figure("NMSE, rows aligned", ".3g", "ratio", "error_power"),
     "tone_rmse_db": Figure("RMSE of tones dB", ".2f", "smaller"),
     "nmse_scalar": Figure("NMSE up to a scalar", ".3g", "ratio"),
     "snr_db": Figure("SNR dB", ".2f"),
     "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
-    "rmse_db": Figure("RMSE dB", ".2f", "smaller"),
-    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller"),
+    "rmse_db": Figure("RMSE dB", ".2f", "smaller", "error_db"),
+    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller", "error_db_with_silent"),
     "mae_db": Figure("MAE dB", ".2f", "smaller"),
     "error_db": Figure("error dB", ".2f", "smaller"),
     "best_server": Figure("strongest told", ".1%"),
@@ -52,6 +61,9 @@ FIGURES = {
     "snr_db_p50": Figure("median SNR dB", ".2f"),
     "mae_db_median": Figure("median error dB", ".2f", "smaller"),
     "reduced_chi2": Figure("reduced chi-squared", ".2f", "smaller"),
+    "interval/coverage_90": Figure("in 90 % interval", ".2f"),
+    "outage/brier": Figure("outage, Brier score", ".4f", "smaller"),
+    "rmse_db_after_constant": Figure("after a constant, dB", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
 GIVEN_HEARD = "rmse_db: of levels given that they are heard or listed"
@@ -62,36 +74,45 @@ CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown bes
 
 @dataclass(frozen=True)
 class KindFigures:
-    """Figures of what is measured, by where they are shown.
+    """Figures of what is measured: what computes them, and where they are shown.
 
     Attributes:
+        metric: computes them.
         columns: of tables; methods, fronts and effects are compared by the first.
         second: beside the score in comparisons.
         of_sample: of a single sample, in decibels.
         distributions: over samples, drawn after a sweep.
         medians: shown beside the columns, which are means, where there is room.
+        compared: further columns of comparisons.
     """
 
+    metric: type[SampleMetric]
     columns: tuple[str, ...]
     second: str
     of_sample: str
     distributions: tuple[str, ...]
     medians: tuple[str, ...]
+    compared: tuple[str, ...]
 
 
 OF_KIND: dict[Scored, KindFigures] = {
     "spectrum": KindFigures(
-        ("psnr_db", "ssim_gauss", "ssim", "mse"), "ssim", "psnr_db", ("ssim_gauss", "psnr_db", "mse"),
-        ("psnr_db_median", "ssim_gauss_median", "mse_median"),
+        SpectrumMetrics, ("psnr_db", "ssim_gauss", "ssim", "mse"), "ssim", "psnr_db",
+        ("ssim_gauss", "psnr_db", "mse"), ("psnr_db_median", "ssim_gauss_median", "mse_median"),
+        compared=("psnr_db_median", "ssim_gauss_median"),
     ),
     "csi": KindFigures(
-        ("nmse", "nmse_scalar", "snr_db"), "snr_db", "snr_db", ("snr_db", "nmse"), ("snr_db_p50",)
+        ChannelMetrics, ("nmse", "nmse_scalar", "snr_db"), "snr_db", "snr_db", ("snr_db", "nmse"),
+        ("snr_db_p50",), compared=("snr_db_p50",),
     ),
     "aligned csi": KindFigures(
-        ("nmse_aligned", "tone_rmse_db", "snr_db"), "tone_rmse_db", "snr_db", ("snr_db", "nmse"),
-        ("snr_db_p50",),
+        AlignedChannelMetrics, ("nmse_aligned", "tone_rmse_db", "snr_db"), "tone_rmse_db", "snr_db",
+        ("snr_db", "nmse"), ("snr_db_p50",), compared=("snr_db_p50",),
     ),
-    "rssi": KindFigures(("rmse_db", "mae_db"), "mae_db", "error_db", ("error_db",), ("mae_db_median",)),
+    "rssi": KindFigures(
+        PowerMetrics, ("rmse_db", "mae_db"), "mae_db", "error_db", ("error_db",), ("mae_db_median",),
+        compared=("mae_db_median",),
+    ),
 }  # fmt: skip
 DECIDING: dict[Scored, str] = {kind: figures.columns[0] for kind, figures in OF_KIND.items()}
 
@@ -135,8 +156,18 @@ def score_heading(name: str) -> str:
     >>> score_heading("nmse"), score_heading("psnr_db")
     ('NMSE dB (less is better)', 'PSNR dB')
     """
-    ratio = " dB" if _look_up(name).better == "ratio" else ""
+    ratio = " dB" if is_ratio(name) else ""
     return f"{heading_of(name)}{ratio}{' (less is better)' if lower_is_better(name) else ''}"
+
+
+def sample_column(name: str) -> str:
+    """Return the column of `per_sample.csv` that a figure is made of."""
+    return _look_up(name).of_sample or name
+
+
+def is_ratio(name: str) -> bool:
+    """Return whether a figure is a ratio of powers, which spans decades."""
+    return _look_up(name).better == "ratio"
 
 
 def number_format(name: str) -> str:

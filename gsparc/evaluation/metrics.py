@@ -17,8 +17,6 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from gsparc.data.schema import Scored
-
 log = logging.getLogger(__name__)
 
 DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
@@ -244,12 +242,6 @@ def power_errors(p: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
     error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
     error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
     return {"error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
-
-
-METRICS: dict[Scored, type[SampleMetric]] = {
-    "spectrum": SpectrumMetrics, "csi": ChannelMetrics, "aligned csi": AlignedChannelMetrics,
-    "rssi": PowerMetrics,
-}  # fmt: skip
 
 
 def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

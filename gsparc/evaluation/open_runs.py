@@ -108,7 +108,7 @@ class Opened:
     def group_places(self, places: np.ndarray, count: int, seed: int) -> np.ndarray:
         """Return which of `count` groups, cut as test rows were, trained places (n, D) [m] are of, or -1."""
         fold, split = self.split.folds[0], effort_settings(self.stored[0].configuration)["split"]
-        known, group = np.concatenate([fold.train, fold.val]), np.full(len(self.data), -1)
+        known, group = fold.learned(), np.full(len(self.data), -1)
         for number, inner in enumerate(cut_folds(self.data, fold, split, count, seed).folds):
             group[inner.test] = number
         return group[known[cKDTree(self.data.moving[known]).query(places)[1]]]
@@ -276,7 +276,7 @@ def _foreign(
     listed = f" ({len(tested) - unlisted} listed, {unlisted} unlisted)" * (unlisted > 0)
     for old, fold in zip(before.folds, chosen.folds, strict=True):
         # Rows of `val` decide steps and weights: they count as learned.
-        rows = np.concatenate([old.train, old.val])
+        rows = old.learned()
         if same:
             learned += int(np.isin(fold.test, rows).sum())
         else:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import WITH_SILENT
+from gsparc.evaluation.metric_formats import sample_column
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.table import Row
 from gsparc.processes.uncertainty import half_width, standard_error
@@ -106,10 +106,8 @@ def gains_of_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str)
     Returns:
         None for figures that are no mean over rows, and of fewer than two rows.
     """
-    column = {WITH_SILENT: "error_db_with_silent", "rmse_db": "error_db", "psnr_db": "psnr_db"}.get(
-        figure, "error_power" if figure.startswith("nmse") else figure
-    )
-    if figure == "nmse_scalar" or column not in one or column not in other:
+    column = sample_column(figure)
+    if column not in one or column not in other:
         return None
     a, b = (np.asarray(own[column], float) for own in (one, other))
     a, b = a + 0 * b, b + 0 * a  # NaN in one is NaN in both: the means are of the same rows

@@ -63,7 +63,7 @@ def draw_predictions(
         return save(draw_spectra(examples, title), path, 100)
     predicted, true = predict_rows(method, data, rows).mean.numpy(), data.targets(rows).numpy()
     scale = data.site.target_scale
-    unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
+    unit = data.site.level_unit if data.site.target.in_decibels else "dB"
     measured = data.censored_side(rows) == 0  # of a silent row the target is its level
     draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
 
@@ -188,7 +188,7 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
         return
     trend = field.network
-    heard = rows_of_stations(data, np.r_[fold.train, fold.val], field.places).measured_rows
+    heard = rows_of_stations(data, fold.learned(), field.places).measured_rows
     count = np.bincount(heard.station, minlength=len(field.places))
     azimuth, stations = trend.table[:, 0].numpy(), data.site.stations
     # Without an azimuth there is no angle to draw over.

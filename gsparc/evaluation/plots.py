@@ -21,12 +21,13 @@ from gsparc.evaluation.metric_formats import (
     OF_KIND,
     axis_of,
     heading_of,
+    is_ratio,
     lower_is_better,
     score_heading,
     score_of,
 )
 from gsparc.evaluation.report.tables import groups_of, interval_of_figure
-from gsparc.evaluation.results import Run, distinct_baselines, own_rows
+from gsparc.evaluation.results import Run, average, distinct_baselines, own_rows
 from gsparc.evaluation.table import Row
 from gsparc.prediction.pareto import pareto_front
 
@@ -106,7 +107,7 @@ def draw_distributions(
             axes.step(*_shares(draws), lw=0.8, label=method, **line_of)
             axes.axvline(np.median(np.concatenate(draws)), lw=0.6, ls="--", color=line_of["color"])
         axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
-        if name in (TIMES, "mse", "nmse"):
+        if name == TIMES or is_ratio(name):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)
     line[0].set_ylabel("share of samples")
     handles, shown = line[0].get_legend_handles_labels()
@@ -126,8 +127,7 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] =
     if not names:  # nothing was tested
         return
     labels = {}
-    for setting, group in groups_of(own).items():
-        seconds, ms = group.train_s.mean(), group.query_ms.dropna().mean()
+    for setting, seconds, ms in average(own, ["setting"], ["train_s", "query_ms"])["mean"].itertuples():
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
         labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
     figure = draw_distributions(rows, names, labels)

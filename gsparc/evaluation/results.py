@@ -13,11 +13,11 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.files import SUMMARY, load_yaml
-from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import dotted_settings
-from gsparc.prediction.timing import p50_p95
+from gsparc.models.registry import plain_methods
+from gsparc.prediction.timing import FACTS, p50_p95
 
 # Columns by the facts of a summary that they hold: of the run, of its own method, of any method.
 OF_RUN = {
@@ -29,8 +29,8 @@ OF_MODEL = {
     "label": "model/label", "gaussians": "model/num_gaussians", "memory_mb": "memory/peak_mb",
 }  # fmt: skip
 COSTS = {
-    "train_s": "train_s", "train_cpu_s": "train_cpu_s", "query_ms": "render_ms_p50",
-    "query_p95_ms": "render_ms_p95", "batch_ms": "render_ms_batch64",
+    "train_s": "train_s", "train_cpu_s": "train_cpu_s", "batch_ms": "render_ms_batch64",
+    **{name: FACTS[name] for name in ("query_ms", "query_p95_ms")},
 }  # fmt: skip
 STUDY = ["dataset", "split"]  # figures of one are comparable
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
@@ -86,7 +86,7 @@ class Run:
         return any(o.lstrip("+~").startswith(f"{name}=") for o in self.overrides)
 
     def rows(self, shared: Iterable[str] = ()) -> list[dict[str, Any]]:
-        """Return its row of the table of results, then those of plain baselines, in the order of `PLAIN`.
+        """Return its row of the table of results, then those of plain baselines, in their order.
 
         `shared` are overrides that tell it from no other run.
         """
@@ -102,7 +102,7 @@ class Run:
         beside = {row["method"]: row for row in others if row["value"] is not None}
         rows += [
             beside[name] | {"setting": " ".join([f"{name} (baseline)", *of])}
-            for name in PLAIN if name in beside
+            for name in plain_methods() if name in beside
         ]  # fmt: skip
         return [row | {"run": self} for row in rows]
 
@@ -163,6 +163,20 @@ def own_rows(rows: pd.DataFrame) -> pd.DataFrame:
 def distinct_baselines(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of the baselines of each split of the rows, of its first run."""
     return rows[rows.baseline].drop_duplicates(["rows", "setting"])
+
+
+def average(rows: pd.DataFrame, by: list[str], names: list[str]) -> pd.DataFrame:
+    """Return averages of the figures `names` of a frame, a row per group by columns `by`.
+
+    Columns are, of each name, its `mean` over draws of the split, seeds of each draw averaged first, and
+    the `error` of that, the standard error, NaN of one draw; `std`, `least` and `largest` are of all values,
+    what seeds change where there is one draw. NaN of figures that the frame does not have.
+    """
+    known = rows.reindex(columns=[*dict.fromkeys([*rows, *names])]).astype(dict.fromkeys(names, float))
+    draws = known.groupby([*by, "draw"], dropna=False, sort=False)[names].mean().reset_index()
+    of_draws, every = (one.groupby(by, dropna=False, sort=False)[names] for one in (draws, known))
+    spread = {"std": every.std(), "least": every.min(), "largest": every.max()}
+    return pd.concat({"mean": of_draws.mean(), "error": of_draws.sem(), **spread}, axis=1)
 
 
 def read_run(folder: Path) -> Run:

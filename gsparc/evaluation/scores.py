@@ -21,7 +21,8 @@ from gsparc.evaluation.given_heard import (
     never_listed,
     strongest_told,
 )
-from gsparc.evaluation.metrics import METRICS, power_errors
+from gsparc.evaluation.metric_formats import OF_KIND
+from gsparc.evaluation.metrics import power_errors
 from gsparc.models.method import Method, predict_in_batches
 
 SUBSETS = ("train", "val", "test")
@@ -53,7 +54,7 @@ class Scores:
 
     def figures(self) -> dict[str, float | None]:
         """Return flat figures over all folds together."""
-        return METRICS[self.kind].summary(self.samples)
+        return OF_KIND[self.kind].metric.summary(self.samples)
 
     def dominant_row(self) -> dict[str, Any]:
         """Return the row that alone makes over half of all error or power, and a figure that no row decides.
@@ -63,7 +64,7 @@ class Scores:
         """
         error, power = self.samples.get("error_power", self.samples["mse"]), self.samples["target_power"]
         known = np.isfinite(error) & (power > 0)
-        if self.kind == "rssi" or known.sum() < FEW:
+        if "error_db" in self.samples or known.sum() < FEW:
             return {}
         error, power, row = error[known], power[known], self.row[known]
         # A row may decide by its error alone, or by its power, which NMSE divides by.
@@ -84,7 +85,7 @@ def errors_with_silent(
     {} where none is.
     """
     side = data.censored_side(row)
-    if data.site.kind != "rssi" or not side.any():
+    if not side.any():
         return {}
     level = data.target[row, 0].astype(np.float64) * data.site.target_scale
     beyond = side * power_errors(samples["prediction"], level)["error_db"]
@@ -111,9 +112,7 @@ def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
     """
     if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
-    # Rows of `val` are not among those learned from where they are the ones scored.
-    learned = fold.train if eval_on == "val" else np.concatenate([fold.train, fold.val])
-    return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[learned])
+    return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[fold.learned(eval_on)])
 
 
 def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
@@ -159,13 +158,13 @@ def score_methods(
     every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
     missing: list[pd.DataFrame] = []
     own, before = learned or (data, split)
-    limited = data.site.kind == "rssi" and (own.censored_side(before.folds[0].train) > 0).any()
+    limited = (own.censored_side(before.folds[0].train) > 0).any()
     are_lists = limited and strongest_lists(data) is not None
     for method, rows, fold, taught in zip(methods, every, split.folds, before.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
         turn = best_phase_of_runs(method, data, rows, runs) if len(runs) else None
-        metric = METRICS[data.site.scored](data.site.target_scale)
+        metric = OF_KIND[data.site.scored].metric(data.site.target_scale)
         outputs = {name: np.full(len(rows), np.nan) for name in ("confidence", "variance")}
         order = []
         for chosen, batch, prediction in predict_in_batches(method, data, rows, CHUNK):
@@ -180,9 +179,8 @@ def score_methods(
         # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
-        # Rows of `val` are not among those learned from where they are the ones scored.
-        known = np.sort(taught.train if eval_on == "val" else np.concatenate([taught.train, taught.val]))
-        if method.name == "nearest" and data.site.kind == "rssi" and data.station is not None:
+        known = np.sort(taught.learned(eval_on))
+        if method.name == "nearest" and data.site.target.in_decibels and data.station is not None:
             scored["served"] = levels_of_nearest_moment(own.subset(known), data.subset(rows))
         if limited:
             variance = scored["variance"] * data.site.target_scale**2

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import draw_stations, draw_walls, legend_below, set_bounds
+from gsparc.evaluation.from_above import draw_stations, draw_values, draw_walls, legend_below, set_bounds
 from gsparc.evaluation.table import Column, Table
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
@@ -37,8 +37,10 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     reached, triangles = heard > 0, survey.engine.triangles()
     # A mark's area [points^2] shrinks with the number of places, within what is seen and not hidden.
     size = float(np.clip(6000 / len(places), 2, 40))
-    _map(axes[0], places[reached], 10 * np.log10(heard[reached]), "received power [dB]", size)
-    _map(axes[1], places[reached], spread[reached] * 1e9, "delay spread [ns]", size)
+    bar: dict[str, Any] = {"location": "bottom", "shrink": 0.8}
+    at, level = places[reached, :2], 10 * np.log10(heard[reached])
+    draw_values(axes[0], at, level, size, 0.01, label="received power [dB]", **bar)
+    draw_values(axes[1], at, spread[reached] * 1e9, size, 0.01, label="delay spread [ns]", **bar)
     if changed is not None:
         known = power[changed.rows] > 0
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
@@ -46,7 +48,8 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
         # Errors of spectra have no decibels.
         if decision is not None and not decision.choice.deliverable.startswith("spectrum"):
             label += " [dB]"
-        _map(axes[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
+        label += ": held-back receivers"
+        draw_values(axes[2], places[rows, :2], errors, 40.0, 0.0, label=label, **bar)
     for axis in axes:
         first = axis is axes[0]  # whose labels stand for all
         if (~reached).any():
@@ -60,14 +63,6 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     legend_below(figure)  # beside the title it would cover the last effects
     figure.suptitle(f"{outcome.data.site.name}: {len(places)} receivers\n{outcome.effects}")
     save(figure, path)
-
-
-def _map(
-    axis: Any, places: np.ndarray, values: np.ndarray, label: str, size: float, clipped: float = 0.01
-) -> None:
-    low, high = np.quantile(values, [clipped, 1 - clipped])
-    dots = axis.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
-    axis.figure.colorbar(dots, ax=axis, location="bottom", label=label, shrink=0.8)
 
 
 def table_of_scenes() -> Table:

@@ -22,7 +22,15 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import OUTLINE, annotate, draw_stations, frame_of, legend_below, set_bounds
+from gsparc.evaluation.from_above import (
+    OUTLINE,
+    annotate,
+    draw_stations,
+    draw_values,
+    frame_of,
+    legend_below,
+    set_bounds,
+)
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
@@ -78,19 +86,20 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
     """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
     several = data.site.stations is not None and len(data.site.stations) > 1
-    if data.site.kind == "spectrum":
+    if data.site.target.is_image:
         return None, ""
     power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side() < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
-    value = power[row, entry] if data.site.kind == "csi" else 10 * np.log10(power[row, entry])
+    in_decibels, value = data.site.target.in_decibels, power[row, entry]
     # Powers of channels are averaged linearly, levels of a station in decibels.
+    value = 10 * np.log10(value) if in_decibels else value
     each = [which[row]]
-    if data.site.kind == "rssi" and data.station is not None:
+    if in_decibels and data.station is not None:
         each.append(data.station[row])
     level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
-    if data.site.kind == "rssi":
+    if in_decibels:
         of = " of the strongest station" if several else ""
         return level, f"received power{of} [{data.site.level_unit}]"
     with np.errstate(divide="ignore"):
@@ -133,11 +142,10 @@ def draw_site(
 
 
 def _title(data: Measurements, places: Spots) -> str:
-    kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
-    stations = data.site.stations
+    stations, called = data.site.stations, data.site.target.called
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
     apart = spacing_words(distinct_places(data), data.site.wavelength).partition(";")[0]
-    return f"{data.site.name}: {len(data)} {kind} at {len(places.place)} places{at}\n{apart}"
+    return f"{data.site.name}: {len(data)} {called} at {len(places.place)} places{at}\n{apart}"
 
 
 def static_positions(data: Measurements) -> np.ndarray:
@@ -166,12 +174,9 @@ def _draw_map(
         if (inside & ~known).any():
             silent = places.place[inside & ~known]
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
-        # 1 and 99 %: a few outliers would leave one colour for the rest.
-        limits = dict(zip(("vmin", "vmax"), np.percentile(places.level_db[known], [1, 99]), strict=True))
-        dots = axis.scatter(*places.place[known].T, c=places.level_db[known], s=size, linewidths=0, **limits)
+        bar: dict[str, Any] = {"label": places.label, "extend": "both", "shrink": 0.85, "pad": 0.02}
+        draw_values(axis, places.place[known], places.level_db[known], size, 0.01, **bar)
         axis.scatter([], [], s=25, c="0.4", linewidths=0, label=name)  # whose colours are the bar's
-        assert axis.figure is not None
-        axis.figure.colorbar(dots, ax=axis, label=places.label, extend="both", shrink=0.85, pad=0.02)
     side = propose_side(data)
     test = np.zeros(0, np.int64) if side is None else held_out_block_rows(data, side)
     if len(test):

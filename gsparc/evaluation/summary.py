@@ -22,7 +22,6 @@ import pandas as pd
 
 from gsparc.data.executor import SAY_S
 from gsparc.data.files import write_whole
-from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.metric_formats import (
     BEST_SERVER,
     CALIBRATION,
@@ -38,6 +37,7 @@ from gsparc.evaluation.metric_formats import (
 from gsparc.evaluation.paired import Lead
 from gsparc.evaluation.results import facts_under, result_rows, row_of_method
 from gsparc.evaluation.table import P50, TRAIN, Column, Table
+from gsparc.models.registry import plain_methods
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.cost import LINE
 
@@ -135,7 +135,8 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
     figures = [own.get(name) for name in wanted]
     # A baseline that the method is was fitted once: its row is the method's own.
     kept = [o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures]
-    kept.sort(key=lambda row: PLAIN.index(row["method"]) if row["method"] in PLAIN else len(PLAIN))
+    plain = plain_methods()
+    kept.sort(key=lambda row: plain.index(row["method"]) if row["method"] in plain else len(plain))
     named = [row | {"method": f"{method} (baseline)"} if row["method"] == method else row for row in kept]
     alone = facts_under(facts, "field")
     fields = [row_of_method(f"{method}, Gaussians alone", alone, alone)] if alone else []

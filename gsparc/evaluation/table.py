@@ -13,6 +13,8 @@ from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions
 from rich.table import Table as RichTable
 
+from gsparc.evaluation.metric_formats import heading_of, number_format
+
 Row = Mapping[str, Any]  # of results, see `results.rows_of`
 
 
@@ -81,6 +83,11 @@ P95 = Column("p95", ".3g", of="query_p95_ms")
 def value_with_error(name: str, error: str) -> Callable[[Row], Interval]:
     """Return what makes `value ± error` of two columns of the results."""
     return lambda row: Interval(row[name], error=row[error])
+
+
+def figure_column(figure: str, note: str = "", of: str | Callable[[Row], Any] = "") -> Column:
+    """Return the column of a figure of merit; `of` where results have it elsewhere than under its name."""
+    return Column(heading_of(figure), number_format(figure), note, of or figure)
 
 
 @dataclass

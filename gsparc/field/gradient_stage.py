@@ -30,7 +30,7 @@ from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-SPENT = "time/spent_s"
+SPENT, SPENT_CPU = "time/spent_s", "time/spent_cpu_s"
 TAKEN = "steps/taken"
 KEPT = "steps/kept"
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
@@ -96,15 +96,16 @@ class ReportSteps(L.Callback):
     """
 
     def __init__(self, watch: Stopwatch) -> None:
-        self.watch, self._began = watch, watch.seconds
+        self.watch, self._began, self._cpu_began = watch, watch.seconds, watch.cpu_seconds
 
     def state_dict(self) -> dict[str, Any]:
         """Return the seconds spent."""
-        return {"seconds": self.watch.seconds - self._began}
+        cpu = self.watch.cpu_seconds - self._cpu_began
+        return {"seconds": self.watch.seconds - self._began, "cpu_seconds": cpu}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from there."""
-        self.watch.charge(float(state["seconds"]))
+        self.watch.charge(float(state["seconds"]), float(state.get("cpu_seconds", 0.0)))
 
     def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
         """Save, also after a checkpoint with every step done.
@@ -112,6 +113,7 @@ class ReportSteps(L.Callback):
         Of an unfinished schedule, what was taken is kept.
         """
         trainer.callback_metrics[SPENT] = torch.tensor(self.watch.seconds, dtype=torch.float64)
+        trainer.callback_metrics[SPENT_CPU] = torch.tensor(self.watch.cpu_seconds, dtype=torch.float64)
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
         if trainer.global_step < module.total_steps:
             trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
@@ -275,7 +277,8 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
 def read_trainer_result(trainer: L.Trainer, watch: Stopwatch) -> TrainerResult:
     """Return the steps of a Trainer that has ended, and charge what other processes say of an earlier run."""
     metrics = trainer.callback_metrics
-    watch.charge(max(float(metrics[SPENT]) - watch.seconds, 0.0))
+    more = float(metrics[SPENT]) - watch.seconds, float(metrics[SPENT_CPU]) - watch.cpu_seconds
+    watch.charge(*(max(spent, 0.0) for spent in more))
     kept = int(metrics[KEPT]) if KEPT in metrics else None
     taken = int(metrics[TAKEN])
     timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]

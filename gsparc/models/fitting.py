@@ -100,12 +100,12 @@ def fit_or_resume(
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
         report = replace(report, seconds=report.seconds + aligning, cost=cost)
-    return method, report
+    return method, replace(report, cpu_s=report.cpu_s + watch.cpu_seconds)
 
 
 def run_extra(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
     """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
-    report_fields = {"train_s": report.seconds, "notes": list(report.notes)}
+    report_fields = {"train_s": report.seconds, "train_cpu_s": report.cpu_s, "notes": list(report.notes)}
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**report_fields, **Origin.from_fit(data, fold, context).to_extra()}
 
@@ -127,7 +127,7 @@ def _restore_fit(
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
     notes = tuple(extra.get("notes", ()))
-    return method, FitReport(float(extra["train_s"]), notes, cost)
+    return method, FitReport(float(extra["train_s"]), notes, cost, float(extra.get("train_cpu_s", 0.0)))
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:

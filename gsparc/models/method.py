@@ -20,6 +20,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
+from gsparc.data.target import Kind
 from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.physics.row_factors import align_factors
 from gsparc.training.context import FitContext, FitReport
@@ -98,6 +99,9 @@ class MethodFactory(ABC):
     has_parts = False  # whether it resumes parts in folders of their own
     takes_effort = False  # whether `FitContext.effort` changes its fit
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
+    # In tables, among plain methods, which a reader could have without gsparc; of this class alone.
+    plain_place: ClassVar[int | None] = None
+    kinds: ClassVar[tuple[Kind, ...]] = ()  # of data beside whose other methods it stands; empty for all
 
     @abstractmethod
     def create_for(self, data: Measurements) -> Method:
@@ -114,6 +118,11 @@ class MethodFactory(ABC):
         Raises:
             ValueError: this makes none of that class.
         """
+
+    @classmethod
+    def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
+        """Tell whether it is fitted beside others on these rows."""
+        return not cls.kinds or data.site.kind in cls.kinds
 
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """Say how measurements would be learned, before they are; "" where the name says it.

@@ -22,7 +22,7 @@ from torch import Tensor
 from gsparc.data import heeded
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
 from gsparc.data.errors import Caution, list_first
-from gsparc.data.executor import run_all
+from gsparc.data.executor import run_all, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
@@ -139,7 +139,7 @@ class PerStation(Method):
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
 
-        def fit_station(turn: int) -> tuple[Method, FitReport]:
+        def fit_station(turn: int) -> tuple[Method, FitReport, float, float]:
             number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
             resume = None if left is None else left / folder
@@ -153,7 +153,7 @@ class PerStation(Method):
             rows, part = self._rows_and_measurements(data, number)
             # Folds are numbers into the station's own rows from here on.
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            before = watch.seconds
+            before, cpu_before = watch.seconds, watch.cpu_seconds
             try:
                 copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
             except KeyboardInterrupt:
@@ -165,11 +165,13 @@ class PerStation(Method):
             if resumable and len(numbers) > 1:
                 extra = fitting.run_extra(report, part, inner, own)
                 checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
-            watch.charge(max(report.seconds - (watch.seconds - before), 0.0))  # by the interrupted run
-            return copy, report
+            return copy, report, watch.seconds - before, watch.cpu_seconds - cpu_before
 
         fits = run_all(fit_station, range(len(numbers)), f"stations of {self.name}")
-        reports = [report for _, report in fits]
+        reports = [fit[1] for fit in fits]
+        for _, report, took_s, took_cpu_s in fits:  # the rest by the interrupted run, or another process
+            here = 0.0 if uses_other_processes() else took_cpu_s
+            watch.charge(max(report.seconds - took_s, 0.0), max(report.cpu_s - here, 0.0))
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = combine_stations([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
@@ -181,7 +183,7 @@ class PerStation(Method):
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
         cost = sum((one.cost for one in reports), Cost())
-        return FitReport(watch.seconds, tuple(notes), cost)
+        return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 
     def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
         """Stations that copies are made for; `UNHEARD` for all together, or for those without rows.

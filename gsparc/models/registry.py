@@ -51,6 +51,16 @@ def method_class(name: str) -> type[MethodFactory]:
     return get_class(there[name])
 
 
+@cache
+def plain_methods() -> tuple[str, ...]:
+    """Return names of plain methods, which others are shown beside, in the order of tables."""
+    kinds = ((name, import_target(path)) for name, path in all_methods().items())
+    # A class of its own: what derives from a plain method is none.
+    found = {name: vars(kind).get("plain_place") for name, kind in kinds if kind is not None}
+    places = {name: place for name, place in found.items() if place is not None}
+    return tuple(sorted(places, key=places.__getitem__))
+
+
 def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     """Return the method that a config of the group `model` describes (unfitted), or what chooses it.
 

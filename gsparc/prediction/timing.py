@@ -24,6 +24,8 @@ Call = Callable[[int], object]
 QUERIES = 64  # different ones, by turns
 COPY = "copy"
 SPEED = ("query_ms", "query_p95_ms", "to_copy", "rounds")  # to_copy: in units of a copy of the same rounds
+# Their names in summaries and in `tradeoff.csv`.
+FACTS = {"query_ms": "render_ms_p50", "query_p95_ms": "render_ms_p95", "to_copy": "ratio_to_copy"}
 COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second everywhere
 
 

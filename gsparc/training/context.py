@@ -34,11 +34,14 @@ class FitReport:
         seconds: that it took, validations too [s].
         notes: what a reader must know (early stop, dropped components), one line each.
         cost: of each stage.
+        cpu_s: processor seconds, of all threads [s]; a method says those alone that were spent elsewhere, as
+            by the run that it went on from: `fit_or_resume` adds what it took here.
     """
 
     seconds: float
     notes: tuple[str, ...] = ()
     cost: Cost = NO_COST
+    cpu_s: float = 0.0
 
     def with_cost(self, cost: Cost) -> FitReport:
         """Return the report with its stages, which are logged."""

@@ -31,7 +31,7 @@ def swept(field, tmp_path_factory):
     config = compose(
         f"ckpt='{ckpt}'", "threads=[1]", "rounds=5",
         "grid.stride=[1,2]",
-        "baselines=[mean]", config="tradeoff",
+        "baselines=[mean,distance_law]", config="tradeoff",
     )  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         runs_in(patch, folder)
@@ -71,6 +71,11 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     stored_facts = json.loads((folder / "summary.json").read_text())
     assert stored_facts["baseline/mean/render_ms_p50"] > 0
     assert stored_facts["time/copy_ms"] > 0 and stored_facts["machine/load"] is not None
+
+
+def test_a_baseline_that_does_not_serve_the_data_ended_the_trade_off(swept):
+    beside = {name.split("/")[1] for name in swept[0] if name.startswith("baseline/")}
+    assert beside == {"mean"}  # laws of distance are of powers
 
 
 def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):

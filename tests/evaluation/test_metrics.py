@@ -19,7 +19,6 @@ from gsparc.evaluation.metric_formats import (
     score_of,
 )
 from gsparc.evaluation.metrics import (
-    METRICS,
     ChannelMetrics,
     PowerMetrics,
     SpectrumMetrics,
@@ -79,7 +78,7 @@ def test_batches_change_nothing(kind):
         prediction, target = torch.rand(5, 1) + 0.1, torch.rand(5, 1) + 0.1
     else:
         prediction, target = spectra(5) if kind == "spectrum" else channels(5)
-    once, parts = METRICS[kind](), METRICS[kind]()
+    once, parts = OF_KIND[kind].metric(), OF_KIND[kind].metric()
     once.update(prediction, target)
     for rows in (slice(0, 2), slice(2, 5)):
         parts.update(prediction[rows], target[rows])
@@ -184,7 +183,7 @@ def test_power_figures_in_decibels(caplog):
 @pytest.mark.parametrize("kind", ["spectrum", "csi"])
 def test_paired_values_average_to_the_figures(kind):
     prediction, target = spectra() if kind == "spectrum" else channels()
-    metric = METRICS[kind](0.1)
+    metric = OF_KIND[kind].metric(0.1)
     metric.update(prediction, target)
     samples = metric.compute()
     figures = metric.summary(samples)
@@ -211,10 +210,10 @@ def test_what_nothing_was_measured_of_is_not_perfect(kind):
     unknown = target.clone()
     unknown[0] = torch.nan
     name = "psnr_db" if kind == "spectrum" else "snr_db"
-    kept = summarise(METRICS[kind](), prediction[1:], target[1:])
+    kept = summarise(OF_KIND[kind].metric(), prediction[1:], target[1:])
     for figures in (
-        summarise(METRICS[kind](), prediction, target, mask),
-        summarise(METRICS[kind](), prediction, unknown),
+        summarise(OF_KIND[kind].metric(), prediction, target, mask),
+        summarise(OF_KIND[kind].metric(), prediction, unknown),
     ):
         for figure in (name, "mse", "mae"):
             assert figures[figure] == pytest.approx(kept[figure]), figure
@@ -243,7 +242,7 @@ OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quanti
 def figure_names(kind):
     shape = {"spectrum": (1, 16, 16), "rssi": (1, 1)}.get(kind, (1, 1, 2))
     one = torch.ones(shape, dtype=torch.complex64 if "csi" in kind else torch.float32)
-    metric = METRICS[kind]()
+    metric = OF_KIND[kind].metric()
     metric.update(one, one)
     return set(metric.summary(metric.compute())) - {"samples", "silent_samples"}
 
@@ -267,5 +266,5 @@ def test_every_figure_knows_which_way_is_better():
 def test_channels_that_are_scored_after_their_freedom_had_no_table():
     """`gsparc compare` and reports of Wi-Fi channels ended in a KeyError."""
     scored = set(get_args(Scored))
-    assert set(OF_KIND) == set(METRICS) == scored
+    assert set(OF_KIND) == scored
     assert all(score_heading(DECIDING[one]) for one in scored)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from campaigns import compose, spectra
 from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
 from hydra.errors import MissingConfigException
 from invented import invent
 from refusals import refused
@@ -20,7 +21,7 @@ from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.experiment.cells import plugin_contenders
+from gsparc.evaluation.experiment.cells import unlisted_contenders
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 
@@ -44,6 +45,7 @@ def installed(tmp_path, monkeypatch):
         importlib.invalidate_caches()
         offer_plugins()
 
+    Plugins.instance()  # before the copy: they store choices, which later tests need
     monkeypatch.setattr(ConfigStore.instance(), "repo", {**ConfigStore.instance().repo})
     for group in ("model", "dataset"):
         ConfigStore.instance().repo[group] = {**ConfigStore.instance().repo.get(group, {})}
@@ -62,7 +64,8 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     predictor = gsparc.load(objects.checkpoints[0])  # its class is out of a file, and of a plugin: trusted
     assert predictor.rssi(rx=[30.0, 1.0, 1.5]).shape == (1,)
     assert datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name == "corridor"
-    assert plugin_contenders()["nearest_k"].overrides(None) == ["model=nearest_k"]
+    assert unlisted_contenders()["nearest_k"].overrides(None) == ["model=nearest_k"]
+    assert {*unlisted_contenders()} == {"nearest_k", "other_carriers", "direct_beam", "ridge"}
     again, *_ = evaluate_files([objects.checkpoints[0]])
     assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
 

@@ -21,7 +21,7 @@ class WoundClock:
 
 
 def wound(monkeypatch) -> SimpleNamespace:
-    """The clock that every stopwatch looks at."""
-    clocks = SimpleNamespace(monotonic=WoundClock())
+    """The clocks that every stopwatch looks at."""
+    clocks = SimpleNamespace(monotonic=WoundClock(), process_time=WoundClock())
     monkeypatch.setattr("gsparc.training.stopwatch.time", clocks)
     return clocks

@@ -90,13 +90,32 @@ def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
     context = FitContext(tmp_path / "fold0", stations="each")
     method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
     report = method.fit(data, fold, context)
-    checkpoint.save(
-        tmp_path / "fold0" / "model.ckpt", method, extra=fitting.run_extra(report, data, fold, context)
-    )
+    extra = fitting.run_extra(replace(report, cpu_s=50.0), data, fold, context)
+    checkpoint.save(tmp_path / "fold0" / "model.ckpt", method, extra=extra)
     again, found = fitting.fit_or_resume(
         PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0")
     )
     assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
+    assert found.cpu_s == 50.0
+
+
+@pytest.mark.parametrize("where", ["here", pytest.param("joblib", marks=pytest.mark.slow)])
+def test_processor_seconds_of_stations_that_were_finished_before_were_left_out(
+    town, tmp_path, elsewhere, where
+):
+    Resumable.stop_at = 0
+    if where != "here":
+        elsewhere(where)
+    fitting.fit_or_resume(PerStation(Resumable()), *town, FitContext(tmp_path / "run"))
+    for file in (tmp_path / "run").glob("station*/model.ckpt"):
+        stored = checkpoint.read(file)
+        extra = stored.extra | {"train_cpu_s": 10.0}
+        method = Resumable().create_as(stored.target)
+        method.restore(stored.site, stored.state)
+        checkpoint.save(file, method, stored.config, extra)
+    resumed = FitContext(tmp_path / "on", resume=tmp_path / "run")
+    _, report = fitting.fit_or_resume(PerStation(Resumable()), *town, resumed)
+    assert 30.0 < report.cpu_s < 31.0
 
 
 def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(

@@ -5,7 +5,7 @@ import pickle
 import pytest
 import yaml
 from campaigns import compose
-from clocks import wound
+from clocks import WoundClock, wound
 from doors import knock
 from refusals import refused
 
@@ -28,11 +28,16 @@ def test_an_effort_multiplies_every_count_and_rows_by_its_cube_root():
 
 def test_what_was_spent_before_and_elsewhere_counts(monkeypatch):
     """Processes of several devices are given a watch of theirs, by pickling."""
-    clock, watch = wound(monkeypatch).monotonic, Stopwatch(before=70.0)
-    clock.wind(2.0)
-    watch.charge(8.0)
-    assert watch.seconds == pytest.approx(80.0, abs=0.01)
-    assert pickle.loads(pickle.dumps(watch)).seconds == pytest.approx(80.0, abs=0.01)
+    clocks, watch = wound(monkeypatch), Stopwatch(before=70.0, cpu_before=5.0)
+    clocks.monotonic.wind(2.0)
+    clocks.process_time.wind(1.0)
+    watch.charge(8.0, cpu=2.0)
+    sent = pickle.dumps(watch)
+    clocks.process_time = WoundClock()  # another process has used none yet
+    there = pickle.loads(sent)
+    clocks.process_time.wind(0.5)
+    assert watch.seconds == pytest.approx(80.0, abs=0.01) == there.seconds
+    assert there.cpu_seconds == pytest.approx(8.5, abs=0.01) and watch.cpu_elsewhere == 7.0
 
 
 @pytest.mark.parametrize(("command", "word"), [

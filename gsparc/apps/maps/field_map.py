@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.geojson import write_shapes
 from gsparc.data.errors import DataError
-from gsparc.data.files import whole_file
+from gsparc.data.files import whole_file, write_archive
 from gsparc.data.limits import finite_array
 
 REFUSED = -1  # of `best_server`
@@ -114,8 +114,7 @@ class FieldMap:
             "unit": np.array(self.unit), "bands": np.array(self.bands, str),
             **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
         }  # fmt: skip
-        with whole_file(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        write_archive(path, arrays)
 
     def summarise(self) -> dict[str, float | int | str | None]:
         """Return `map/*` for `summary.json`; shares are of the cells that something is said of."""

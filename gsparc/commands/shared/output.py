@@ -17,6 +17,7 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import open_console, repeated_warnings
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_summary
+from gsparc.evaluation.table import Table
 from gsparc.prediction.timing import machine_facts
 
 
@@ -64,10 +65,17 @@ def show_training(
     drawn = config.split.get("seed") is not None and not split.of_release
     draw = f" (split.seed={config.split.seed})" if drawn else ""
     title = f"{facts['dataset/name']}, split {split.title}{draw}, {config.eval_on}, seed {config.seed}"
-    table = results_table(facts, facts["model/label"], title, config.eval_on)
+    tables = tables_of(facts, title, config.eval_on, stations)
     tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
-    worst = worst_stations(stations, facts["model/label"])
-    show_result(run_dir, *[table, *worst] * tested, lines=remarks(facts, config.eval_on))
+    show_result(run_dir, *tables * tested, lines=remarks(facts, config.eval_on))
+
+
+def tables_of(
+    facts: Mapping[str, Any], title: str, eval_on: str, stations: Mapping[str, Any]
+) -> list[Table]:  # fmt: skip
+    """Return the table of a method beside others, and that of the worst of its `stations`, if any."""
+    label = facts["model/label"]
+    return [results_table(facts, label, title, eval_on), *worst_stations(stations, label)]
 
 
 def finish_run(

@@ -16,18 +16,25 @@ from typing import Any, TypeVar
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.instantiate import from_settings, import_target, plugins
+from gsparc.data.files import load_yaml
+from gsparc.data.instantiate import from_settings, import_target
 from gsparc.data.limits import POSITIVE
 from gsparc.data.load import load, split_for
 from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
-from gsparc.evaluation.console import to_dict
+from gsparc.evaluation.console import config_folder, to_dict
 from gsparc.evaluation.experiment.options import REDRAW
 from gsparc.evaluation.experiment.runner import Job
 from gsparc.evaluation.ledger import measurements_hash
 from gsparc.models.powers.together.network import find_sectors
-from gsparc.models.registry import built_in_methods, fill_defaults
+from gsparc.models.registry import (
+    all_methods,
+    built_in_methods,
+    fill_defaults,
+    method_class,
+    plain_methods,
+)
 from gsparc.simulate.scenes.build import has_known_scene
 
 log = logging.getLogger(__name__)
@@ -98,7 +105,7 @@ class Problem:
     @property
     def network(self) -> bool:
         """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
-        several = self.kind == "rssi" and self.data.site.stations is not None
+        several = self.data.site.target.in_decibels and self.data.site.stations is not None
         return several and find_sectors(self.data) is not None
 
     @property
@@ -271,14 +278,24 @@ class Cell:
         return f"{self.dataset}/{self.split}/{self.method}/{effort}/{ANY if self.seed is None else self.seed}"
 
 
-def plugin_contenders() -> dict[str, Contender]:
-    """Return methods that are plugins; a class may name the `kinds` of data that it serves."""
-    found = {}
-    for name, path in plugins("model").items():
-        kind = import_target(path)
-        if name not in built_in_methods() and kind is not None:  # one that cannot be imported is warned of
-            found[name] = Contender(name, (), kind.takes_effort, tuple(getattr(kind, "kinds", ())))
-    return found
+class Unlisted(Contender):
+    """A method that the configuration does not name: its class tells which data it serves."""
+
+    def serves(self, problem: Problem) -> bool:
+        """See `Contender.serves`."""
+        kind, folds = method_class(self.name), problem.folds.folds
+        return super().serves(problem) and all(kind.stands_beside(problem.data, fold) for fold in folds)
+
+
+def unlisted_contenders() -> dict[str, Contender]:
+    """Return those of plugins and plain methods that conf/compare.yaml does not name."""
+    # The file, not the settings: `~methods.gp` on a command line leaves it out.
+    file = config_folder() / "compare.yaml"
+    listed = load_yaml(file.read_text(encoding="utf-8"), file)["methods"]
+    known = {*listed, *({*built_in_methods()} - {*plain_methods()})}
+    kinds = {name: import_target(path) for name, path in all_methods().items() if name not in known}
+    # One that cannot be imported is warned of.
+    return {name: Unlisted(name, effort=kind.takes_effort) for name, kind in kinds.items() if kind}
 
 
 def plan_cells(
@@ -321,7 +338,7 @@ def plan_cells(
 
 def plan_jobs(settings: Mapping[str, Any], cells_dir: Path) -> list[Job]:
     """List the fits that conf/compare.yaml asks for, see `plan_cells`."""
-    methods = plugin_contenders() | read_entries("methods", Contender, settings["methods"])
+    methods = unlisted_contenders() | read_entries("methods", Contender, settings["methods"])
     for effort in settings["efforts"]:
         POSITIVE.check("efforts", effort)
     problems = load_every_problem(settings)

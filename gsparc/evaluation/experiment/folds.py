@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -160,30 +159,26 @@ def fit_folds(
         fold = split.folds[number]
         return (data, fold) if learned is None else learned(data, fold)
 
-    def fitted(number: int) -> tuple[Method, FitReport, float]:
+    def fitted(number: int) -> tuple[Method, FitReport]:
         there, rows = of_fold(number)
-        # process_time counts all threads of this process, waiting for others excluded.
-        before = time.process_time()
         # Stations are counted in the data that are learned from, which `learned` may have changed.
-        unfitted = wrap_per_station(factory, there)
-        method, report = fitting.fit_or_resume(unfitted, there, rows, contexts[number])
-        return method, report, time.process_time() - before
+        return fitting.fit_or_resume(wrap_per_station(factory, there), there, rows, contexts[number])
 
-    by_fold: dict[int, tuple[Method, FitReport, float]] = {}
+    by_fold: dict[int, tuple[Method, FitReport]] = {}
     try:
         # Folds may end in any order: kept at once, so that an interrupt loses only those at work.
         for number, one in run_each(fitted, range(len(split.folds)), "folds"):
             by_fold[number] = one
             if keep is not None:
-                keep(number, *of_fold(number), *one[:2])
+                keep(number, *of_fold(number), *one)
     except KeyboardInterrupt as stopped:
         if len(contexts) == 1:
             raise
         cause, run_dir = str(stopped).partition("; ")[0] or "interrupted", contexts[0].run_dir.parent
         raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={run_dir}") from None
-    methods, reports, processor = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
+    methods, reports = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
-        methods, tuple(one.seconds for one in reports), processor, reports[0].notes,
-        sum((one.cost for one in reports), NO_COST),
+        methods, tuple(one.seconds for one in reports), tuple(one.cpu_s for one in reports),
+        reports[0].notes, sum((one.cost for one in reports), NO_COST),
     )  # fmt: skip

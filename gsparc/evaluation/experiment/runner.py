@@ -1,6 +1,6 @@
-"""A list of fits done one after the other in one process, which reads data once; each is kept as it ends.
+"""Lists of jobs, such as fits, done one after the other in one process, which reads data once.
 
-Their models are timed at the end, asked in turns, with nothing beside them.
+Each fit is kept as it ends; their models are timed at the end, asked in turns, with nothing beside them.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from __future__ import annotations
 import logging
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pandas as pd
 import torch
@@ -92,18 +92,46 @@ class Job:
 
 
 Fit = Callable[[Job, str | None], object]
+Piece, Made = TypeVar("Piece"), TypeVar("Made")
 
 
-def _tried(fit: Fit, job: Job) -> str:
-    """Why the job cannot be done, if so; one failing job does not stop the table."""
+def run_list(
+    make: Callable[[Piece], Made], pieces: Sequence[Piece], what: str, *, name: Callable[[Piece], str] = str,
+    refused: list[str] | None = None, **how: Any,
+) -> Iterator[tuple[Piece, Made]]:  # fmt: skip
+    """Yield pieces and what is made of each, as they end; one that cannot be made is said and left out.
+
+    Args:
+        make: may raise whatever a plugin does.
+        pieces, what, how: see `run_each`.
+        name: of a piece in the log.
+        refused: to which it is added why a piece cannot be made.
+    """
+    for number, (made, why) in run_each(partial(_tried, make), pieces, what, **how):
+        if not why:
+            yield pieces[number], made
+            continue
+        log.log(
+            logging.INFO if REFUSED in why else logging.WARNING, "%s is left out: %s",
+            name(pieces[number]), why,
+        )  # fmt: skip
+        if refused is not None:
+            refused.append(why)
+
+
+def _tried(make: Callable[[Piece], Made], piece: Piece) -> tuple[Any, str]:
+    """What is made of a piece, or why that cannot be; one that fails does not stop the others."""
     try:
-        run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse)
-        return ""
+        return make(piece), ""
     except Exception as error:  # any error of a plugin
-        if is_out_of_space(error):  # the others would be trained in vain
+        if is_out_of_space(error):  # the others would be made in vain
             raise
         unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
-        return error_in_one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
+        return None, error_in_one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
+
+
+def _fit_once(fit: Fit, job: Job) -> None:
+    run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse)
 
 
 def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float | None = None) -> pd.DataFrame:
@@ -136,25 +164,18 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
             log.warning("max_hours: %s is not started", one.name)
         return not late
 
-    here, refused = missing if train else [], dict[str, str]()
+    here, refused = missing if train else [], list[str]()
+    how: dict[str, Any] = {"cost": lambda one: one.expected_s, "wanted": fits, "refused": refused}
     try:
-        for number, why in run_each(
-            partial(_tried, fit), here, "cells", cost=lambda one: one.expected_s, wanted=fits
-        ):
-            name = str(here[number].name)
-            if why:
-                refused[name] = why
-                level = logging.INFO if REFUSED in why else logging.WARNING
-                log.log(level, "%s is left out: %s", name, why)
-                continue
-            found[name] = row = here[number].row()
+        for job, _ in run_list(partial(_fit_once, fit), here, "cells", name=lambda one: str(one.name), **how):
+            found[str(job.name)] = row = job.row()
             value = format(row["value"], number_format(row["figure"]))
-            log.info("%s: %s %s after %.1f s", name, row["figure"], value, row["train_s"])
+            log.info("%s: %s %s after %.1f s", job.name, row["figure"], value, row["train_s"])
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"
         raise KeyboardInterrupt(message) from None
     if refused and not found:
-        raise ValueError(next(iter(refused.values())))
+        raise ValueError(refused[0])
     return as_frame(found[str(one.name)] for one in jobs if str(one.name) in found)
 
 

@@ -17,6 +17,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.experiment.runner import Job, time_queries
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.ledger import measurements_hash
+from gsparc.evaluation.results import average
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import loading
 from gsparc.models.refined_places import move_rows
@@ -54,7 +55,7 @@ class Condition:
         if self.what not in ("train", "train_known"):
             return data, fold
         # Both ends of learning: validation rows are measured with the same instrument.
-        moved = add_position_errors(data, np.concatenate([fold.train, fold.val]), self.amount, seed)
+        moved = add_position_errors(data, fold.learned(), self.amount, seed)
         known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
         return replace(moved, position_std=known), fold
 
@@ -119,7 +120,7 @@ def ask_moved(fits: pd.DataFrame, conditions: Sequence[Condition]) -> pd.DataFra
             continue
         folds = [condition.change_training(data, fold, fit["seed"])[1] for fold in split.folds]
         own = {**fit, **asdict(condition), "model": fit["run"].checkpoints[0]}
-        own["rows"] = float(np.mean([len(fold.train) + len(fold.val) for fold in folds]))
+        own["rows"] = float(np.mean([len(fold.learned()) for fold in folds]))
         if condition.what == "query":
             tested = np.concatenate([fold.test for fold in split.folds])
             moved = add_position_errors(data, tested, condition.amount, fit["seed"])
@@ -147,12 +148,13 @@ def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: C
         NaN where there is no spread.
     """
     every, job = ask_moved(fits, conditions), fits.job.iloc[0]
-    every = every.astype(dict.fromkeys(("value", "train_s", "train_cpu_s"), float))
+    every = every.astype(dict.fromkeys(("train_s", "train_cpu_s"), float))
     # The model of the last round is timed: rounds differ in weights, not in size.
     last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
     median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
-    groups = every.groupby(["variant", "what", "amount"], sort=False)
-    rows = groups.agg(value=("value", "mean"), spread=("value", "std"), **last, **median).reset_index()
+    by = ["variant", "what", "amount"]
+    rows, averages = every.groupby(by, sort=False).agg(**last, **median), average(every, by, ["value"])
+    rows = rows.assign(value=averages["mean"].value, spread=averages["std"].value).reset_index()
     order = [list(fits.variant.unique()).index(variant) for variant in rows.variant]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     # Conditions that share a training share its model and its time: a file is timed once.
@@ -243,7 +245,7 @@ def thin_fold(fold: Fold, keep: float, seed: int) -> Fold:
         keep: a share of the rows up to 1; above, a number of rows.
         seed: of the choice.
     """
-    every = len(fold.train) + len(fold.val)
+    every = len(fold.learned())
     # Never more than there are.
     total = min(round(keep * every if keep <= 1 else keep), every)
     # One validation row at least, where there is one: it decides when to stop.

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.baselines import PLAIN
 from gsparc.evaluation.experiment.runner import TIMED
 from gsparc.evaluation.metric_formats import (
     CALIBRATION,
@@ -18,25 +17,28 @@ from gsparc.evaluation.metric_formats import (
     WITH_SILENT,
     heading_of,
     lower_is_better,
-    number_format,
     score_heading,
 )
 from gsparc.evaluation.paired import lead_over_runs
-from gsparc.evaluation.results import score_db
+from gsparc.evaluation.results import average, score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
-from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Interval, Row, Table, value_with_error
+from gsparc.evaluation.table import (
+    CPU,
+    P50,
+    P95,
+    TRAIN,
+    Column,
+    Interval,
+    Row,
+    Table,
+    figure_column,
+    value_with_error,
+)
+from gsparc.models.registry import plain_methods
 
-BESIDE = {  # figures beside the score, and their headings, by their columns
-    "coverage": ("interval/coverage_90", Column("in 90 % interval", ".2f", of="coverage")),
-    "outage": ("outage/brier", Column("outage, Brier score", ".4f", of="outage")),
-    "after_constant": (
-        "rmse_db_after_constant", Column("after a constant, dB", ".2f", of="after_constant"),
-    ),
-    "chi2": (CALIBRATION, Column(heading_of(CALIBRATION), number_format(CALIBRATION), of="chi2")),
-    **{
-        name: (name, Column(heading_of(name), number_format(name), of=name))
-        for name in ("psnr_db_median", "ssim_gauss_median", "snr_db_p50", "mae_db_median")
-    },
+BESIDE = {  # figures beside the score, by their columns
+    "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
+    "chi2": CALIBRATION, **{name: name for figures in OF_KIND.values() for name in figures.compared},
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
@@ -59,7 +61,7 @@ def _scored(own: Row) -> dict[str, Any]:
     label = str(own["label"] or "")
     return {
         "result": own, "score_db": score_db(own), "second_figure": second, "second_value": own.get(second),
-        **{name: own.get(key) for name, (key, _) in BESIDE.items()},
+        **{name: own.get(figure) for name, figure in BESIDE.items()},
         "label": label[label.find(" (") :] if " (" in label else "",
     }  # fmt: skip
 
@@ -94,19 +96,20 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
     own: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
     cells = pd.DataFrame([{**row, **_scored(row)} for row in own])
-    cells = cells.astype(dict.fromkeys(["effort", *means], float))
+    cells = cells.astype({"effort": float})
     # Draws with the same test rows are seeds.
     drawn = cells.groupby(PROBLEM)[["draw", "seed"]].transform("nunique")
     cells["draws"] &= (drawn["draw"] > 1) | (drawn["seed"] == 1)
     groups = cells.groupby(GROUP, dropna=False, sort=False)
-    rows = groups[means].mean()
+    averages = average(cells, GROUP, means)
+    rows = averages["mean"].copy()
     rows[["figure", "second_figure"]] = groups[["figure", "second_figure"]].first()
     rows["seeds"], several = groups.size(), groups["draws"].any()
     rows["results"] = groups["result"].agg(list)
     rows["draws"] = several
-    # Over draws the mean is what is told, hence sem; over seeds the scatter of one training.
-    rows["spread_db"] = groups["score_db"].std().where(~several, groups["score_db"].sem())
-    rows["value_error"] = groups["value"].sem().where(several)
+    # Over draws the mean is what is told, hence its error; over seeds the scatter of one training.
+    rows["spread_db"] = averages["error"].score_db.where(several, averages["std"].score_db)
+    rows["value_error"] = averages["error"].value
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())
@@ -162,7 +165,7 @@ def title_of(block: pd.DataFrame) -> str:
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     """Return what the table shows about simple baselines and about our own default, favourable or not."""
-    rows = list(block.itertuples())
+    rows, plain = list(block.itertuples()), plain_methods()
     first = rows[0]
     level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
     lines = [f"first: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
@@ -177,12 +180,12 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
         lines.append(gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure))
-    if first.method in PLAIN and not block.method.isin(PLAIN).all():
+    if first.method in plain and not block.method.isin(plain).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
         if own is None or lead is None or lead.sure:
             lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
     for row in rows[1:]:
-        if own is None or row.method not in PLAIN or row.score_db <= own.score_db:
+        if own is None or row.method not in plain or row.score_db <= own.score_db:
             continue
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
@@ -214,7 +217,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second_figure.iloc[0], of="second_value")),
-        *((block[name].notna().any(), column) for name, (_, column) in BESIDE.items()),
+        *((block[n].notna().any(), figure_column(beside, of=n)) for n, beside in BESIDE.items()),
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import pandas as pd
@@ -14,6 +14,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baselines import fit_baseline
+from gsparc.evaluation.experiment.runner import run_list
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import deciding_figure, score_of
 from gsparc.evaluation.scores import rows_to_score, score_methods
@@ -23,15 +24,12 @@ from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import Settings
 from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.timing import ClockSettings, time_beside_copy
-
-log = logging.getLogger(__name__)
+from gsparc.prediction.timing import FACTS, ClockSettings, time_beside_copy
 
 POINT = (  # columns of the table of points
     Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
     Column("ms p95", ".3g", of="render_ms_p95"),
 )  # fmt: skip
-TIMES = {"render_ms_p50": "query_ms", "render_ms_p95": "query_p95_ms", "ratio_to_copy": "to_copy"}
 MADE = ["settings", "figure", "value", "score"]  # columns that are not in `tradeoff.csv`
 CLOSEST_DB = 100.0  # the precision of float32
 
@@ -45,7 +43,8 @@ def measure_points(
     Args:
         candidates: what a method is reduced by, and the method that answers so.
         threads: CPU threads that each is timed with.
-        baselines: names of others beside them; those whose deciding figure is not defined are left out.
+        baselines: names of others beside them; those that do not serve the data, or whose deciding figure is
+            not defined, are left out, as are candidates that fail.
         data, split: as the model was trained with, its fold.
         eval_on: rows whose figures are shown.
         clock: how long to measure.
@@ -59,41 +58,48 @@ def measure_points(
     Raises:
         ValueError: these rows do not define the deciding figure.
     """
-    ways: list[dict[str, Any]] = []
-    asked: list[Method] = []
-    for number, (settings, method) in enumerate(candidates):
-        means: list[Tensor] = []
-        own = pool_figures(score_methods([method], data, split, eval_on, means=means), data, split)
-        answers = torch.cat(means)
-        if not ways:
-            whole = answers
-        own |= {"closeness_db": closeness_db(answers, whole), "front": 0, "kept_with_model": 0}
+    how = data, split, eval_on
+
+    def score(candidate: tuple[Settings, Method]) -> dict[str, Any]:
+        figures, answers = _score(candidate[1], *how)
+        return figures | {"closeness_db": closeness_db(answers, whole)}
+
+    own, whole = _score(candidates[0][1], *how)
+    figure, ways = deciding_figure(own, data.site.scored), list[dict[str, Any]]()
+    first = candidates[0], own | {"closeness_db": closeness_db(whole, whole)}
+    others = run_list(score, candidates[1:], "points", name=lambda one: describe_point(one[0]))
+    for (settings, method), own in chain([first], others):
+        knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
+        own |= {"front": 0, "kept_with_model": 0}
         for used in threads:
             label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
             sizes = {"threads": used, "num_gaussians": method.count_components(), "settings": settings}
-            knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
-            ways.append({"label": label, **dict.fromkeys(TIMES), **own, **sizes, **knobs})
-            asked.append(method)
-        if number % 10 == 9:
-            log.info("%d of %d faster variants scored", number + 1, len(candidates))
-    figure, count = deciding_figure(ways[0], data.site.scored), len(ways)
-    for name in baselines:
-        fitted = fit_baseline(name, data, split, eval_on)
+            row = {"label": label, **dict.fromkeys(FACTS.values()), **own, **sizes, **knobs}
+            ways.append(row | {"method": method})
+    count = len(ways)
+    for name, fitted in run_list(lambda one: fit_baseline(one, *how), baselines, "baselines"):
         own = pool_figures(fitted.scores, data, split)
         if own[figure] is not None:
-            ways.append({**own, "label": name, "threads": 1})
-            asked.append(fitted.methods[0])
+            ways.append({**own, "label": name, "threads": 1, "method": fitted.methods[0]})
+    rows = pd.DataFrame(ways, dtype=object)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
-    calls = {i: Predictor(method, data.site).cycle_places(places) for i, method in enumerate(asked)}
-    times = pd.DataFrame(time_beside_copy(calls, clock, {i: way["threads"] for i, way in enumerate(ways)})).T
-    rows = pd.DataFrame(ways, dtype=object).assign(**{name: times[of] for name, of in TIMES.items()})
+    calls = {i: Predictor(method, data.site).cycle_places(places) for i, method in rows.pop("method").items()}
+    times = pd.DataFrame(time_beside_copy(calls, clock, rows.threads.to_dict())).T
+    rows = rows.assign(**{fact: times[name] for name, fact in FACTS.items()})
     rows = rows.assign(figure=figure, value=[defined_figure(way, figure) for way in ways])
     rows["score"] = [score_of(figure, value) for value in rows.value]
     points, beside = rows[:count].copy(), rows[count:]
     for column, by in (("front", points.score), ("kept_with_model", points.closeness_db)):
         points.loc[pareto_front(points.render_ms_p50.to_list(), by.to_list()), column] = 1
     return points.sort_values("render_ms_p50", kind="stable"), beside
+
+
+def _score(method: Method, data: Measurements, split: Split, eval_on: str) -> tuple[dict[str, Any], Tensor]:
+    """Figures of a method, and its answers (n, ...) in the order of batches."""
+    means: list[Tensor] = []
+    scores = score_methods([method], data, split, eval_on, means=means)
+    return pool_figures(scores, data, split), torch.cat(means)
 
 
 def closeness_db(answers: Tensor, whole: Tensor) -> float:

@@ -22,7 +22,7 @@ from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.evaluation.report import tables
-from gsparc.evaluation.results import STUDY, own_rows, score_db, short_settings
+from gsparc.evaluation.results import STUDY, average, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -101,7 +101,7 @@ def warnings(rows: pd.DataFrame) -> list[str]:
     scored = own[own.value.notna()]
     score = scored.apply(score_db, axis=1).astype(float) if len(scored) else scored.value
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
-        best = str(score.groupby(scored.setting, sort=False).mean().idxmax())
+        best = str(average(scored.assign(score=score), ["setting"], ["score"])["mean"].score.idxmax())
         facts = scored.run[scored.setting == best].iloc[0].facts
         for ahead, figure in judged_by(facts).items():
             every = tables.leads_of_baselines(rows[rows.run.isin(scored.run)], best, figure)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 
 import numpy as np
@@ -10,8 +10,8 @@ import pandas as pd
 
 from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format
 from gsparc.evaluation.paired import Lead, lead_over_runs
-from gsparc.evaluation.results import distinct_baselines, own_rows
-from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table
+from gsparc.evaluation.results import average, distinct_baselines, own_rows
+from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table, figure_column
 from gsparc.processes.uncertainty import central_interval
 
 # Quantiles at 2.5 % of 1000 draws rest on 25 of them: two digits of an interval.
@@ -67,18 +67,14 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
     return (values, None) if len(values) > 1 else None
 
 
-def pooled_interval(values: Sequence[float | None], draws: Sequence[str]) -> Interval | None:
-    """Return the mean over draws of the split and its standard error, seeds of each averaged.
-
-    Of one draw with the least and largest over seeds; None where none has a value.
-    """
-    known = pd.DataFrame({"value": values, "draw": draws}).dropna()
-    means = known.groupby("draw").value.mean()
-    if len(means) > 1:
-        return Interval(means.mean(), error=means.sem())
+def _interval(average: pd.Series) -> Interval | None:
+    """Mean and standard error over draws; of one draw mean, least and largest over seeds."""
+    if np.isnan(average["mean"]):
+        return None
+    if not np.isnan(average["error"]):
+        return Interval(average["mean"], error=average["error"])
     # A single seed has no spread: no brackets.
-    ends = (known.value.min(), known.value.max()) if len(known) > 1 else ()
-    return Interval(known.value.mean(), *ends) if len(known) else None
+    return Interval(average["mean"], *([] if np.isnan(average["std"]) else average[["least", "largest"]]))
 
 
 def has_draws(rows: pd.DataFrame) -> bool:
@@ -99,11 +95,6 @@ def leads_of_baselines(rows: pd.DataFrame, setting: str, figure: str) -> dict[st
 def _judged(rows: pd.DataFrame, figure: str) -> list[Row]:
     """The rows as they are judged by this figure."""
     return rows.assign(figure=figure, value=rows.get(figure)).to_dict("records")  # type: ignore[return-value]
-
-
-def accuracy_column(figure: str, note: str = "") -> Column:
-    """Return a test figure, with its interval."""
-    return Column(heading_of(figure), number_format(figure), note, partial(interval_of_figure, figure=figure))
 
 
 def _figures(rows: pd.DataFrame) -> list[str]:
@@ -131,8 +122,9 @@ def table_of_results(rows: pd.DataFrame) -> Table:
     """
     note = "95 % interval: bootstrap over test samples"
     columns = [
-        *_run_columns(rows), *(accuracy_column(f, note) for f in _figures(rows)),
-        Column(heading_of(CALIBRATION), number_format(CALIBRATION), "1: deviations are right", CALIBRATION),
+        *_run_columns(rows),
+        *(figure_column(f, note, partial(interval_of_figure, figure=f)) for f in _figures(rows)),
+        figure_column(CALIBRATION, "1: deviations are right"),
         TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
         Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
@@ -152,11 +144,12 @@ def table_of_seeds(rows: pd.DataFrame) -> Table:
     """
     differs, several, spread = differing_settings(rows), has_draws(rows), _spread_columns(rows)
     also = [Column("differs, too", "")] if any(differs.values()) else []
-    lines = []
-    for setting, group in groups_of(pd.concat([own_rows(rows), distinct_baselines(rows)])).items():
+    lines, shown = [], pd.concat([own_rows(rows), distinct_baselines(rows)])
+    averages = average(shown, ["setting"], names := [str(column.of) for column in spread])
+    for setting, group in groups_of(shown).items():
         seeds = group.seed.nunique(dropna=False)
         counts = [group.draw.nunique(), seeds] if several else [len(group)]
-        values = [pooled_interval(group.apply(column.value, axis=1), group.draw) for column in spread]
+        values = [_interval(averages.loc[setting].xs(name, level=1)) for name in names]
         lines.append([setting, *([differs.get(setting)] if also else []), *counts, *values])
     counted = [Column("draws", "d")] * several + [Column("seeds", "d")]
     note = "Brackets: least and largest over seeds, on the same test rows: split.seed draws others "
@@ -190,7 +183,7 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
 
 
 def _spread_columns(rows: pd.DataFrame) -> list[Column]:
-    figures = [Column(heading_of(f), number_format(f), of=f) for f in _figures(rows)]
+    figures = [figure_column(figure) for figure in _figures(rows)]
     if rows.alone.notna().any():
         deciding = rows.figure.iloc[0]
         name = f"{heading_of(deciding)} of Gaussians alone"

@@ -201,6 +201,8 @@ class DistanceLaw(Differentiable):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"
+    plain_place = 70
+    kinds = ("rssi",)
     stored = ("law",)
     uses_censored = True
 

@@ -27,6 +27,12 @@ class Ridge(UplinkMethod):
     """
 
     name = "ridge"
+    plain_place = 110
+
+    @classmethod
+    def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
+        """See `MethodFactory.stands_beside`: of a band beside another."""
+        return data.uplink is not None
 
     def __init__(self, inputs: Literal["own", "all"] = "own") -> None:
         if inputs not in ("own", "all"):

@@ -58,6 +58,12 @@ class OneArray(Method):
     exponent: int  # of a pixel that is its power
     places: Tensor  # (n, 3) float64 [m], local, of training rows, each once
     mean: Tensor  # (H * W,) of all training rows
+
+    @classmethod
+    def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
+        """See `MethodFactory.stands_beside`: of one array at several carriers."""
+        return carriers_obstacle(data.site) is None
+
     _spectra: ExpectedSpectra | None = None
 
     def learns_jointly(self, site: Site) -> bool:

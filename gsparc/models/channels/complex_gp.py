@@ -26,6 +26,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import Group, Slot, fit_run_factors, negative_log_likelihood
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
+from gsparc.models.per_station import stations_of_fold
 from gsparc.models.run_factors import RunFactors
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import TINY
@@ -61,12 +62,23 @@ class ComplexGP(ClosedForm):
     """
 
     name = "complex_gp"
+    plain_place = 100
+    kinds = ("csi",)
     both_ends = True
     count_gaussians = 0  # type: ignore[assignment]
 
     def __init__(self) -> None:
         self.site: Site | None = None
         self.posterior: Posterior | None = None
+
+    @classmethod
+    def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
+        """See `MethodFactory.stands_beside`: carrier and all stations must be known."""
+        site = data.site
+        carriers = (site.carrier_hz, None if site.stations is None else site.stations.carrier_hz)
+        if not super().stands_beside(data, fold) or all(one is None for one in carriers):
+            return False
+        return data.station is None or not stations_of_fold(cls(), data, fold).only_tested.any()
 
     @property
     def label(self) -> str:

@@ -185,7 +185,7 @@ class TrainedPeer(Method):
         self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        return FitReport(watch.seconds, (note, *result.notes))
+        return FitReport(watch.seconds, (note, *result.notes), cpu_s=watch.cpu_elsewhere)
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> NetworkModule:
         """Return what Lightning trains, with a schedule of `steps`."""

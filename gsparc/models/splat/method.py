@@ -164,7 +164,7 @@ class LearnedField(Method):
         if left is not None:
             origin.require_same(left)
         marks = {} if left is None else left.extra
-        watch = Stopwatch(float(marks.get("spent_s", 0.0)))
+        watch = Stopwatch(*(float(marks.get(name, 0.0)) for name in ("spent_s", "spent_cpu_s")))
         self._begin_fit(data, fold, marks)
         for stage in self._plan_stages(data, fold, context, left):
             module = self._start_stage(stage, data, watch)
@@ -183,7 +183,7 @@ class LearnedField(Method):
         self.frozen = self._doubled = None
         what, count = f"final, {self.steps} of {self.steps_taken} steps kept", self.count_components()
         context.log_curve(watch.seconds, what, step=self.steps_taken, num_gaussians=count)
-        return FitReport(watch.seconds, self._ended)
+        return FitReport(watch.seconds, self._ended, cpu_s=watch.cpu_elsewhere)
 
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """See `MethodFactory`."""
@@ -323,6 +323,7 @@ class LearnedField(Method):
         """What `_begin_fit` reads of a run that is interrupted in a stage."""
         return {
             "stage": stage.name, "earlier_s": self._earlier_s, "spent_s": watch.seconds,
+            "spent_cpu_s": watch.cpu_seconds,
             "ended": [*self._ended], "paying": self._paying, "init_s": self.init_s,
             "taken": self.steps_taken,
             "left_out": to_plain(self._left_out), **origin.to_extra(),
