@@ -9,6 +9,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+import field_table
 import pandas as pd
 import pytest
 from hydra import compose, initialize_config_module
@@ -43,6 +44,13 @@ def test_a_tutorial_imported_a_name_that_was_gone():
     assert lines
     gone = [f"{home}.{n}" for home, names in lines for n in names.split(", ") if not can_import(home, n)]
     assert not gone
+
+
+def test_the_fields_table_is_its_csv():
+    """`python tests/helpers/field_table.py` writes the tables."""
+    page = field_table.PAGE.read_text(encoding="utf-8")
+    measured = page.split(field_table.BEGIN)[1].split(field_table.END)[0]
+    assert measured.strip() == field_table.text(field_table.collect([field_table.FILE])).strip()
 
 
 def can_import(module: str, name: str) -> bool:

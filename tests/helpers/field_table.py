@@ -33,6 +33,11 @@ WHAT = {  # of data and splits, for the headings
     "city/drawn": "powers of a campus", "city/blocks_300m": "powers of a campus, squares of 300 m",
 }  # fmt: skip
 
+MEDIANS = {  # over test rows
+    "psnr_db_median": "median PSNR dB", "ssim_gauss_median": "median SSIM", "snr_db_p50": "median SNR dB",
+    "mae_db_median": "median error dB",
+}  # fmt: skip
+
 
 def collect(files: Iterable[str | Path]) -> pd.DataFrame:
     """Return rows of tables; of the same fit those of the last file, and the last times of a query."""
@@ -54,8 +59,8 @@ def _section(name: str, rows: pd.DataFrame) -> str:
     columns = [
         Column("method", "", of=_named), Column("beside places", "", of="given"),
         Column(score_heading(figure), ".2f", of=_score),
-        Column(rows.second_figure.iloc[0], of="second_value"),
-        CPU, P50, Column("Gaussians", ".0f", of="gaussians"),
+        *(Column(heading, ".3g", of=name) for name, heading in MEDIANS.items() if rows[name].notna().any()),
+        CPU, P50, Column("Gaussians", ".0f", of=lambda row: row["gaussians"] or None),
     ]  # fmt: skip
     columns = [one for one in columns if one.of != "given" or rows.given.any()]
     made = f"{rows.seeds.max()} draws (± standard error)" if draws else "one split, one seed"
