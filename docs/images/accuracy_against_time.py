@@ -2,10 +2,9 @@
 
 python docs/images/accuracy_against_time.py
 
-Reads `docs/results/compare/efforts.csv`, the RFID release's random split, written by `gsparc compare
-datasets.rfid.root=DIR efforts=[.1,.3,1,3] "only=['rfid/random/*']" ~methods.gaussians ~methods.residual
-~methods.paper`; a line joins efforts. The paper's recipe to its end, of one seed, is
-of `docs/results/paper/runs.csv`: its query was timed in another run, and is not drawn.
+Reads the RFID release's random split of `docs/results/table.csv` (docs/table.md says which command); a line
+joins efforts. The paper's recipe to its end, of one seed, is of `docs/results/paper/runs.csv`: its query was
+timed in another run, and is not drawn.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pathlib import Path
 from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
 
 HERE = Path(__file__).parent
-TABLE = HERE.parent / "results" / "compare" / "efforts.csv"
+TABLE = HERE.parent / "results" / "table.csv"
 PAPER = HERE.parent / "results" / "paper" / "runs.csv"
 # Per method: its name in the literature, and the label's offset from the point [points] in the left and the
 # right panel.
@@ -30,6 +29,7 @@ METHODS: dict[str, tuple[str, tuple[int, int], tuple[int, int]]] = {
     "swiftwrf": ("SwiftWRF", (8, 4), (8, 8)),
     "wrfgs": ("WRF-GS+", (8, -4), (8, -4)),
     "ngrf": ("nGRF", (8, 0), (8, 0)),
+    "published_ngrf": ("", (8, 0), (8, 0)),
     "gsrf": ("GSRF", (8, 0), (-8, 0)),
     "nerf2": ("NeRF2", (8, 0), (-8, 0)),
     "paper": ("GSpaRC, as published", (-8, 0), (-8, 0)),
@@ -39,7 +39,8 @@ METHODS: dict[str, tuple[str, tuple[int, int], tuple[int, int]]] = {
 def main() -> None:
     """Read the table, draw both panels, write the picture."""
     with TABLE.open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        every = csv.DictReader(file)
+        rows = [row for row in every if (row["dataset"], row["split"]) == ("rfid", "random")]
     with PAPER.open(encoding="utf-8") as file:
         ended = next(r for r in csv.DictReader(file) if r["run"] == "text")  # of the same rows
     rows.append({"method": "paper", "score_db": ended["psnr_db"], "train_cpu_s": ended["train_cpu_s"]})
@@ -52,7 +53,7 @@ def main() -> None:
         style, ours, own = style_of(name), name == "gsparc", [r for r in rows if r["method"] == name]
         for axis, cost, (right, up) in zip(axes, ("train_cpu_s", "query_ms"), beside, strict=True):
             # In the order of efforts: a busy core makes a larger one seem quicker.
-            places = [(max(float(row[cost]), 1e-3), float(row["score_db"])) for row in own if cost in row]
+            places = [(max(float(row[cost]), 1e-3), float(row["score_db"])) for row in own if row.get(cost)]
             if not places:
                 continue
             axis.plot(*zip(*places, strict=True), **style.marked, markersize=15 if ours else 7)

@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 EXECUTED = ROOT / "build" / "executed"
 TABLE = re.compile(r"^<!-- table: (\S+\.csv) -->$", re.MULTILINE)  # its path from the root
 SETTINGS = "<!-- settings -->"
+SORT = ROOT / "gsparc" / "evaluation" / "report" / "sort.js"  # tables are sorted as in reports
 TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 
 
@@ -26,6 +27,7 @@ def on_files(files: Files, config: Any) -> Files:
     for name in TAKEN:
         text = (ROOT / name).read_text(encoding="utf-8").replace("](docs/", "](")
         files.append(File.generated(config, name, content=text))
+    files.append(File.generated(config, "site/sort.js", content=SORT.read_text(encoding="utf-8")))
     return files
 
 

@@ -18,6 +18,7 @@ from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED, save
 from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.experiment.cells import plan_jobs
+from gsparc.evaluation.experiment.published import beside_published, read_published
 from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
 from gsparc.evaluation.experiment.table import (
     CELL,
@@ -42,6 +43,7 @@ def task(config: DictConfig) -> pd.DataFrame:
     run_dir, settings = begin_run(config)
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)
+    published = read_published(settings["beside"]) if settings["beside"] else None
     folder = settings["cells"]
     cells_dir = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     jobs = plan_jobs(settings, cells_dir)
@@ -53,21 +55,23 @@ def task(config: DictConfig) -> pd.DataFrame:
     if filled.empty:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     timed = time_by_dataset(filled) if settings["latency"] else None
-    return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"])
+    return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"], published)
 
 
 def write_comparison(
     filled: pd.DataFrame, timed: pd.DataFrame | None, ours: str, run_dir: Path,
-    figures: Sequence[str] = (),
+    figures: Sequence[str] = (), published: pd.DataFrame | None = None,
 ) -> pd.DataFrame:  # fmt: skip
     """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
 
-    `figures` are formats beside PNG, see `drawing.save`.
+    `figures` are formats beside PNG, see `drawing.save`; `published`: rows that stand beside, see
+    `read_published`.
 
     Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`;
     each has the distributions of its methods' errors, and of spectra the same rows as all predict them.
     """
     rows = average_cells(filled, timed)
+    rows = rows if published is None else beside_published(rows, published)
     blocks = split_by_problem(rows)
     write_samples(run_dir / "compare.csv", columns_of_csv(rows))
     write_samples(run_dir / "cells.csv", filled[CELL].to_dict("list"))

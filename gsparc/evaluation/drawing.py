@@ -71,6 +71,7 @@ METHODS = {
     "residual": MethodStyle("#56B4E9", "h", True), "wrfgs": MethodStyle("#4B5320", "D"),
     "array": MethodStyle("#4B5320", "X", True), "nerf2": MethodStyle("#000000", "o"),
     "image_source_gp": MethodStyle("#000000", "v"), "nearest": MethodStyle("#332288", "^"),
+    "wideband": MethodStyle("#332288", "D", True),
     "gsrf": MethodStyle("#882255", "P"), "ngrf": MethodStyle("#882255", "s", True),
     "mean": MethodStyle(GREY, "o"), "zero": MethodStyle(GREY, "X", True),
 }  # fmt: skip

@@ -23,7 +23,7 @@ from gsparc.prediction.timing import FACTS, p50_p95
 OF_RUN = {
     "dataset": "dataset/name", "split": "split/name", "seed": "seed", "kind": "dataset/kind",
     "load": "machine/load", "data": "dataset/sha256", "git": "git", "simulate_s": "dataset/simulate_s",
-    "rows": "split/sha256",
+    "rows": "split/sha256", "run_id": "run_id", "cpu": "machine/cpu",
 }  # fmt: skip
 OF_MODEL = {
     "label": "model/label", "gaussians": "model/num_gaussians", "memory_mb": "memory/peak_mb",

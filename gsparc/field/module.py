@@ -38,8 +38,8 @@ class NetworkModule(L.LightningModule):
     """Trains a network by its own loss.
 
     Args:
-        model: called with tx (B, 3) [m] and receiver poses, gives targets (B, ...); `loss(batch, draw)` is ()
-            of a batch, with a generator for what is drawn at random.
+        model: called with a query, gives targets (B, ...); `loss(batch, draw)` is () of a batch, with a
+            generator for what is drawn at random.
         site: what the data declare.
         rates: of its schedule, and of its parameters where `rate_of` does not say.
         total_steps: length of the schedules.
@@ -68,7 +68,7 @@ class NetworkModule(L.LightningModule):
 
     def mean(self, batch: Batch) -> Tensor:
         """Return targets (B, ...) as predicted."""
-        return self.model(batch.tx, batch.rx)
+        return self.model(batch)
 
     def losses(self, batch: Batch) -> StepLosses:
         """Return the losses of a step."""

@@ -17,7 +17,7 @@ from gsparc.models.registry import method_class
 
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docs" / "results" / "compare" / "settings.csv"
-PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf")
+PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf", "wideband")
 NO_SETTING = ("_target_", "name", "seed")
 
 

@@ -51,7 +51,7 @@ PLAIN = ("mean", "nearest", "idw", "gp", "kriging")
 INVENTED = [(kind, end) for kind in ("spectrum", "csi", "rssi") for end in ("rx", "tx")]
 # Settings of trainings that are over at once.
 SMALL: dict[str, dict[str, Any]] = {
-    **{name: {"count": 40, "max_steps": 3} for name in ("gsrf", "wrfgs", "swiftwrf", "ngrf")},
+    **{name: {"count": 40, "max_steps": 3} for name in ("gsrf", "wrfgs", "swiftwrf", "ngrf", "wideband")},
     **{name: {"width": 16, "samples": 8, "max_steps": 3} for name in ("nerf2", "newrf")},
 }
 UPLINK: dict[str, dict[str, Any]] = {
@@ -65,8 +65,8 @@ MAKES = {  # what others than of received powers are fitted to
     **dict.fromkeys(("complex_gp", "channels", "image_sources"), kinds.gains),
     **dict.fromkeys(("array", "splat", "array_process"), kinds.static_array),
     **dict.fromkeys(("moving_array", "bearings"), kinds.moving_array),
-    **dict.fromkeys(("carriers", "other_carriers", "direct_beam"), kinds.carriers),
     **dict.fromkeys(SMALL, lambda folder: lobes(folder)[0]),
+    **dict.fromkeys(("carriers", "other_carriers", "direct_beam", "wideband"), kinds.carriers),
     **dict.fromkeys(("ngrf", "newrf"), lambda _: room(40, directions=True)[0]),
     **dict.fromkeys(UPLINK, lambda _: city("all")),
     "ridge, all antennas": lambda _: city(0),  # of one antenna

@@ -82,7 +82,10 @@ def test_left_out_it_had_never_been_and_kept_it_is_finite_or_refused(files, tmp_
 MAKE = {  # measurements that methods train or search on, and these methods
     "spectra": (kinds.images, ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc")),
     "spectra of a known array": (kinds.static_array, ("array", "array_process", "ngrf", "gsparc")),
-    "spectra at carriers": (kinds.carriers, ("carriers", "other_carriers", "direct_beam", "gsparc")),
+    "spectra at carriers": (
+        kinds.carriers,
+        ("carriers", "other_carriers", "direct_beam", "wideband", "gsparc"),
+    ),
     "spectra of a moving array": (kinds.moving_array, ("moving_array", "bearings", "gsparc")),
     "channels": (kinds.bands, ("gsrf", "ngrf", "image_source_gp", "image_sources", "channels", "gsparc")),
     "channels with directions": (lambda _: directed(60)[0], ("newrf", "directional_gp", "gsparc")),

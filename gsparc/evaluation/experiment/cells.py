@@ -7,7 +7,7 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
@@ -93,6 +93,11 @@ class Problem:
     draw: int | None = None
 
     @property
+    def name(self) -> str:
+        """dataset/split."""
+        return f"{self.dataset}/{self.split}"
+
+    @property
     def kind(self) -> Scored:
         """Of the measurements."""
         return self.data.site.scored
@@ -115,14 +120,16 @@ class Problem:
 
 
 def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
-    """Return named settings of conf/compare.yaml, `methods` or `splits`; an empty entry has defaults.
+    """Return named settings of conf/compare.yaml, `methods` or `splits`; one that is null is left out.
 
     Raises:
         ValueError: an entry with an unknown setting.
     """
     entries = {}
     for name, entry in config.items():
-        own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry or {}).items()}
+        if entry is None:
+            continue
+        own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()}
         entries[str(name)] = from_settings(of, {"name": str(name), **own}, f"{group}.{name}")
     return entries
 
@@ -184,7 +191,7 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     Raises:
         ValueError: no dataset has a path, or none of those that have one is wanted.
     """
-    wanted = [str(pattern) for pattern in settings["only"]]
+    wanted = wanted_cells(settings)
     splits = read_entries("splits", SplitChoice, settings["splits"])
     problems, absent = list[Problem](), list[str]()
     for name, own in ((name, own or {}) for name, own in settings["datasets"].items()):
@@ -213,6 +220,21 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     return problems
 
 
+def wanted_cells(settings: Mapping[str, Any]) -> list[str]:
+    """Return the patterns of `only`, which may be the name of one of the comparison's `parts`.
+
+    Raises:
+        ValueError: a name that no part has.
+    """
+    only, parts = settings["only"], settings["parts"]
+    if not isinstance(only, str):
+        return [str(pattern) for pattern in only]
+    if only not in parts:
+        have = ", ".join(parts) or "no part here"
+        raise ValueError(f"only={only}: a list of patterns, or the name of a part ({have})")
+    return [str(pattern) for pattern in parts[only]]
+
+
 def _may_match(pattern: str, dataset: str, split: str) -> bool:
     """Whether a pattern of cells can match this problem, so that others need not be loaded."""
     # Up to the first of its signs, which may stand for all that follows.
@@ -229,6 +251,9 @@ class Contender:
         choose: overrides of train.yaml that select it; empty: `model=<name>`.
         effort: whether it takes part once for every effort and seed, or once.
         kinds: of data it serves; empty for all.
+        problems: patterns of dataset/split that it takes part in; empty for all.
+        given: what it reads beside places, by such patterns; the last one that matches counts.
+        train_s: seconds that its fit takes at effort 1, as far as they are known [s].
         stations: takes part only where there are several stations, some rows of each being learned from.
         scene: takes part only where the measurements name the scene that they were made in.
         networks: takes part where stations are sectors of a network, which have one model whatever is chosen.
@@ -238,6 +263,9 @@ class Contender:
     choose: tuple[str, ...] = ()
     effort: bool = False
     kinds: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+    given: Mapping[str, str] = field(default_factory=dict)
+    train_s: float | None = None
     stations: bool = False
     scene: bool = False
     networks: bool = True
@@ -245,9 +273,14 @@ class Contender:
     def serves(self, problem: Problem) -> bool:
         """Return whether it can take part."""
         kind = not self.kinds or problem.kind in self.kinds
+        kind &= not self.problems or any(fnmatchcase(problem.name, pattern) for pattern in self.problems)
         # Booleans compare as 0 and 1: what a method needs, the problem must have.
         needs = problem.stations >= self.stations and problem.scene >= self.scene
         return kind and needs and self.networks >= problem.network
+
+    def reads(self, problem: Problem) -> str:
+        """Return what it is given beside places; "" for nothing."""
+        return ([what for where, what in self.given.items() if fnmatchcase(problem.name, where)] or [""])[-1]
 
     def overrides(self, effort: float | None) -> list[str]:
         """Return overrides of train.yaml, but for the seed."""
@@ -264,6 +297,7 @@ class Cell:
         effort: that what it counts is multiplied by; None for a method that counts nothing.
         seed: of the method, and of the split where that is drawn several times; None for neither.
         draws: whether its seed is a draw of the split.
+        given: what the method reads beside places.
     """
 
     dataset: str
@@ -272,6 +306,7 @@ class Cell:
     effort: float | None
     seed: int | None
     draws: bool = False
+    given: str = ""
 
     def __str__(self) -> str:
         effort = ANY if self.effort is None else f"{self.effort:g}"
@@ -323,7 +358,18 @@ def plan_cells(
         if problem.draw is None or seed == seeds[0]:
             fits += [(problem, m.name, effort, seed) for m in those if m.effort]
     cells = [
-        (p, Cell(p.dataset, p.split, name, effort, seed if p.draw is None else p.draw, p.draw is not None))
+        (
+            p,
+            Cell(
+                p.dataset,
+                p.split,
+                name,
+                effort,
+                seed if p.draw is None else p.draw,
+                p.draw is not None,
+                methods[name].reads(p),
+            ),
+        )
         for p, name, effort, seed in fits
     ]
     names = [str(cell) for _, cell in cells]
@@ -338,14 +384,16 @@ def plan_cells(
 
 def plan_jobs(settings: Mapping[str, Any], cells_dir: Path) -> list[Job]:
     """List the fits that conf/compare.yaml asks for, see `plan_cells`."""
-    methods = unlisted_contenders() | read_entries("methods", Contender, settings["methods"])
+    own = settings["methods"]
+    unlisted = {name: one for name, one in unlisted_contenders().items() if name not in own}
+    methods = unlisted | read_entries("methods", Contender, own)
     for effort in settings["efforts"]:
         POSITIVE.check("efforts", effort)
     problems = load_every_problem(settings)
-    cells = plan_cells(problems, methods, settings["efforts"], settings["seeds"], settings["only"])
-    own = {name: of or {} for name, of in settings["datasets"].items()}
+    cells = plan_cells(problems, methods, settings["efforts"], settings["seeds"], wanted_cells(settings))
+    datasets = {name: of or {} for name, of in settings["datasets"].items()}
     return [
-        job_of_cell(cell, methods[cell.method], own[cell.dataset], problem, cells_dir, settings["reuse"])
+        job_of_cell(cell, methods[cell.method], datasets[cell.dataset], problem, cells_dir, settings["reuse"])
         for problem, cell in cells
     ]
 
@@ -360,8 +408,9 @@ def job_of_cell(
     """
     overrides = [*problem.chosen, *contender.overrides(cell.effort)]
     config = compose(settings, overrides, problem.draw, cell.seed)
+    usual_s = FREE_S if cell.effort is None else EFFORT_S
     # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
-    fit_s = 2.0 + (FREE_S if cell.effort is None else EFFORT_S * cell.effort)
+    fit_s = 2.0 + (contender.train_s or usual_s) * (cell.effort or 1.0)
     return Job(
         cell, config, cells_dir / str(cell), problem.data, problem.folds, problem.content,
         expected_s=len(problem.folds.folds) * fit_s, keeps_models=not problem.draw, reuse=reuse,

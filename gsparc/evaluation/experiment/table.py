@@ -42,14 +42,14 @@ BESIDE = {  # figures beside the score, by their columns
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
-GIVEN = {"newrf", "directional_gp", "calibrated_raytracer"}  # methods that learn from more than places
 PROBLEM = ["dataset", "split"]
 GROUP = [*PROBLEM, "effort", "method"]
 CELL = [*GROUP[:2], "method", "effort", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
     *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
     "behind_error_db", *BESIDE, "second_figure", "second_value", "train_s",
-    "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label",
+    "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label", "given", "gaussians",
+    "memory_mb", "cpu", "commit", "date", "tested",
 ]  # fmt: skip
 CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spread_db` by what it is
 
@@ -63,6 +63,8 @@ def _scored(own: Row) -> dict[str, Any]:
         "result": own, "score_db": score_db(own), "second_figure": second, "second_value": own.get(second),
         **{name: own.get(figure) for name, figure in BESIDE.items()},
         "label": label[label.find(" (") :] if " (" in label else "",
+        # "20261129T153822-2c93ceee", "014896424e456e89…": when, and by which program.
+        "date": str(own["run_id"] or "")[:8], "commit": str(own["git"] or "")[:8],
     }  # fmt: skip
 
 
@@ -90,10 +92,13 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
         `load`: 1-minute load per core at the end of the training.
         `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
+        `given`: what it reads beside places; `gaussians`: of a model; `memory_mb`: while it was fitted [MB].
+        `cpu`, `commit`, `date`: of the latest fit; `tested`: hashes of the test rows of all draws.
     """
     if filled.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
-    means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load"]
+    means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load", "gaussians"]
+    means += ["memory_mb"]
     own: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
     cells = pd.DataFrame([{**row, **_scored(row)} for row in own])
     cells = cells.astype({"effort": float})
@@ -111,6 +116,10 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     rows["spread_db"] = averages["error"].score_db.where(several, averages["std"].score_db)
     rows["value_error"] = averages["error"].value
     rows["earlier"] = groups["earlier"].agg(lambda commits: " ".join(sorted(set(commits) - {""})))
+    rows[["given", "cpu"]] = groups[["given", "cpu"]].last()
+    latest = cells.sort_values("date", kind="stable").groupby(GROUP, dropna=False)
+    rows[["commit", "date"]] = latest[["commit", "date"]].last()
+    rows["tested"] = groups["draw"].agg(lambda draws: " ".join(sorted(set(draws))))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())
     timed = pd.DataFrame(columns=TIMED) if timed is None else timed
@@ -195,9 +204,8 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
-    if GIVEN & set(block.method):
-        given = "newrf, directional_gp and gsparc were given directions of arrival of training rows"
-        lines.append(f"{given}, calibrated_raytracer the scene's walls, all others places alone")
+    if given := "; ".join(f"{row.method}: {row.given}" for row in rows if row.given):
+        lines.append(f"given more than places: {given}")
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another program (at commit): {old}")

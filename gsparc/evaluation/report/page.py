@@ -126,8 +126,12 @@ def _png(path: Path) -> str:
 
 def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
     """Return the page; `note` says where it comes from."""
-    text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
-    return Environment(autoescape=True).from_string(text).render(title=title, made=note, studies=sections)
+    text, script = (
+        (files("gsparc.evaluation.report") / name).read_text(encoding="utf-8")
+        for name in ("page.html.j2", "sort.js")
+    )
+    page = Environment(autoescape=True).from_string(text)
+    return page.render(title=title, made=note, studies=sections, script=script)
 
 
 def write_report(

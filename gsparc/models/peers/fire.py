@@ -45,6 +45,13 @@ class Coder(Network):
         out = self.decoder(code)
         return torch.view_as_complex(out.view(len(out), -1, 2)), divergence
 
+    def forward(self, query: Query) -> Tensor:
+        """Return channels (B, A, K) from the query's uplink."""
+        assert query.uplink is not None
+        own, scale = self.unit_uplink_and_level(query.uplink)
+        downlink, _ = self.downlink_and_divergence(own.flatten(0, 1))
+        return downlink.view(*own.shape[:2], -1) * scale
+
     def unit_uplink_and_level(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
         """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
         # Both bands lose alike along the path: the uplink's level carries over to the downlink.
@@ -94,8 +101,5 @@ class Fire(UplinkMethod, TrainedPeer):
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; of the uplink alone."""
-        network, uplink = self.fitted(), self.query_uplinks(query)
-        assert isinstance(network, Coder)
-        own, scale = network.unit_uplink_and_level(uplink)
-        downlink, _ = network.downlink_and_divergence(own.flatten(0, 1))
-        return Prediction(downlink.view(*own.shape[:2], -1) * scale)
+        self.query_uplinks(query)
+        return super().predict(query)

@@ -33,7 +33,7 @@ class GaussianPeer(TrainedPeer):
         """See `HasGaussians`."""
         network = self.fitted()
         assert isinstance(network, GaussianNetwork)
-        emitted = [network.emit(one.tx, one.rx) for one in query.split(1)]
+        emitted = [network.emit(one) for one in query.split(1)]
         return network.to_cloud(torch.stack(emitted).square().mean(0).sqrt())
 
 
@@ -59,8 +59,8 @@ class GaussianNetwork(Network):
 
     field: GaussianField
 
-    def emit(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Return what each Gaussian emits (N,) for one position (1, 3)."""
+    def emit(self, query: Query) -> Tensor:
+        """Return what each Gaussian emits (N,) for a query of one place."""
         raise NotImplementedError
 
     def to_cloud(self, strengths: Tensor) -> GaussianCloud:

@@ -22,7 +22,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.query import Batch
+from gsparc.data.query import Batch, Query
 from gsparc.data.target import Kind
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.losses import LossSettings, task_loss
@@ -34,7 +34,7 @@ from gsparc.models.peers.gaussians import (
     rendering_options,
 )
 from gsparc.models.peers.trained import KnownSite, smooth_root
-from gsparc.ops import FrozenPlan, Pose, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops import FrozenPlan, freeze, make_plan, mean_weights, rasterize
 
 
 class ComplexGaussians(GaussianNetwork):
@@ -59,9 +59,9 @@ class ComplexGaussians(GaussianNetwork):
             self.response = nn.Parameter(response)
         self._frozen: FrozenPlan | None = None
 
-    def radiance_towards(self, tx: Tensor, rx: Pose) -> Tensor:
+    def radiance_towards(self, query: Query) -> Tensor:
         """Return radiance (B, N, 2) of each Gaussian towards the moving end."""
-        towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
+        towards = self.scene.site.moving(query.tx, query.rx)[:, None] - self.field.means
         # [m]: 1 / distance grows without end at the moving end itself.
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
         series = fourier_legendre(towards / distance, self.degree, self.order)
@@ -73,23 +73,23 @@ class ComplexGaussians(GaussianNetwork):
         turns = torch.polar(1 / distance, -2 * torch.pi / self.scene.site.wavelength * distance)
         return torch.view_as_real(torch.view_as_complex(sent.contiguous()) * turns.squeeze(-1))
 
-    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+    def forward(self, query: Query) -> Tensor:
         """Return spectra (B, H, W) or channels (B, A, K)."""
-        sent, geometry = self.radiance_towards(tx, rx), self.field.geometry()
+        sent, geometry, rx = self.radiance_towards(query), self.field.geometry(), query.rx
         if self.response is not None:
             seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
             return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
         return smooth_root(rasterize(*geometry, sent, rx, self.grid, **self.options).image.square().sum(1))
 
-    def emit(self, tx: Tensor, rx: Pose) -> Tensor:
+    def emit(self, query: Query) -> Tensor:
         """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""
-        sent = self.radiance_towards(tx, rx)[0].norm(dim=1)
+        sent = self.radiance_towards(query)[0].norm(dim=1)
         return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
-        seen = self(batch.tx, batch.rx)
+        seen = self(batch)
         plain = task_loss(seen, batch, self.losses).mean()
         # A transform mixes all pixels, those that were not measured among them.
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
@@ -104,15 +104,15 @@ class ComplexGaussians(GaussianNetwork):
         return self
 
     @torch.no_grad()
-    def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
+    def rendered(self, query: Query) -> Tensor:
         """Render spectra or channels; a static receiver's view is frozen once."""
-        if self.response is not None or rx.batched or self.training:
-            return self(tx, rx)
+        if self.response is not None or query.rx.batched or self.training:
+            return self(query)
         if self._frozen is None:
             geometry = self.field.geometry()
-            plan = make_plan(*geometry, rx, self.grid, **self.options)
+            plan = make_plan(*geometry, query.rx, self.grid, **self.options)
             self._frozen = freeze(plan, *geometry, version=0)
-        return smooth_root(self._frozen.render(self.radiance_towards(tx, rx), 0).square().sum(1))
+        return smooth_root(self._frozen.render(self.radiance_towards(query), 0).square().sum(1))
 
 
 @dataclass(eq=False, kw_only=True)

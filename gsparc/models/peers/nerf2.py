@@ -21,7 +21,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.query import Batch
+from gsparc.data.query import Batch, Query
 from gsparc.data.target import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron, smooth_root
@@ -82,14 +82,15 @@ class MarchedField(Network):
             error = error * batch.mask.flatten(1)[sample, pixel]
         return error.mean()
 
-    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+    def forward(self, query: Query) -> Tensor:
         """Return spectra (B, H, W), every ray of them."""
-        moving, pixels = self.scene.site.moving(tx, rx), torch.arange(len(self.directions))
+        rx, pixels = query.rx, torch.arange(len(self.directions))
+        moving = self.scene.site.moving(query.tx, rx)
         parts = []
-        for sample, some in product(range(len(tx)), pixels.split(max(POINTS // self.samples, 1))):
+        for sample, some in product(range(len(query)), pixels.split(max(POINTS // self.samples, 1))):
             which = torch.full_like(some, sample)
             parts.append(self.march(*self._origins_and_directions(rx, which, some), moving[which]))
-        return torch.cat(parts).view(len(tx), *self.scene.shape)
+        return torch.cat(parts).view(len(query), *self.scene.shape)
 
     def _origins_and_directions(self, rx: Pose, sample: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and world directions (R, 3) of the pixels of samples."""

@@ -23,13 +23,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsparc.data.query import Batch
+from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements
 from gsparc.data.target import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron
-from gsparc.ops import Pose
 
 NEAR = 0.1  # [m] from the receiver, where rays begin
 AROUND = 0.1  # [m], half the interval of the fine samples
@@ -89,9 +88,9 @@ class DirectedRays(Network):
         wave = torch.polar(weight / depth, -self.wavenumber * depth)
         return ((gain * wave).sum(-1) * likely).sum(-1)
 
-    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+    def forward(self, query: Query) -> Tensor:
         """Return channels (B, 1, 1) at searched directions."""
-        places = torch.atleast_2d(rx.position)
+        places = torch.atleast_2d(query.rx.position)
         return self.march(places, *self.transmitters_and_likely(places, False), None).view(-1, 1, 1)
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:

@@ -19,9 +19,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.query import Query
 from gsparc.data.target import Kind
 from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer
-from gsparc.ops import Pose
 from gsparc.physics.array_response import bartlett_spectrum, normalise_spectrum, steering_matrix
 from gsparc.physics.waves import LIGHT
 
@@ -67,9 +67,9 @@ class Radiators(Network):
         hertz = torch.as_tensor([site.carrier_hz] * tones if hertz is None else hertz)  # type: ignore
         self.register_buffer("wavenumbers", (2 * math.pi / LIGHT * hertz).float())  # type: ignore
 
-    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+    def forward(self, query: Query) -> Tensor:
         """Return channels (B, A, K) or spectra (B, H, W)."""
-        moving = self.scene.site.moving(tx, rx)
+        moving = self.scene.site.moving(query.tx, query.rx)
         offset = moving[:, None] - self.means
         distance = (offset.square().sum(-1) + (2 * self.log_extents).exp()).sqrt()
         strength = torch.view_as_complex(self.gains) / distance

@@ -21,6 +21,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from gsparc.data.query import Query
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.target import Kind
 from gsparc.models.peers.gaussians import (
@@ -62,9 +63,9 @@ class PlanarGaussians(GaussianNetwork):
         self.strengths = nn.Parameter(torch.full((count,), 0.2))
         self.deformation = Deformation(DIRECTIONS, scene.box, sum(CHANGES), settings)
 
-    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+    def forward(self, query: Query) -> Tensor:
         """Return spectra (B, H, W)."""
-        move, stretch, turn, light = self._changes_at(tx, rx)
+        move, stretch, turn, light = self._changes_at(query)
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
@@ -83,12 +84,12 @@ class PlanarGaussians(GaussianNetwork):
         )
         return image.squeeze(1)
 
-    def _changes_at(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
-        return self.deformation(self.base, self.scene.site.moving(tx, rx)).split(CHANGES, -1)
+    def _changes_at(self, query: Query) -> tuple[Tensor, ...]:
+        return self.deformation(self.base, self.scene.site.moving(query.tx, query.rx)).split(CHANGES, -1)
 
-    def emit(self, tx: Tensor, rx: Pose) -> Tensor:
+    def emit(self, query: Query) -> Tensor:
         """See `GaussianNetwork`."""
-        return self.strengths + self._changes_at(tx, rx)[-1][0, :, 0]
+        return self.strengths + self._changes_at(query)[-1][0, :, 0]
 
     def to_cloud(self, strengths: Tensor) -> GaussianCloud:
         """Return them a metre from the receiver, not yet moved; opacities are strengths: nothing is hidden.

@@ -64,7 +64,7 @@ class KnownSite:
 
 
 class Network(nn.Module):
-    """Positions in, targets out: called with tx (B, 3) [m] and one shared or B receiver poses.
+    """Queries in, targets out.
 
     Args:
         scene: what is known of the site.
@@ -79,12 +79,12 @@ class Network(nn.Module):
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the training loss () of a batch; `generator` for whatever is drawn at random."""
-        return task_loss(self(batch.tx, batch.rx), batch, self.losses).mean()
+        return task_loss(self(batch), batch, self.losses).mean()
 
     @torch.no_grad()
-    def rendered(self, tx: Tensor, rx: Pose) -> Tensor:
+    def rendered(self, query: Query) -> Tensor:
         """Return the prediction at inference, which may keep state between calls."""
-        return self(tx, rx)
+        return self(query)
 
 
 def perceptron(
@@ -118,7 +118,7 @@ class TrainedPeer(Method):
     resumable: ClassVar[bool] = True  # type: ignore[misc]
     takes_effort: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
-    usual_steps: ClassVar[dict[Kind, int]]  # a minute of one core at its usual batches (docs/results/compare)
+    usual_steps: ClassVar[dict[Kind, int]]  # a minute of one core at its usual batches (docs/table.md)
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
@@ -209,7 +209,7 @@ class TrainedPeer(Method):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; these peers give no confidence."""
         network = self.fitted()
-        mean = torch.cat([network.rendered(part.tx, part.rx) for part in query.split(QUERY_CHUNK)])
+        mean = torch.cat([network.rendered(part) for part in query.split(QUERY_CHUNK)])
         return Prediction(mean if mean.is_complex() else mean.clamp(0, 1))
 
     def state(self) -> dict[str, Any]:

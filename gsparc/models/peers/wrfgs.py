@@ -16,6 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.query import Query
 from gsparc.data.target import Kind
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
@@ -29,7 +30,6 @@ from gsparc.models.peers.gaussians import (
     rendering_options,
 )
 from gsparc.models.peers.trained import KnownSite
-from gsparc.ops import Pose
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
 
@@ -45,25 +45,25 @@ class DeformedGaussians(GaussianNetwork):
         places = torch.stack(self.field.means.detach().aminmax(dim=0))
         self.deformation = Deformation(places, scene.box, sum(CHANGES), settings)
 
-    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+    def forward(self, query: Query) -> Tensor:
         """Return spectra (B, H, W)."""
         field = self.field
-        place, turn, stretch, fade, light = self._changes_at(tx, rx)
+        place, turn, stretch, fade, light = self._changes_at(query)
         stretch = stretch.clamp(-MOST_STRETCH, MOST_STRETCH)
         geometry = (
             field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch).exp(),
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
         )  # fmt: skip
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
-        return render_each(geometry, signal, rx, self.grid, **self.options).squeeze(1)
+        return render_each(geometry, signal, query.rx, self.grid, **self.options).squeeze(1)
 
-    def _changes_at(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
-        changes = self.deformation(self.field.means, self.scene.site.moving(tx, rx))
+    def _changes_at(self, query: Query) -> tuple[Tensor, ...]:
+        changes = self.deformation(self.field.means, self.scene.site.moving(query.tx, query.rx))
         return changes.split(CHANGES, -1)
 
-    def emit(self, tx: Tensor, rx: Pose) -> Tensor:
+    def emit(self, query: Query) -> Tensor:
         """See `GaussianNetwork`; these are drawn where they lie before they are moved."""
-        return torch.sigmoid(self.signals + self._changes_at(tx, rx)[-1][0, :, 0])
+        return torch.sigmoid(self.signals + self._changes_at(query)[-1][0, :, 0])
 
 
 @dataclass(eq=False, kw_only=True)

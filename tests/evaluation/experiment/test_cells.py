@@ -7,7 +7,7 @@ from campaigns import compose
 from omegaconf import OmegaConf
 from refusals import refused
 
-from gsparc.evaluation.experiment.cells import Contender, SplitChoice, plan_cells, read_entries
+from gsparc.evaluation.experiment.cells import Contender, SplitChoice, plan_cells, read_entries, wanted_cells
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -18,7 +18,7 @@ COUNTED = (1, 0.3), (0, 1)  # efforts and seeds
 
 
 def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> SimpleNamespace:
-    own = {"draw": None, "stations": False, "scene": False, "network": False}
+    own = {"draw": None, "stations": False, "scene": False, "network": False, "name": f"{dataset}/{split}"}
     return SimpleNamespace(dataset=dataset, split=split, kind=kind, **(own | others))
 
 
@@ -62,6 +62,25 @@ def test_a_method_takes_part_where_what_it_needs_is_there(needed):
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
     assert names("*/gp/*", "*/fast/0.3/0") == ["rfid/random/gp/any/any", "rfid/random/fast/0.3/0"]
     refused("only: 'rfid/rndom/\\*' matches no cell", names, "rfid/rndom/*")
+
+
+def test_only_may_name_a_part():
+    settings = {"only": "quick", "parts": {"quick": ["rfid/*"]}}
+    assert wanted_cells(settings) == ["rfid/*"] and wanted_cells({"only": ["a/*"], "parts": {}}) == ["a/*"]
+    refused(
+        r"only=slow: a list of patterns, or the name of a part \(quick\)",
+        wanted_cells,
+        settings | {"only": "slow"},
+    )
+
+
+def test_methods_take_part_where_they_are_said_to_and_tell_what_they_read():
+    entry = {"problems": ["rfid/*"], "given": {"*": "walls", "rfid/grouped": "directions"}}
+    methods = read_entries("methods", Contender, {"own": entry, "left_out": None})
+    assert list(methods) == ["own"], "an entry of null is left out"
+    wanted = [problem("rfid"), problem("rfid", "grouped"), problem("newrf")]
+    cells = [cell for _, cell in plan_cells(wanted, methods, [1], [0])]
+    assert [(cell.dataset, cell.given) for cell in cells] == [("rfid", "walls"), ("rfid", "directions")]
 
 
 @pytest.mark.slow

@@ -1,15 +1,13 @@
 """The table says who is first, who is fast, and when a simple baseline wins."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
+from compared import averages, drawn, filled, said_of
 
 from gsparc.evaluation import plots
 from gsparc.evaluation.experiment import runner
 from gsparc.evaluation.experiment.table import (
-    average_cells,
     columns_of_csv,
     markdown,
     remarks,
@@ -18,35 +16,6 @@ from gsparc.evaluation.experiment.table import (
 )
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.plots import draw_efforts
-from gsparc.evaluation.results import Run, as_frame
-
-
-def filled(method, value, seed=None, effort=None, split="random", kind="spectrum", **more):
-    """The row of a cell with the figure that decides, and other facts."""
-    figures = {"spectrum": ("psnr_db", "ssim"), "rssi": ("rmse_db", "mae_db")}[kind]
-    facts = {f"test/{name}": number for name, number in zip(figures, (value, 0.9), strict=True)}
-    facts |= {
-        "split/sha256": f"{split}{seed if more.get('drawn') else ''}",
-        "dataset/kind": kind, "time/train_s": 1.0, "time/train_cpu_s": 1.0, "machine/load": 0.1,
-    }  # fmt: skip
-    cell = {"dataset": "rfid", "split": split, "method": method, "effort": effort, "seed": seed}
-    cell |= {"draws": more.pop("drawn", False), "earlier": more.pop("earlier", "")}
-    return Run(more.pop("folder", Path("absent")), facts | more).rows()[0] | cell
-
-
-def drawn(method, *values, **more):
-    """A cell for each draw of the split."""
-    return [filled(method, value, draw, drawn=True, **more) for draw, value in enumerate(values)]
-
-
-def said_of(cells, ours="gsparc"):
-    """Remarks on the first table of cells."""
-    return " | ".join(remarks(split_by_problem(averages(cells))[0], ours))
-
-
-def averages(cells, timed=None):
-    return average_cells(as_frame(cells), timed)
-
 
 FOUND = [
     filled("gp", 30.0), *(filled("gsparc", 29.0 + s, s, 1.0) for s in (0.0, 1.0)),
@@ -229,8 +198,9 @@ def test_the_csv_file_had_other_signs_than_the_console():
 
 
 def test_what_methods_were_given_besides_places_was_not_said():
-    assert "gsparc were given directions of arrival" in said_of([*FOUND[:1], filled("newrf", 29.0, 0, 1.0)])
-    assert "were given" not in said_of(FOUND[:1])
+    newrf = filled("newrf", 29.0, 0, 1.0, given="directions")
+    assert "given more than places: newrf: directions" in said_of([*FOUND[:1], newrf])
+    assert "given" not in said_of(FOUND[:1])
 
 
 def test_draws_with_the_same_test_rows_had_a_standard_error():

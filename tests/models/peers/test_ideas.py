@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, room_vectors, walk
-from scenes import error, fold_of, lobes, room, shadowed, wandering
+from scenes import answer_error, error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
 from gsparc.data.datasets.rfid import planar_array
+from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
+from gsparc.data.splits import Fold
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.peers.gsrf import count_terms, fourier_legendre
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.training.context import FitContext
@@ -48,7 +51,7 @@ def test_gsrf_lets_opposite_phases_cancel(tmp_path):
     for phase in (1.0, -1.0):
         with torch.no_grad():
             net.coefficients[1, 0, 0] = phase
-            brightest.append(float(net(batch.tx, batch.rx).max()))
+            brightest.append(float(net(batch).max()))
     assert brightest[1] < 0.35 * brightest[0]
 
 
@@ -71,6 +74,27 @@ def test_deformed_gaussians_follow_what_moves(tmp_path, name, share):
     known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
     method = fitted(name, data, fold, tmp_path, count=40, max_steps=150, batch_size=8, rate=8e-3, octaves=1)
     assert error(method, data, fold.test) < share * known
+
+
+@pytest.mark.slow
+def test_a_carrier_that_nothing_was_learned_from_is_between_its_neighbours(tmp_path):
+    """Lobes that come and go with the carrier: a network that did not read it would show their mean."""
+    carrier = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    place = np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 3], (24, 3))
+    towards = SphereGrid.hemisphere(12, 24).directions().numpy()
+    lobes = np.exp(8 * (np.stack([towards @ axis for axis in np.eye(3)[:2]], -1) - 1))  # (H, W, 2)
+    octave = np.tile(np.log2(carrier) / 4, len(place))
+    spectrum = (lobes @ np.stack([octave, 1 - octave])).transpose(2, 0, 1).astype(np.float32)
+    arrays = {"tx_position": np.repeat(place, 5, axis=0), "rx_position": np.zeros(3), "spectrum": spectrum}
+    data = from_arrays({**arrays, "carrier_hz": np.tile(carrier, len(place)) * 1e9})
+    rows = np.arange(len(data))
+    fold = Fold(rows[rows % 5 != 1], rows[:0], rows[rows % 5 == 1])
+    settings = {"count": 40, "max_steps": 500, "batch_size": 8, "octaves": 2}
+    method = wrap_per_station(method_class("wideband")(**settings), data)
+    method.fit(data, fold, FitContext(tmp_path))
+    tested = spectrum[fold.test]
+    mean = np.square(spectrum[fold.train].mean(0) - tested).sum() / np.square(tested).sum()
+    assert answer_error(method, data, fold.test) < 0.3 * mean
 
 
 @pytest.mark.slow

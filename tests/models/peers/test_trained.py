@@ -27,6 +27,7 @@ from gsparc.training.context import FitContext
 from gsparc.training.effort import Effort
 
 SMALL = {"gsrf": {"count": 40}, "wrfgs": {"count": 40}, "swiftwrf": {"count": 40}, "ngrf": {"count": 20},
+         "wideband": {"count": 20},
          "newrf": {"width": 16, "samples": 8}, "nerf2": {"width": 16, "samples": 8, "rays": 64}}  # fmt: skip
 
 
