@@ -92,7 +92,8 @@ class Job:
 
 
 Fit = Callable[[Job, str | None], object]
-Piece, Made = TypeVar("Piece"), TypeVar("Made")
+Piece = TypeVar("Piece")
+Made = TypeVar("Made")
 
 
 def run_list(
