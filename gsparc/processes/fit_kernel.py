@@ -41,7 +41,7 @@ NOISES = (1e-4, 10.0)  # of the signal's power
 LEARNED_ON, TWO_LENGTH_LOOKS = 400, 8  # rows, and looks at them
 
 
-class View(NamedTuple):
+class KernelRows(NamedTuple):
     """Rows of one process as its settings see them.
 
     Attributes:
@@ -60,7 +60,7 @@ class View(NamedTuple):
         """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
 
         >>> one = torch.zeros(1, 1, dtype=torch.float64)
-        >>> View(one, None, one).gram(Kernel.from_length(length=2.0, noise=0.5))
+        >>> KernelRows(one, None, one).gram(Kernel.from_length(length=2.0, noise=0.5))
         tensor([[1.5000]], dtype=torch.float64)
         """
         total = kernel.correlations_of(self.apart)
@@ -136,7 +136,7 @@ def fit_kernel(
 
 
 def fit_kernel_by_left_out(
-    starts: Sequence[Kernel], views: Sequence[View], bounds: Sequence[tuple[float, float]] = (),
+    starts: Sequence[Kernel], views: Sequence[KernelRows], bounds: Sequence[tuple[float, float]] = (),
     looks: int = LOOKS, entries: int = 1, bounded: bool = True, partitions: Sequence[Iterable[Tensor]] = (),
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel.
@@ -167,7 +167,7 @@ def fit_kernel_by_left_out(
     return value * count, kernel
 
 
-def fit_kernel_by_evidence(start: Kernel, views: Sequence[View], looks: int) -> tuple[float, Kernel]:
+def fit_kernel_by_evidence(start: Kernel, views: Sequence[KernelRows], looks: int) -> tuple[float, Kernel]:
     """Find the kernel of largest evidence, levels among the values; without looks `start` as it is.
 
     Args:
@@ -221,7 +221,7 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
     lengths = combinations(spread * STARTS, count)
     starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
-    view = View(distances(places, places), None, values)
+    view = KernelRows(distances(places, places), None, values)
     return fit_kernel_by_left_out(starts, [view], bounds, entries=entries, bounded=False)[1]
 
 
@@ -257,6 +257,6 @@ def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start
         *((math.log(low * length), math.log(high * length)) for low, high in (SHORT, LONG)),
         (-SHARES, SHARES), (math.log(NOISES[0]), math.log(NOISES[1])),
     ]  # fmt: skip
-    view = View(distances(at, at), None, real)
+    view = KernelRows(distances(at, at), None, real)
     evidence = lambda kernel: ProfiledDensity.apply(view.gram(kernel), real)  # noqa: E731
     return fit_kernel(evidence, [start], bounds, TWO_LENGTH_LOOKS, SETTLED / real.numel())[1]

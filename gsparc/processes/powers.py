@@ -15,7 +15,7 @@ from gsparc.processes.averages import MeanVariance, mixture_moments
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import covering_rows, first_rows
-from gsparc.processes.fit_kernel import View
+from gsparc.processes.fit_kernel import KernelRows
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
 from gsparc.processes.neighbourhood import NEIGHBOURS
@@ -71,7 +71,7 @@ class PowerRows:
         """Return means (m, 1) [dB] over the rows of each place."""
         return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
-    def view(self, trend: Trend, kernel: Kernel | None = None) -> View:
+    def view(self, trend: Trend, kernel: Kernel | None = None) -> KernelRows:
         """Return the rows [dB] less the mean of a trend and with its terms, as a kernel's settings see them.
 
         Of a `kernel` to which more than distances counts, places (n, D) [m] stand for these.
@@ -79,7 +79,7 @@ class PowerRows:
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
         apart = distances(places, places) if kernel is None or kernel.is_isotropic else places
-        return View(apart, trend.columns(places), rest[:, None], torch.from_numpy(self.side))
+        return KernelRows(apart, trend.columns(places), rest[:, None], torch.from_numpy(self.side))
 
     def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""

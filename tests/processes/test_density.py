@@ -6,7 +6,7 @@ import torch
 
 from gsparc.processes.density import LeftOutDensity
 from gsparc.processes.factor import NotDefiniteError
-from gsparc.processes.fit_kernel import View, minimise
+from gsparc.processes.fit_kernel import KernelRows, minimise
 from gsparc.processes.kernel import Kernel
 
 KERNELS = (Kernel.from_lengths((0.3,), (1.0,), 0.1), Kernel.from_lengths((0.1, 0.5), (0.3, 0.7), 0.1))
@@ -27,7 +27,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
     distance, columns, values = rows(40, outputs)
 
     def density(at: torch.Tensor) -> torch.Tensor:
-        gram = View(distance, columns, values).gram(kernel.with_values(at))
+        gram = KernelRows(distance, columns, values).gram(kernel.with_values(at))
         return LeftOutDensity.apply(gram, values, outputs + 1, bounded)[0]
 
     at = kernel.parameters().requires_grad_()
@@ -39,7 +39,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
 
 def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
     distance, columns, values = rows(12, 3)
-    gram = View(distance, columns, values).gram(KERNELS[1])
+    gram = KernelRows(distance, columns, values).gram(KERNELS[1])
     density, amplitude = (float(part) for part in LeftOutDensity.apply(gram, values, 3, False))
     total, g, y = 0.0, gram.numpy(), values.numpy()
     for i in range(12):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data import limits
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
@@ -31,7 +32,6 @@ SOURCES = ("builder", "builtin", "xml", "file", "room")
 PLACE = limits.Limit("three finite numbers [m]", lambda value: limits.finite_array(value).shape == (3,))
 SEVERAL = limits.Limit("a list of one transmitter or more", bool)
 MIN_RECEIVERS = 20
-SAME_PLACE_M = 0.01  # a station nearer to a transmitter of the scene is that transmitter
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
 WIDEST_M = 400.0  # of an area that nobody states
 MAST_M = 10.0  # height of a transmitter that nobody states, above what stands in the middle
