@@ -12,10 +12,11 @@ import torch
 
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
-from gsparc.evaluation.drawing import save, spread_out
+from gsparc.evaluation.drawing import save
 from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.field.schedule import INTERVAL, to_steps
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.training.tracking import log_picture
 
 
@@ -48,7 +49,7 @@ class Pictures(Checked, L.Callback):
         if not len(candidates):
             return
         # The same rows at every step, so that pictures can be compared.
-        rows = spread_out(candidates, self.count)
+        rows = candidates[evenly_spaced(len(candidates), self.count)]
         ledger = next((one for one in trainer.callbacks if isinstance(one, CostLedger)), None)  # type: ignore[attr-defined]
         with nullcontext() if ledger is None else ledger.paused(), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)
