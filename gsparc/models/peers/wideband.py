@@ -51,6 +51,8 @@ MOST = 0.999  # of an opacity
 class FrequencyEmbedded(GaussianNetwork):
     """Complex Gaussians and the network that changes them by carrier and query."""
 
+    tuned: Tensor  # (stations,) octaves of each carrier above the lowest, as long as the box
+
     def __init__(self, scene: KnownSite, settings: Wideband) -> None:
         super().__init__(scene, settings.count)
         stations = scene.site.stations
