@@ -32,8 +32,8 @@ ARROWS = {
     "apps.maps": "data evaluation models prediction processes",
     "apps.export": "data field models ops physics prediction processes training",
     "apps.link": "data evaluation models physics prediction processes simulate",
-    "apps.view": "apps.maps data evaluation prediction",
-    "callbacks": "data evaluation field training",
+    "apps.view": "apps.maps data evaluation prediction processes",
+    "callbacks": "data evaluation field processes training",
     "commands": "apps.export apps.link apps.locate apps.maps apps.view conf "
     "data evaluation models ops prediction simulate training",
     "conf": "",
