@@ -12,6 +12,7 @@ from gsparc.data.query import Query
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.field.gaussians import FieldSettings, GaussianField, create_field
+from gsparc.field.losses import LossSettings
 from gsparc.field.model import FULL_SPHERE_ROWS, RasterSettings
 from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer, perceptron
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
@@ -45,6 +46,7 @@ class DeformedPeer(GaussianPeer):
         count: Gaussians.
         width, depth: of the deforming network.
         octaves: of its Fourier features of places.
+        ssim_weight: share of 1 - SSIM in the loss.
         others: see `TrainedPeer`.
     """
 
@@ -52,12 +54,17 @@ class DeformedPeer(GaussianPeer):
     width: int = 64
     depth: int = 3
     octaves: int = 5
+    ssim_weight: float = LossSettings().ssim_weight
 
 
 class GaussianNetwork(Network):
-    """Renders Gaussians that lie in `field`."""
+    """Renders Gaussians that lie in `field`; `ssim_weight` is the share of 1 - SSIM in the loss."""
 
     field: GaussianField
+
+    def __init__(self, scene: KnownSite, count: int, ssim_weight: float) -> None:
+        super().__init__(scene, count)
+        self.losses = LossSettings(ssim_weight)
 
     def emit(self, query: Query) -> Tensor:
         """Return what each Gaussian emits (N,) for a query of one place."""

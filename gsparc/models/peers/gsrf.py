@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.target import Kind
 from gsparc.field.gaussians import FieldSettings
-from gsparc.field.losses import LossSettings, task_loss
+from gsparc.field.losses import task_loss
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     GaussianNetwork,
@@ -41,11 +41,10 @@ class ComplexGaussians(GaussianNetwork):
     """N Gaussians, each with K complex coefficients."""
 
     def __init__(self, scene: KnownSite, settings: GSRF) -> None:
-        super().__init__(scene, settings.count)
+        # Of what the base counts.
+        super().__init__(scene, settings.count, settings.ssim_weight / (1 - settings.fourier_weight))
         count, self.degree, self.order = settings.count, settings.degree, settings.order
         self.fourier_weight = settings.fourier_weight
-        # Of what the base counts.
-        self.losses = LossSettings(settings.ssim_weight / (1 - settings.fourier_weight))
         self.field = initial_gaussians(scene, count)
         self.grid, self.options = rendering_options(scene)
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, count_terms(self.degree, self.order), 2))
@@ -88,13 +87,13 @@ class ComplexGaussians(GaussianNetwork):
         return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
+        """Return the base's, and for spectra the mean squared distance of the two-dimensional transforms."""
         seen = self(batch)
         plain = task_loss(seen, batch, self.losses).mean()
         # A transform mixes all pixels, those that were not measured among them.
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain
-        difference = torch.fft.rfft2(seen - batch.target, norm="ortho").abs().mean()
+        difference = torch.fft.fft2(seen - batch.target, norm="ortho").abs().square().mean()
         return (1 - self.fourier_weight) * plain + self.fourier_weight * difference
 
     def train(self, mode: bool = True) -> ComplexGaussians:
@@ -133,8 +132,8 @@ class GSRF(GaussianPeer):
     count: int = FieldSettings().count
     degree: int = 5
     order: int = 5
-    ssim_weight: float = 0.19
-    fourier_weight: float = 0.05
+    ssim_weight: float = 0.37
+    fourier_weight: float = 0.19
     rate: float = 8e-3
 
 

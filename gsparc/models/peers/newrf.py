@@ -9,7 +9,7 @@ distance; at a query the directions are *searched* (rays of training receivers a
 receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
 a query has (what at least half of the neighbours see is taken); a density per metre (ours is an opacity per
 sample, since half of the samples lie within 10 cm of where the intersection found something, in place of
-hierarchical resampling).
+hierarchical resampling), four octaves of directions (two), further rays, noise on directions.
 """
 
 from __future__ import annotations

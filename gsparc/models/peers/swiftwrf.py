@@ -5,9 +5,9 @@ for Efficient Wireless Radiance Field Rendering" (SwiftWRF), 2025.
 
 Kept: two-dimensional Gaussians without depth, a plain sum instead of compositing, one small network from
 (Gaussian, position of the moving end) to changes of centre, shape and strength. Left out: the two stages with
-annealed smoothing and the residual scheme between groups of spectra. The Gaussians lie on the unit sphere
-around the receiver rather than in the image plane, so that the seam in azimuth closes; the plain sum is
-our compositing in the limit of vanishing opacity, without occlusion.
+annealed smoothing, the residual scheme between groups of spectra, complex signals in two channels. The
+Gaussians lie on the unit sphere around the receiver rather than in the image plane, so that the seam in
+azimuth closes; the plain sum is our compositing in the limit of vanishing opacity, without occlusion.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class PlanarGaussians(GaussianNetwork):
     frames: Tensor
 
     def __init__(self, scene: KnownSite, settings: DeformedPeer) -> None:
-        super().__init__(scene, settings.count)
+        super().__init__(scene, settings.count, settings.ssim_weight)
         assert scene.site.grid is not None
         self.grid, count = scene.site.grid, settings.count
         base, axes = sphere_lattice(self.grid, count)

@@ -21,7 +21,6 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
-from gsparc.field.losses import LossSettings
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     Deformation,
@@ -54,12 +53,11 @@ class FrequencyEmbedded(GaussianNetwork):
     tuned: Tensor  # (stations,) octaves of each carrier above the lowest, as long as the box
 
     def __init__(self, scene: KnownSite, settings: Wideband) -> None:
-        super().__init__(scene, settings.count)
+        super().__init__(scene, settings.count, settings.ssim_weight)
         stations = scene.site.stations
         carriers = [scene.site.carrier_hz] if stations is None else stations.carrier_hz
         if carriers is None or None in carriers:
             raise ValueError(f"{settings.name}: the dataset declares no carrier")
-        self.losses = LossSettings(settings.ssim_weight)
         self.grid, self.options = rendering_options(scene)
         self.field, self.degree = initial_gaussians(scene, settings.count), settings.degree
         self.series = nn.Parameter(
@@ -121,7 +119,6 @@ class Wideband(DeformedPeer):
 
     Args:
         degree: largest degree and order of the series over directions.
-        ssim_weight: share of 1 - SSIM in the loss.
         others: see `DeformedPeer`.
     """
 

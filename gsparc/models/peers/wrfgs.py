@@ -4,8 +4,9 @@ C. Wen, J. Tong, Y. Hu, Z. Lin, J. Zhang, "Neural Representation for Wireless Ra
 A 3D Gaussian Splatting Approach" (WRF-GS and WRF-GS+), 2025.
 
 Kept: a static part (the Gaussians) and a dynamic part (a network of a Gaussian's place and the query) that
-moves, turns, stretches, fades and re-lights them; one projection per query; L1 and SSIM. Left out: adaptive
-density control, initial Gaussians 20 m wide about the origin (ours start around the receiver).
+moves, turns, stretches, fades and re-lights them (the authors' program neither moves nor fades them); one
+projection per query; L1 and SSIM. Left out: adaptive density control, complex signals in two channels, initial
+Gaussians 20 m wide about the origin (ours start around the receiver).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class DeformedGaussians(GaussianNetwork):
     """Static Gaussians and the network that deforms them."""
 
     def __init__(self, scene: KnownSite, settings: DeformedPeer) -> None:
-        super().__init__(scene, settings.count)
+        super().__init__(scene, settings.count, settings.ssim_weight)
         self.grid, self.options = rendering_options(scene)
         self.field = initial_gaussians(scene, self.count)
         self.signals = nn.Parameter(torch.zeros(self.count))
