@@ -5,7 +5,7 @@ A 3D Gaussian Splatting Approach" (WRF-GS and WRF-GS+), 2025.
 
 Kept: a static part (the Gaussians) and a dynamic part (a network of a Gaussian's place and the query) that
 moves, turns, stretches, fades and re-lights them (the authors' program neither moves nor fades them); one
-projection per query; L1 and SSIM. Left out: adaptive density control, complex signals in two channels, initial
+projection per query; L1 and SSIM. Left out: adaptive density control, complex signals in two channels, first
 Gaussians 20 m wide about the origin (ours start around the receiver).
 """
 
