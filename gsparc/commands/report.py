@@ -14,7 +14,7 @@ from gsparc.data.files import SUMMARY
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.report.page import write_report
-from gsparc.evaluation.results import STUDY, frame, own_rows, read_columns, read_summary
+from gsparc.evaluation.results import PROBLEM, frame, own_rows, read_columns, read_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -30,7 +30,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         rows = time_again(rows, rounds=int(config.rounds), rounds_s=float(config.rounds_s))
     out = run_directory()
     write_report(out, config.title, rows, _fronts(paths), config.figures)
-    count, studies = len(own_rows(rows)), rows.groupby(STUDY, dropna=False).ngroups
+    count, studies = len(own_rows(rows)), rows.groupby(PROBLEM, dropna=False).ngroups
     facts = {"report/runs": count, "report/studies": studies}
     return finish_run(out, facts, before=f"{count} run{'s' * (count > 1)}; report.html ")
 

@@ -32,7 +32,7 @@ COSTS = {
     "train_s": "train_s", "train_cpu_s": "train_cpu_s", "batch_ms": "render_ms_batch64",
     **{name: FACTS[name] for name in ("query_ms", "query_p95_ms")},
 }  # fmt: skip
-STUDY = ["dataset", "split"]  # figures of one are comparable
+PROBLEM = ["dataset", "split"]  # figures of one are comparable
 RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
 # Where data lie and how much is logged changes no result.
 HIDDEN = (

@@ -15,7 +15,7 @@ from rich.table import Table as RichTable
 
 from gsparc.evaluation.metric_formats import heading_of, number_format
 
-Row = Mapping[str, Any]  # of results, see `results.rows_of`
+Row = Mapping[str, Any]  # of results, see `results.result_rows`
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def built_in_methods() -> dict[str, str]:
 
 
 def all_methods() -> dict[str, str]:
-    """Return import paths of all methods by name: `methods()` and what plugins bring."""
+    """Return import paths of all methods by name: `built_in_methods()` and what plugins bring."""
     return plugins("model") | built_in_methods()
 
 

@@ -81,6 +81,8 @@ def weighted_quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.n
 def conformal_level(share: float, groups: int) -> float:
     """Return which quantile of the errors of so many groups a share of further errors lies below.
 
+    At most 1, the largest error: the guarantee of `conformal_quantile` ends where groups are too few.
+
     >>> conformal_level(0.5, 10)
     0.55
     """

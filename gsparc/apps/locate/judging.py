@@ -30,6 +30,7 @@ from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.prediction.predictor import Predictor, update_extra
+from gsparc.processes.few_rows import draw_rows
 
 log = logging.getLogger(__name__)
 
@@ -200,7 +201,7 @@ def sample_rows(config: DictConfig, count: int) -> np.ndarray:
     if not count:
         raise ValueError("there is nothing to be located")
     # Sorted, since rows of a track must stay in the order of time.
-    return np.sort(np.random.default_rng(int(config.seed)).permutation(count)[: config.rows])
+    return draw_rows(count, config.rows, int(config.seed))
 
 
 def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np.ndarray, path: Path) -> None:

@@ -24,7 +24,9 @@ def read_published(file: str | Path) -> pd.DataFrame:
         raise ValueError(f"{file}: cannot be read as a comparison's compare.csv: {error}") from None
     if lacking := {"score_error_db", "score_std_db", "tested", *GROUP} - {*rows}:
         raise ValueError(f"{file}: no compare.csv: it has no column {', '.join(sorted(lacking))}")
-    rows[WORDS] = rows[WORDS].fillna("")
+    # An older table lacks columns that were added since.
+    rows = rows.reindex(columns=[*dict.fromkeys([*rows, *ROW])])
+    rows[WORDS] = rows[WORDS].astype(object).fillna("").astype(str)
     rows["spread_db"] = rows.score_error_db.fillna(rows.score_std_db)
     rows["score_db"] = [shown(*one) for one in zip(rows.figure, rows.score_db, strict=True)]
     several = rows.draws > 1

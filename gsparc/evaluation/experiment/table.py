@@ -20,7 +20,7 @@ from gsparc.evaluation.metric_formats import (
     score_heading,
 )
 from gsparc.evaluation.paired import lead_over_runs
-from gsparc.evaluation.results import average, score_db
+from gsparc.evaluation.results import PROBLEM, average, score_db
 from gsparc.evaluation.summary import busy_machine, wrong_deviations
 from gsparc.evaluation.table import (
     CPU,
@@ -42,7 +42,6 @@ BESIDE = {  # figures beside the score, by their columns
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
-PROBLEM = ["dataset", "split"]
 GROUP = [*PROBLEM, "effort", "method"]
 CELL = [*GROUP[:2], "method", "effort", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
@@ -51,7 +50,8 @@ ROW = [
     "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label", "given", "gaussians",
     "memory_mb", "cpu", "commit", "date", "tested",
 ]  # fmt: skip
-CSV = [*ROW[:5], "score_error_db", "score_std_db", *ROW[6:]]  # the two are `spread_db` by what it is
+SPREADS = ["score_error_db", "score_std_db"]  # `spread_db` by what it is
+CSV = [name for one in ROW for name in (SPREADS if one == "spread_db" else [one])]
 
 
 def _scored(own: Row) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
 from gsparc.evaluation.pictures import draw_spectra
 from gsparc.evaluation.report import tables
-from gsparc.evaluation.results import STUDY, average, own_rows, score_db, short_settings
+from gsparc.evaluation.results import PROBLEM, average, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
 
 # A page holds its pictures in base64, a third larger than their files.
@@ -68,7 +68,7 @@ def make_sections(
     `fronts`: names of datasets, `tradeoff.csv` by column.
     """
     sections = []
-    for (dataset, split), group in rows.groupby(STUDY, sort=False, dropna=False):
+    for (dataset, split), group in rows.groupby(PROBLEM, sort=False, dropna=False):
         title, study = f"{dataset}, split {split}", short_settings(group)
         own = own_rows(study)
         firsts = own.drop_duplicates("setting")

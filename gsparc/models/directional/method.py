@@ -23,7 +23,7 @@ from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, Ga
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.frame import SourceFrame, SourcePaths, SourcesInFrame, require_static_phase
-from gsparc.models.image_sources.rows import LEAST_ROWS, draw_rows
+from gsparc.models.image_sources.rows import LEAST_ROWS, rows_of_measurements
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
@@ -78,7 +78,7 @@ class DirectionalGP(SourcesInFrame):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
         order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
         sources = sources[order[: SearchSettings.max_sources]]
-        everything = draw_rows(data, known, self.row_limit, self.seed)
+        everything = rows_of_measurements(data, known, self.row_limit, self.seed)
         self.frame = SourceFrame.from_rows(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
         at = {int(row): k for k, row in enumerate(known)}

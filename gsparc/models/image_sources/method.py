@@ -30,7 +30,13 @@ from gsparc.models.image_sources.frame import (
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
 from gsparc.models.image_sources.refine import POLISHING_STEPS
-from gsparc.models.image_sources.rows import Rows, draw_rows, measured_places, ranges_at, static_array
+from gsparc.models.image_sources.rows import (
+    Rows,
+    measured_places,
+    ranges_at,
+    rows_of_measurements,
+    static_array,
+)
 from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
@@ -99,7 +105,7 @@ class ImageSourceGP(SourcesInFrame):
         self.site, antennas = data.site, data.target.shape[1]
         # The frame is of rows of all searches: their scenes are averaged in it.
         self.frame = SourceFrame.from_rows(
-            data.site, antennas, draw_rows(data, seen, settings.rows, settings.seed)
+            data.site, antennas, rows_of_measurements(data, seen, settings.rows, settings.seed)
         )
         noise = 0.0 if data.noise_variance is None else float(np.mean(data.noise_variance[seen]))
         # Simulated channels may have no noise, and float32 needs some to factor.
@@ -197,7 +203,7 @@ class ImageSourceGP(SourcesInFrame):
     def _draw(self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
         limit = self.settings.rows if limit is None else limit
-        return self.frame.normalise(draw_rows(data, rows, limit, self.settings.seed + number))
+        return self.frame.normalise(rows_of_measurements(data, rows, limit, self.settings.seed + number))
 
     def _draw_search_rows(self, data: Measurements, known: np.ndarray, number: int) -> Rows:
         """Rows of a search by its number."""

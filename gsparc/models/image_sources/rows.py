@@ -101,7 +101,7 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
     return antenna_positions(site, position, rotation, antennas)
 
 
-def draw_rows(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
+def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
     """Return at most `limit` rows from the given measurements.
 
     Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each

@@ -36,6 +36,14 @@ def test_rows_of_the_same_test_rows_stand_beside_a_new_method(file):
     assert len(beside_published(averages([filled("mine", 31.0, split="other")]), read_published(file))) == 1
 
 
+def test_a_table_of_an_older_program_lacks_a_column(file):
+    """Each column that is added to `compare.csv` made the tables written before unreadable."""
+    older = pd.read_csv(file).drop(columns=["given", "memory_mb"])
+    older.to_csv(file, index=False)
+    rows = read_published(file)
+    assert set(rows.given) == {""} and rows.memory_mb.isna().all()
+
+
 def test_a_file_that_is_no_table_is_named(tmp_path, file):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     refused("other.csv: no compare.csv: it has no column dataset", read_published, tmp_path / "other.csv")

@@ -17,7 +17,7 @@ from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.directional.position_refine import UncertainPositions
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import draw_rows
+from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.image_sources.scene import spherical_waves
 from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
@@ -58,7 +58,9 @@ def test_a_search_starts_from_sources_where_rays_meet():
     found = method.points_and_amplitudes()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
         settings = SearchSettings(order=order)
-        start = Search(draw_rows(data, rows, 100, 0), still, settings, 0, lambda: False, found).scene.sources
+        start = Search(
+            rows_of_measurements(data, rows, 100, 0), still, settings, 0, lambda: False, found
+        ).scene.sources
         assert len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
     context, init = FitContext(beside={"rays": method}), InitSettings()
     assert torch.equal(CANDIDATES["sources"](init, True, context).start[0], found[0])

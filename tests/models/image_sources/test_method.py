@@ -20,7 +20,7 @@ from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import draw_rows
+from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.physics.mirror_planes import reflect
 from gsparc.prediction.predictor import Predictor
@@ -154,7 +154,7 @@ def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
 def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     array = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1, array=array)
-    assert draw_rows(data, fold.train, 10_000, 0).target.shape == (3 * len(fold.train), 1)
+    assert rows_of_measurements(data, fold.train, 10_000, 0).target.shape == (3 * len(fold.train), 1)
     method, _ = fitted(data, fold, tmp_path, clutter=False)
     assert _predicted(method, data, fold.test).mean.shape == (len(fold.test), 3, 1)
     assert error(method, data, fold.test) < 0.03
@@ -167,7 +167,7 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     mask = np.zeros(data.target.shape, bool)
     mask[..., ::4] = True
     known = replace(data, mask=mask)
-    assert set(draw_rows(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
+    assert set(rows_of_measurements(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
     method, _ = fitted(known, fold, tmp_path, clutter=False)
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
@@ -176,11 +176,11 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
 def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
     frequency = 2.4e9 + np.arange(64) * 1e6
     _, data, fold = shoebox(30, size=(3.0, 2.5, 2.2), max_order=0, frequency_hz=frequency)
-    rows = draw_rows(data, fold.train, 4 * len(fold.train), 0)
+    rows = rows_of_measurements(data, fold.train, 4 * len(fold.train), 0)
     assert len(rows) == 4 * len(fold.train) and len(rows.frequency.unique()) > 16
     for receiver in rows.receiver.unique():
         assert (rows.frequency[rows.receiver == receiver].diff() >= 15e6).all()
-    assert len(draw_rows(data, fold.train, 10, 0)) == 10
+    assert len(rows_of_measurements(data, fold.train, 10, 0)) == 10
 
 
 def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):

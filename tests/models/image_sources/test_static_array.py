@@ -17,7 +17,7 @@ from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
 from gsparc.models.image_sources.gp_likelihood import GainPosterior, estimate_phases
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
-from gsparc.models.image_sources.rows import draw_rows, static_array
+from gsparc.models.image_sources.rows import rows_of_measurements, static_array
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
 from gsparc.physics.mirror_planes import bisector, image_rotations, images, reflect
 from gsparc.physics.waves import LIGHT
@@ -116,7 +116,7 @@ def test_orientation_of_first_and_second_order():
 
 def _rows_and_scene():
     data, fold = _uplink(40)
-    rows = draw_rows(data, fold.train, 100, 0)
+    rows = rows_of_measurements(data, fold.train, 100, 0)
     static = torch.from_numpy(data.site.static_position)
     planes = torch.tensor([[1.0, 0, 0, -data.site.origin[0]]]).double()
     scene = SourceScene(static, planes, ((), (0,)), torch.zeros(2), -5.0)
@@ -170,14 +170,14 @@ def test_antennas_with_phases_of_their_own(tmp_path):
 
 def test_antennas_of_unknown_places_are_outputs_of_their_own():
     data, fold = _uplink(30, antennas=2)
-    rows = draw_rows(replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0)
+    rows = rows_of_measurements(replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0)
     assert rows.target.shape == (len(fold.train), 2) and rows.array is None
 
 
 def test_rows_draw_antennas_so_that_places_are_many():
     tones, array = CARRIER + 1e6 * np.arange(8), np.eye(4, 3) / 30
     _, data, fold = shoebox(60, max_order=0, frequency_hz=tones, array=array)
-    rows = draw_rows(data, fold.train, 2 * len(fold.train), 0)
+    rows = rows_of_measurements(data, fold.train, 2 * len(fold.train), 0)
     assert len(rows.receiver.unique()) == len(fold.train) and len(rows) == 2 * len(fold.train)
 
 

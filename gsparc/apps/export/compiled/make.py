@@ -19,7 +19,7 @@ from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.clutter.blocking import Clutter
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import draw_rows
+from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.method import Method
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
@@ -186,7 +186,9 @@ def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
     member = method.members[int(torch.as_tensor(method.weights).argmax())]
     # Sources work in their own unit, in which rows' factors are divided out.
     data = replace(data, target=data.target * method.factors.numpy()[:, None])
-    rows = method.frame.normalise(draw_rows(data, np.arange(len(data)), len(data), method.settings.seed))
+    rows = method.frame.normalise(
+        rows_of_measurements(data, np.arange(len(data)), len(data), method.settings.seed)
+    )
     scene = replace(member.scene, clutter=Clutter.empty())
     # Without __init__: its sources are given, and searching is what would be repeated.
     alone = ImageSourceGP.__new__(ImageSourceGP)
