@@ -18,6 +18,7 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 
+from gsparc.data.errors import list_first
 from gsparc.data.executor import run_each
 from gsparc.data.files import is_out_of_space
 from gsparc.data.schema import Measurements
@@ -45,6 +46,7 @@ SLOW = ClockSettings(rounds=5, least=1, warmup=0, rounds_s=20.0)
 ONCE = replace(SLOW, rounds=1)
 
 
+LONGEST = 4  # entries of what is to be done
 TIMED = ["dataset", "split", "method", *SPEED[:3]]
 
 
@@ -92,6 +94,15 @@ class Job:
 
 
 Fit = Callable[[Job, str | None], object]
+
+
+def _minutes(jobs: Sequence[Job]) -> list[str]:
+    """Say what jobs take together and each, the longest first."""
+    longest = sorted(jobs, key=lambda job: -job.expected_s)
+    every = sum(job.expected_s for job in jobs)
+    return [f"{every / 60:.3g} min", *(f"{job.name} {job.expected_s / 60:.2g}" for job in longest)]
+
+
 Piece = TypeVar("Piece")
 Made = TypeVar("Made")
 
@@ -156,6 +167,8 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
     found = {str(one.name): one.row() for one in jobs if read_finished(one.folder, one.state, one.reuse)}
     missing = [one for one in jobs if str(one.name) not in found]
     log.info("%d cells, %d already done", len(jobs), len(found))
+    if train and missing:
+        log.info("to do: about %s", list_first(_minutes(missing), LONGEST))
     # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 
