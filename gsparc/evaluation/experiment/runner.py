@@ -46,7 +46,7 @@ SLOW = ClockSettings(rounds=5, least=1, warmup=0, rounds_s=20.0)
 ONCE = replace(SLOW, rounds=1)
 
 
-LONGEST = 4  # entries of what is to be done
+LONGEST = 3  # jobs that are named before they begin
 TIMED = ["dataset", "split", "method", *SPEED[:3]]
 
 
@@ -97,10 +97,9 @@ Fit = Callable[[Job, str | None], object]
 
 
 def _minutes(jobs: Sequence[Job]) -> list[str]:
-    """Say what jobs take together and each, the longest first."""
+    """Say what each job is expected to take, the longest first."""
     longest = sorted(jobs, key=lambda job: -job.expected_s)
-    every = sum(job.expected_s for job in jobs)
-    return [f"{every / 60:.3g} min", *(f"{job.name} {job.expected_s / 60:.2g}" for job in longest)]
+    return [f"{job.name} {job.expected_s / 60:.2g} min" for job in longest]
 
 
 Piece = TypeVar("Piece")
@@ -168,7 +167,8 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
     missing = [one for one in jobs if str(one.name) not in found]
     log.info("%d cells, %d already done", len(jobs), len(found))
     if train and missing:
-        log.info("to do: about %s", list_first(_minutes(missing), LONGEST))
+        every = sum(job.expected_s for job in missing) / 60
+        log.info("about %.3g min; longest: %s", every, list_first(_minutes(missing), LONGEST))
     # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 

@@ -65,6 +65,8 @@ def _scored(own: Row) -> dict[str, Any]:
         "label": label[label.find(" (") :] if " (" in label else "",
         # "20261129T153822-2c93ceee", "014896424e456e89…": when, and by which program.
         "date": str(own["run_id"] or "")[:8], "commit": str(own["git"] or "")[:8],
+        # Draws are hashes of numbers of rows: of other data they may be the same.
+        "tested": f"{str(own['data'] or '')[:8]}/{own['draw']}",
     }  # fmt: skip
 
 
@@ -93,7 +95,7 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
         `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
         `given`: what it reads beside places; `gaussians`: of a model; `memory_mb`: while it was fitted [MB].
-        `cpu`, `commit`, `date`: of the latest fit; `tested`: hashes of the test rows of all draws.
+        `cpu`, `commit`, `date`: of the latest fit; `tested`: hashes of data and test rows of all draws.
     """
     if filled.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
@@ -119,7 +121,7 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     rows[["given", "cpu"]] = groups[["given", "cpu"]].last()
     latest = cells.sort_values("date", kind="stable").groupby(GROUP, dropna=False)
     rows[["commit", "date"]] = latest[["commit", "date"]].last()
-    rows["tested"] = groups["draw"].agg(lambda draws: " ".join(sorted(set(draws))))
+    rows["tested"] = groups["tested"].agg(lambda tested: " ".join(sorted(set(tested))))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
     rows = _with_behind(rows.reset_index())
     timed = pd.DataFrame(columns=TIMED) if timed is None else timed

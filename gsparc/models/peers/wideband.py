@@ -21,6 +21,7 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
+from gsparc.field.losses import task_loss
 from gsparc.models.peers.gaussians import (
     GEOMETRY_RATES,
     Deformation,
@@ -34,17 +35,11 @@ from gsparc.models.peers.gsrf import count_terms, fourier_legendre
 from gsparc.models.peers.trained import KnownSite, smooth_root
 from gsparc.training.context import FitContext
 
-CHANGES = (
-    1,
-    1,
-    1,
-    1,
-    2,
-    2,
-)  # amplitude, phase, attenuation, size, scale and shift of the series' constant
-LEAST = (0.1, 0.1, 0.01)  # how much at most size, and the constant's scale and shift, may change
+# Amplitude, phase, attenuation, size, and of the series' constant scale and shift.
+CHANGES = (1, 1, 1, 1, 2, 2)
+MOST_CHANGE = (0.1, 0.1, 0.01)  # of the size, and of the constant's scale and shift
 PULL = 5e-4  # weight of the squared changes in the loss
-MOST = 0.999  # of an opacity
+MOST_OPACITY = 0.999
 
 
 class FrequencyEmbedded(GaussianNetwork):
@@ -74,7 +69,10 @@ class FrequencyEmbedded(GaussianNetwork):
 
     def forward(self, query: Query) -> Tensor:
         """Return spectra (B, H, W)."""
-        amplitude, phase, opacity, size = self._attributes(query, self._changes_at(query))
+        return self._render(query, self._changes_at(query))
+
+    def _render(self, query: Query, changes: tuple[Tensor, ...]) -> Tensor:
+        amplitude, phase, opacity, size = self._attributes(query, changes)
         count = len(query)
         geometry = (
             self.field.means.expand(count, -1, -1), self.field.quats.expand(count, -1, -1),
@@ -97,11 +95,11 @@ class FrequencyEmbedded(GaussianNetwork):
         series = fourier_legendre(nn.functional.normalize(towards, dim=-1), self.degree, self.degree)
         whole = torch.einsum("bnk,nkc->bnc", series, self.series)
         constant = self.series[:, 0]
-        raw = 0.5 + whole + LEAST[1] * scale.tanh() * constant + LEAST[2] * shift.tanh()
-        strength = nn.functional.leaky_relu(raw[..., 0].clamp_min(0)) * (1 + amplitude[..., 0]).abs()
+        raw = 0.5 + whole + MOST_CHANGE[1] * scale.tanh() * constant + MOST_CHANGE[2] * shift.tanh()
+        strength = raw[..., 0].clamp_min(0) * (1 + amplitude[..., 0]).abs()
         turn = 2 * math.pi * (torch.sigmoid(raw[..., 1]) + phase[..., 0].tanh())
         opacity = torch.sigmoid(self.field.opacity_logits) * (1 + attenuation[..., 0]).abs()
-        return strength, turn, opacity.clamp_max(MOST), 1 + LEAST[0] * size.tanh()
+        return strength, turn, opacity.clamp_max(MOST_OPACITY), 1 + MOST_CHANGE[0] * size.tanh()
 
     def emit(self, query: Query) -> Tensor:
         """See `GaussianNetwork`."""
@@ -109,8 +107,9 @@ class FrequencyEmbedded(GaussianNetwork):
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the base's, and the pull of all changes towards none."""
-        pull = torch.stack([change.square().mean() for change in self._changes_at(batch)]).sum()
-        return super().loss(batch, generator) + PULL * pull
+        changes = self._changes_at(batch)
+        pull = torch.stack([change.square().mean() for change in changes]).sum()
+        return task_loss(self._render(batch, changes), batch, self.losses).mean() + PULL * pull
 
 
 @dataclass(eq=False, kw_only=True)

@@ -36,6 +36,12 @@ def test_rows_of_the_same_test_rows_stand_beside_a_new_method(file):
     assert len(beside_published(averages([filled("mine", 31.0, split="other")]), read_published(file))) == 1
 
 
+def test_rows_of_other_data_stood_beside(file):
+    """Test rows were known by their numbers, which another simulation of a room has, too."""
+    own = averages([filled("mine", 31.0, **{"dataset/sha256": "other"})])
+    assert len(beside_published(own, read_published(file))) == 1
+
+
 def test_a_table_of_an_older_program_lacks_a_column(file):
     """Each column that is added to `compare.csv` made the tables written before unreadable."""
     older = pd.read_csv(file).drop(columns=["given", "memory_mb"])
