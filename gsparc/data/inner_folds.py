@@ -73,7 +73,7 @@ def inner_folds(
     Raises:
         DataError: fewer than 2 places to cut.
     """
-    known = np.sort(np.concatenate([fold.train, fold.val]))
+    known = np.sort(fold.learned())
     positions, place = positions - positions.min(axis=0), spacing.group_visits(positions, place)
     number = np.arange(len(known)) if place is None else np.unique(place[known], return_inverse=True)[1]
     _, first, which = np.unique(number, return_index=True, return_inverse=True)
@@ -148,7 +148,7 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
     gap = float(np.median(cKDTree(places).query(positions[fold.val])[0]))
     if not gap > FARTHER * (neighbour_distance(places) or gap):
         return settings
-    known = np.sort(np.concatenate([fold.train, fold.val]))
+    known = np.sort(fold.learned())
     where = positions[known]
     best, nearest = settings, np.inf
     for side in gap * SIDES:
@@ -157,7 +157,7 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
             cut = make_split(where, squares).folds[0]
         except DataError:
             break
-        learned = where[np.concatenate([cut.train, cut.val])]
+        learned = where[cut.learned()]
         apart = float(np.median(cKDTree(learned).query(where[cut.test])[0]))
         if abs(np.log(max(apart, 1e-12) / gap)) < nearest:
             best, nearest = squares, abs(np.log(max(apart, 1e-12) / gap))

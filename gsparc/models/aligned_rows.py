@@ -71,7 +71,7 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     site = data.site
     if site.freedom == "none" or site.phase_reference is not None:
         return data, fold
-    known = np.sort(np.concatenate([fold.train, fold.val]))
+    known = np.sort(fold.learned())
     key = (fold.train.tobytes(), fold.val.tobytes(), site.sha256.encode())
     for kept, its, result in _LAST:
         if kept() is data and its == key:

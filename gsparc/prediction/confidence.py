@@ -103,7 +103,7 @@ class Trusted(Stored):
 
         Length and noise of the kernel are chosen by likelihood on a few known rows.
         """
-        known = np.concatenate([fold.train, fold.val])
+        known = fold.learned()
         # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
         kernel = kernel_of_targets(data, known[draw_rows(len(known), KERNEL_ROWS, 0)], COMPONENTS)
         return Trusted(known=data.moving[known], kernel=kernel)

@@ -141,7 +141,7 @@ def held_out_levels(method: Method, data: Measurements, fold: Fold, block: np.nd
 
     Without rows that have no level, or of which the method predicts none.
     """
-    rows, known = fold.test, np.concatenate([fold.train, fold.val])
+    rows, known = fold.test, fold.learned()
     mean, spread = np.full((2, len(rows)), np.nan)
     for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
         mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)

@@ -54,7 +54,7 @@ class Learned:
         One that can forget rows does so, with its settings as they are; another one is fitted anew.
         """
         if isinstance(self.method, Reconditions):
-            known = np.sort(np.concatenate([fold.train, fold.val]))
+            known = np.sort(fold.learned())
             less = self.method.copy_conditioned(without_devices(self.data, self.method.fitted_site), known)
             if less is not None:
                 return less

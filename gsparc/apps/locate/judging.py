@@ -127,7 +127,7 @@ def locate_by_model(
     """
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
     data, fold = run.data, run.split.folds[0]
-    learned = np.sort(np.concatenate([fold.train, fold.val]))
+    learned = np.sort(fold.learned())
     unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
     # A plan is in world metres, cells are local.
     origin = data.site.origin

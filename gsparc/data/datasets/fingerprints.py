@@ -154,4 +154,4 @@ def split_fingerprints(
     cube = np.unique(np.floor(rows.position / side_m), axis=0, return_inverse=True)[1].reshape(-1)
     place = cube if how == "places" else None
     fold = make_split(rows.position, settings, place=place, station=rows.walk).folds[0]
-    return np.sort(np.concatenate([fold.train, fold.val])), fold.test
+    return np.sort(fold.learned()), fold.test

@@ -43,7 +43,7 @@ class Interpolator(Method):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none, or what it learned is not stored."""
-        known = np.concatenate([fold.train, fold.val])
+        known = fold.learned()
         rows = known if self.uses_censored else heard_rows(data, known)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")

@@ -95,7 +95,7 @@ class ComplexGP(ClosedForm):
         started = Stopwatch()
         if data.site.kind != "csi" or data.site.wavelength is None:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
-        known = np.concatenate([fold.train, fold.val])
+        known = fold.learned()
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
         one_run = len(np.unique(data.runs_of(known))) == 1  # factors of several need all rows
         many = len(known) > MOST_ROWS and one_run

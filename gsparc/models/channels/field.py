@@ -110,7 +110,7 @@ class ChannelField(ClosedForm):
         Raises:
             ValueError: the data are no channels of a known carrier with one static end.
         """
-        watch, rows = Stopwatch(), np.concatenate([fold.train, fold.val])
+        watch, rows = Stopwatch(), fold.learned()
         self.site, self.channel = data.site, (int(data.target.shape[1]), int(data.target.shape[2]))
         self.prior, notes = find_terms(data, rows, self.settings, context.counts)
         self.condition(data, rows)

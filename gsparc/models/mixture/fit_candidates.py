@@ -50,7 +50,7 @@ def fit_candidates(
         ValueError: the only initialiser, the one asked for, or none of them can solve this.
     """
     several = cut is not None
-    rows = fold.train if several else np.sort(np.concatenate([fold.train, fold.val]))
+    rows = fold.train if several else np.sort(fold.learned())
     groups = () if cut is None else _training_groups(cut, fold.train)
     # Searches come last: they race against the best before them, and end where they fall behind.
     fields: dict[str, ClosedForm] = {}

@@ -112,7 +112,7 @@ class Mixture(LearnsTogether, ClosedForm):
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
         site, phases = data.site, data.site.phase_reference != "neighbours"
         heeds = site.kind != "spectrum" and site.static_end is not None and phases
-        known = np.concatenate([fold.train, fold.val])
+        known = fold.learned()
         if (std := position_errors(data, known, self.position_std, heeds)) is not None:
             return self._fit_twice(parts, init, data, fold, context, std)
         return self._solve(parts, init, data, fold, context)
@@ -149,7 +149,7 @@ class Mixture(LearnsTogether, ClosedForm):
         """
         watch = Stopwatch()
         log.info("training in closed form: init=%s", " and ".join(parts))
-        known, several = np.sort(np.concatenate([fold.train, fold.val])), len(parts) > 1
+        known, several = np.sort(fold.learned()), len(parts) > 1
         self.runs = _estimate_run_factors(data, known, context)
         data = self.runs.remove_factors(data)
         stages = {"factors of runs": watch.seconds} if len(self.runs) > 1 else {}

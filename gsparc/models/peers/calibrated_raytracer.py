@@ -103,7 +103,7 @@ class CalibratedRayTracer(Checked, Method):
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
         self._scene_json, self._tracer = json.dumps(asdict(scene)), None
-        rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
+        rows = heard_rows(data, fold.learned())
         # Measurements are local, the tracer's scene is in world coordinates.
         places, measured = data.moving[rows] + data.site.origin, _measured_decibels(data, rows)
         tracer = self._loaded_tracer()

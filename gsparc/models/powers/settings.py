@@ -47,7 +47,7 @@ MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
-COMPARED_ON = 500  # of them, constant and distance law; with little effort
+COMPARED_ON = 300  # of them, constant and distance law; with little effort
 WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 MAP_COST = 3.0  # nats that rows must say for a map that was there before
@@ -201,7 +201,7 @@ def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows
     if not many:
         return best
     if not best.kernel.is_isotropic:  # none are nearest by which it could be chosen
-        part = rows.draw_subset(min(max_rows, 2 * COMPARED_ON), seed)
+        part = rows.draw_subset(min(max_rows, CHOSEN_ON), seed)
         return _search_kernel(part, best, [best.kernel], limit=REFINED)
     kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))

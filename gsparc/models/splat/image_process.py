@@ -88,7 +88,7 @@ class ImageProcess(LearnedField):
         spent = dict(self.spent)
         if self._average is not None:
             method = self._average[0]
-            known = np.sort(np.concatenate([fold.train, fold.val]))
+            known = np.sort(fold.learned())
             # It was weighed without validation rows, and answers with them.
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             if not self._is_process_alone:  # components are most of a query

@@ -537,12 +537,12 @@ class LearnedField(Method):
 
 def _train_on_all(fold: Fold) -> Fold:
     """Training and validation rows as training rows."""
-    return Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+    return Fold(np.sort(fold.learned()), fold.val[:0], fold.test)
 
 
 def _hold_out_third(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
-    known = np.sort(np.concatenate([fold.train, fold.val]))
+    known = np.sort(fold.learned())
     if len(known) < THIRDS * LEAST_HELD:
         return fold
     cut = cut_folds(data, fold, context.split, THIRDS, context.seed).folds[0]
