@@ -82,7 +82,7 @@ def test_every_package_is_on_the_map():
 def test_the_walk_is_through_functions_that_are_there():
     """At most 12 steps of a spectrum and of a power, each a file and what it defines."""
     for walk in MAP.partition("## The walk")[2].partition("\n## ")[0].split("**A ")[1:]:
-        steps = re.findall(r"(?:^|\s)(\d+) `([\w/]+\.py) ([\w.]+)`", walk)
+        steps = re.findall(r"(?:^|\s)(\d+)\.? `([\w/]+\.py) ([\w.]+)`", walk)
         assert len(steps) > 5 and int(steps[-1][0]) == 12
         for _, file, name in steps:
             text = (ROOT / "gsparc" / file).read_text(encoding="utf-8")

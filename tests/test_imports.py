@@ -27,7 +27,7 @@ ARROWS = {
     "training": "data processes",
     "models": "conf data field ops physics processes simulate training",
     "prediction": "data field models ops physics processes training",
-    "apps.locate": "data evaluation prediction processes",
+    "apps.locate": "data evaluation models prediction processes",
     "evaluation": "conf data models prediction processes simulate training",
     "apps.maps": "data evaluation models prediction processes",
     "apps.export": "data field models ops physics prediction processes training",

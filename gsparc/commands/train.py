@@ -73,8 +73,7 @@ def train(
             )
             contexts = folds.fold_contexts(whole, split, resumes)
             with heeded.record_reads(inputs.reads):
-                # `Method.fit` of every fold; what takes gradient steps (models/splat/method.py) makes the
-                # Trainer from `context.trainer` and calls `trainer.fit(module, datamodule)`.
+                # `Method.fit` of every fold; models/{splat/method,peers/trained}.py call `Trainer.fit`.
                 keep = partial(folds.keep_fold, split, contexts, run_id)
                 fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
                 options.ask_one_query(fits.methods[0], data, split, config.eval_on)

@@ -36,7 +36,7 @@ class Fold:
     test: np.ndarray
 
     def learned(self, eval_on: str = "test") -> np.ndarray:
-        """Return rows that are learned from; those of `val` are not where they are the ones scored."""
+        """Return rows that are learned from: all but test rows, and without `val` where `val` is scored."""
         return self.train if eval_on == "val" else np.concatenate([self.train, self.val])
 
     def map(self, change: Callable[[np.ndarray], np.ndarray]) -> Fold:
@@ -212,9 +212,9 @@ def make_split(
     rows, left = len(positions), settings.leave_out
     absent = np.zeros(0, np.int64) if isinstance(left, int) else rows_to_leave_out(left, outliers, rows)
     rows_left = np.setdiff1d(np.arange(rows), absent)
-    # Files of the release are its published split; `redraw` is for drawing others, and not read without.
+    # Files of the release are its published split; `redraw` draws another one instead.
     named = None if settings.name != "random" or release_split is None or settings.redraw else release_split
-    # Of the rows that stand for their places, and the place of each row.
+    # `first`: the row that stands for each place; `which`: the place of each row.
     first = which = np.arange(len(rows_left))
     if settings.name in WHOLE:
         local_folds = _whole(None if station is None else station[rows_left], settings)
@@ -227,34 +227,33 @@ def make_split(
             # One row stands for each place: splits are made of places, so that no visit is on both sides.
             _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
         where = positions[rows_left][first]
-        pairs = enumerate(_pairs(where, settings, named))
-        if settings.name == "later":
-            taken = np.argsort(rows_left if order is None else order[rows_left], kind="stable")
-            pairs = enumerate([_cut_off(taken, settings.test_fraction)])
-        elif order is not None and settings.name == "none":
-            drawn = np.argsort(np.argsort(order)[rows_left][first])
-            pairs = enumerate([(drawn, drawn[:0])])
-        local_folds = tuple(_finish(i, train, test, where, settings) for i, (train, test) in pairs)
+        taken = np.arange(len(first)) if order is None else np.argsort(order[rows_left][first], kind="stable")
+        pairs = [named] if named is not None else _pairs(where, taken, settings)
+        local_folds = tuple(_finish(i, *pair, where, settings) for i, pair in enumerate(pairs))
     folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
     return Split(settings.name, folds, named is not None)
 
 
-def _pairs(positions: np.ndarray, settings: SplitSettings, named: TrainTest | None) -> list[TrainTest]:
-    """(training, test) rows of each fold, before thinning and validation."""
-    if named is not None:
-        return [named]
-    if settings.name == "grouped":
-        return _grouped(positions, settings)
-    if settings.name == "corner":
-        return [_corner(positions, settings)]
-    rows = len(positions)
-    if settings.name == "none":
-        return [(np.arange(rows), np.zeros(0, np.int64))]
-    if settings.name == "blocks":
-        test = _blocks(positions, np.arange(rows), settings, settings.share, [settings.seed])
-        return [(np.setdiff1d(np.arange(rows), test), test)]
-    test_share = settings.test_fraction if settings.name == "random" else 1 - settings.train_fraction
-    return [_cut_off(np.random.default_rng(settings.seed).permutation(rows), test_share)]
+def _pairs(positions: np.ndarray, taken: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
+    """(training, test) rows of each fold, before thinning and validation; `taken` (n,) are rows in order."""
+    rows, rng = np.arange(len(positions)), np.random.default_rng(settings.seed)
+    match settings.name:
+        case "random":
+            return [_cut_off(rng.permutation(rows), settings.test_fraction)]
+        case "sparse":
+            return [_cut_off(rng.permutation(rows), 1 - settings.train_fraction)]
+        case "later":
+            return [_cut_off(taken, settings.test_fraction)]
+        case "none":
+            return [(taken, taken[:0])]
+        case "grouped":
+            return _grouped(positions, settings)
+        case "corner":
+            return [_corner(positions, settings)]
+        case "blocks":
+            test = _blocks(positions, rows, settings, settings.share, [settings.seed])
+            return [(np.setdiff1d(rows, test), test)]
+    raise ValueError(f"split={settings.name}: no such way to split by places")
 
 
 def _cut_off(order: np.ndarray, test_share: float) -> TrainTest:

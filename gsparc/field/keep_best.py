@@ -69,7 +69,7 @@ class KeepBest(L.Callback):
         if module.solved and len(self.start):
             log.info(
                 "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; with "
-                "experiment=field, from a random start, another loss or callback shows",
+                "experiment=field starts at random: there another loss or callback makes a difference",
                 self.step, len(self.start), float(self.start.mean()), self.error,
             )  # fmt: skip
         if self.step == taken:

@@ -129,7 +129,7 @@ class Interpolated(View):
     """A method that answers on a coarser grid, its images interpolated to the full one.
 
     Args:
-        inner: answers on `coarser(grid, stride)`.
+        inner: answers on `coarsen_grid(grid, stride)`.
         grid: the full one.
         stride: pixels per rendered pixel, along both axes.
     """

@@ -2,8 +2,8 @@
 
 Stacked regression with weights that are not negative and sum to one: L. Breiman, "Stacked regressions",
 Machine Learning 24 (1996). With e_ik the error of prediction k in row i, the squared error of a mixture w is
-w^T G_i w, G_i = e_i e_i^T, so that weights are functions of these products alone. A mixture is taken where it
-is surely better than one predictor alone, on units of rows that its weights were not learned from.
+w^T G_i w, G_i = e_i e_i^T, so that weights are functions of these products alone. Weights are learned on some
+units of rows and tried on the others; a mixture is taken where it surely beats one predictor alone there.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ def choose_weights(
         gram: (n, K, K) products of the errors of n rows.
         unit: (n,), rows of one unit are not independent.
         deviations: standard errors that the gain over one alone must exceed.
-        least: share of its error that it must exceed where the first is the best: then a mixture costs more.
+        least: smallest relative gain where predictor 0 is the best one: a mixture answers more slowly. Where
+            another is the best, any mixture is taken: it holds predictor 0 and costs no more.
         few: units below which predictors that they do not tell apart weigh alike (J. M. Bates and C. W. J.
             Granger, 1969).
     """
@@ -96,8 +97,8 @@ def best_weights(gram: np.ndarray) -> np.ndarray:
 def weights_of_fits(errors: Tensor) -> Tensor:
     """Return weights (K,) of fits by their errors (K,) at rows that they were fitted to, each left out alone.
 
-    Errors that are small by search say little of what a mean gains: by their products test errors of searches
-    went 10 % up and down.
+    Products of errors would overrate a mean of searches, whose errors are small because they were searched
+    for: test errors went 10 % up and down.
     """
     return torch.softmax(-SHARPNESS * errors.log(), 0)
 
@@ -123,9 +124,9 @@ def to_real_entries(values: Tensor) -> Tensor:
 def leave_out_groups(
     member: ClosedForm, data: Measurements, rows: np.ndarray, groups: Sequence[np.ndarray]
 ) -> LeftOutRows | None:
-    """Return rows of every group, predicted from the others of rows (n,) with the parameters of all.
+    """Return predictions of every group of rows by a member conditioned on rows (n,) without that group.
 
-    None without groups. The member stays as it is.
+    Its parameters stay those of all rows. None without groups. The member stays as it is.
     """
     if not groups:
         return None
@@ -150,7 +151,7 @@ def stack(
         members: one or more; one alone needs no rows.
         data: measurements.
         val: (v,) rows that none learned from, which are compared beside those that all left out by groups.
-        cut: of the groups; None: there are none.
+        cut: of the groups; None only for one member.
         deviations: see `choose_weights`.
     """
     first = next(iter(members))

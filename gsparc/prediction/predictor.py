@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -17,7 +16,6 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.models import checkpoint
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import (
     MEAN_DEVICE,
@@ -442,8 +440,3 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
         explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
         return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)
-
-
-def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
-    """Store more with a model, as its `Predictor.extra`; the file is rewritten whole or not at all."""
-    checkpoint.update_extra(path, extra)

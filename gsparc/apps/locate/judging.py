@@ -29,7 +29,8 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Column, Table
-from gsparc.prediction.predictor import Predictor, update_extra
+from gsparc.models import checkpoint
+from gsparc.prediction.predictor import Predictor
 from gsparc.processes.few_rows import draw_rows
 
 log = logging.getLogger(__name__)
@@ -151,7 +152,8 @@ def locate_by_model(
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:
-            update_extra(config.ckpt, {locating.KEY: {"trust": asdict(trust), "how": how, "count": count}})
+            learned = {"trust": asdict(trust), "how": how, "count": count}
+            checkpoint.update_extra(config.ckpt, {locating.KEY: learned})
     elif config.calibrate:
         log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
 

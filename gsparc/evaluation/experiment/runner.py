@@ -110,13 +110,13 @@ def run_list(
     make: Callable[[Piece], Made], pieces: Sequence[Piece], what: str, *, name: Callable[[Piece], str] = str,
     refused: list[str] | None = None, **how: Any,
 ) -> Iterator[tuple[Piece, Made]]:  # fmt: skip
-    """Yield pieces and what is made of each, as they end; one that cannot be made is said and left out.
+    """Yield each piece with what is made of it, as they end; a piece that fails is logged and left out.
 
     Args:
         make: may raise whatever a plugin does.
         pieces, what, how: see `run_each`.
         name: of a piece in the log.
-        refused: to which it is added why a piece cannot be made.
+        refused: a list that takes the reasons of failed pieces.
     """
     for number, (made, why) in run_each(partial(_tried, make), pieces, what, **how):
         if not why:
@@ -146,9 +146,9 @@ def _fit_once(fit: Fit, job: Job) -> None:
 
 
 def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float | None = None) -> pd.DataFrame:
-    """Return the frame of jobs, found done or done now, saying how far it is and how long it will take.
+    """Do the jobs that are not done yet, log how long they take, and return the frame of all.
 
-    A job that cannot be done is said and left out; the others go on.
+    A job that fails is logged and left out; the others go on.
 
     Args:
         jobs: the most wanted first.
@@ -204,7 +204,7 @@ def time_queries(
     def timed(names: Iterable[str], clock: ClockSettings) -> None:
         found.update(time_beside_copy({name: calls[name] for name in names}, clock))
 
-    # By speed, before any takes a share of the rounds; a first call may make what later ones keep.
+    # One call sorts them by speed; slow ones take two, as the first may build what later ones keep.
     timed(calls, ONCE)
     timed([name for name, one in found.items() if SLOW_MS < one["query_ms"] <= ENDLESS_MS], ONCE)
     speeds = {name: one["query_ms"] for name, one in found.items()}

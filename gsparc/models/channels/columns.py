@@ -118,7 +118,7 @@ class Group(SlotPlaces):
 
     def state(self, factors: Tensor) -> dict[str, Any]:
         """Return what `read` reads; targets as measured, of runs of these factors."""
-        # Groups hold aligned targets, and `fit_factors` divides by the factors again when read.
+        # Groups hold aligned targets, and `_fit_factors` divides by the factors again when read.
         target = self.target * factors[self.run][:, None]
         return {**self._tensors(), "slot": self.slot.state(), "target": target}
 

@@ -63,9 +63,9 @@ class Stage:
     """A part of a fit that begins with a fresh model, or goes on with one.
 
     Attributes:
-        name: `train`; `refit`, as many steps again, of all rows; `final`, the start alone, of all rows.
+        name: `train`; `refit`: as many steps again on all rows; `final`: the start alone, on all rows.
         fold: whose training rows it learns from.
-        context: of the fit, in the stage's folder, with what the stage goes on from.
+        context: the fit's, with the stage's folder and the file that it resumes from.
         steps: of gradient, of its schedule.
         patience: see `KeepBest`.
     """
@@ -107,7 +107,7 @@ class LearnedField(Method):
     stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     _is_process_alone = False  # whether a process beside it has all the weight: another stage gains nothing
     _ended: tuple[str, ...] = ()
-    # Of a version, with what an array sees or without, in float64.
+    # The float64 copy of a version of the model, for an array or not.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
 
     def __init__(
@@ -131,7 +131,7 @@ class LearnedField(Method):
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
-        # Of a callback that is left out, oc.select gives None.
+        # A guess about a callback that is left out reads None (oc.select).
         self.refit, self.guesses = refit, tuple(guess for guess in guesses if " None" not in guess)
         self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
         self.model: GaussianModel | None = None
@@ -237,7 +237,7 @@ class LearnedField(Method):
     def _plan_stages(
         self, data: Measurements, fold: Fold, context: FitContext, resumed: StoredModel | None
     ) -> Iterator[Stage]:
-        """Yield one stage after the other, each decided by what came of those before.
+        """Yield the stages in order; the results of earlier ones decide what follows.
 
         Args:
             resumed: by an interrupted run.
@@ -279,7 +279,7 @@ class LearnedField(Method):
     def _start_stage(self, stage: Stage, data: Measurements, watch: Stopwatch) -> GaussianModule | None:
         """Make a fresh model, or read one back; return what trains it, None where no step is taken.
 
-        What an earlier stage learned of errors is kept by `refit`, which learns from the rows that told it.
+        `refit` keeps the confidence of the stage before: the rows that calibrated it are learned from now.
         """
         context, folder = stage.context, stage.context.run_dir
         L.seed_everything(context.seed, verbose=False)
