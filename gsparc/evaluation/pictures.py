@@ -21,7 +21,6 @@ from gsparc.evaluation.metrics import SpectrumMetrics
 from gsparc.evaluation.site_plan import draw_found
 from gsparc.evaluation.summary import results_table
 from gsparc.models.method import Method
-from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
 from gsparc.prediction.confidence import Guarantee
@@ -183,8 +182,7 @@ LEAST = 10  # rows that were heard of a sector, whose azimuth is not contradicte
 
 def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Path) -> None:
     """Draw rows of sectors that were learned from, less the law of distance, where there are patterns."""
-    every = method.all_stations() if isinstance(method, PerStation) else None
-    field = None if every is None else every.joint_method()
+    field = method.joint_method()
     if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
         return
     trend = field.network

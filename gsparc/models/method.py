@@ -254,6 +254,14 @@ class Method(MethodFactory):
         """Return a method that answers with these settings; this one is left as it is."""
         return self if self.reducible is None else self.reducible.reduce(settings, measured)
 
+    def station_method(self, number: int) -> Method:
+        """Return what answers for a station; of a method without copies by station, itself."""
+        return self
+
+    def joint_method(self) -> HasJoint | None:
+        """Return what knows how levels of stations go together; None where nothing does."""
+        return None
+
     def objects(self) -> SiteObjects:
         """Return what it found to stand in the site."""
         return SiteObjects.from_arrays()

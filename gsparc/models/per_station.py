@@ -279,6 +279,11 @@ class PerStation(Method):
         stations = None if self.site is None else self.site.stations
         return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
 
+    def joint_method(self) -> HasJoint | None:
+        """See `Method.joint_method`."""
+        every = self.all_stations()
+        return None if every is None else every.joint_method()
+
     def add_carrier(self, frequency_hz: float) -> PerStation:
         """See `AddsCarriers`."""
         copy, site = self._copies.get(UNHEARD), self.fitted_site
@@ -348,7 +353,7 @@ class OneStationView(View):
         self.number = number
 
     def joint_method(self) -> HasJoint | None:
-        """Return what knows how levels of stations go together; None where nothing does."""
+        """See `Method.joint_method`."""
         method = getattr(self.inner, "member", None)
         return method if isinstance(method, HasJoint) else None
 

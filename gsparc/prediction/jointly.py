@@ -9,7 +9,7 @@ import torch
 
 from gsparc.data.schema import Site
 from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
-from gsparc.models.per_station import OneStationView, PerStation
+from gsparc.models.per_station import OneStationView
 from gsparc.prediction.query import Queries
 
 TOGETHER, UNREAD = 64, 1e12  # places at a time; variance of what is not measured [dB^2]
@@ -32,7 +32,7 @@ class JointMixin:
             places: (G, 3) of the moving end, world [m]; (G, k, 3): one for each of `stations`.
             stations: (k,) numbers.
         """
-        known = self._joint_method()
+        known = self.method.joint_method()
         return None if known is None else self._predict_levels(known, places, torch.as_tensor(stations))
 
     def predict_new(
@@ -47,7 +47,7 @@ class JointMixin:
                 [deg], and power over the mean of those that stand [dB].
             like: number of a station of their band; None: of the first.
         """
-        if (known := self._joint_method()) is None:
+        if (known := self.method.joint_method()) is None:
             return None
         still = np.asarray(station, np.float64) - self.site.origin
         more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64), like)
@@ -76,10 +76,6 @@ class JointMixin:
                 more[part] = np.maximum(noise, joint.noise / len(stations)) - joint.noise
         return more
 
-    def _joint_method(self) -> HasJoint | None:
-        every = self.method.all_stations() if isinstance(self.method, PerStation) else None
-        return None if every is None else every.joint_method()
-
     def _predict_levels(self, known: HasJoint, places: Any, stations: torch.Tensor) -> JointLevels:
         moving = torch.from_numpy(np.asarray(places, np.float64) - self.site.origin)
         if moving.dim() == 2:
@@ -107,7 +103,7 @@ class JointMixin:
         """
         query = self.queries.query(tx, rx, torch.float64).query
         places = query.places(self.site)
-        known = self.method.joint_method() if isinstance(self.method, OneStationView) else None
+        known = self.method.joint_method()
         if isinstance(self.method, OneStationView) and known is not None:
             station = torch.full((len(places),), self.method.number)
             _, covariance, noise = known.predict_joint(places[None], station)

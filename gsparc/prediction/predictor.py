@@ -131,7 +131,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.shown)}")
         # By number: two stations at one place, with different carriers, cannot be told apart by it.
         both = self.method, self._whole
-        method, whole = (m.station_method(number) if isinstance(m, PerStation) else m for m in both)
+        method, whole = (None if m is None else m.station_method(number) for m in both)
         copy = self._copy_with(method, whole, station_site(self.site, number), self._unit)
         copy.queries = Queries(copy.site, None if isinstance(self.method, PerStation) else number)
         return copy
