@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 RECORD = "job.json"  # in a fit's folder: its state and program, when it began, and whether it has ended
 FAILURE = "failure.txt"  # why it has failed
-WHERE = ("engine", "workers", "ray", "logger", "reuse")  # of where, or whether, a fit is done
+WHERE = ("engine", "workers", "ray", "logger", "reuse", "ckpt_path")  # of where, or whether, a fit is done
 OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
@@ -127,7 +127,7 @@ def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, 
 
 def run_once(
     folder: Path, state: State, work: Callable[[str | None], object], *, reuse: bool = False,
-    again: bool = False,
+    again: bool = False, resumes: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the summary of a fit, which is done now where it is not done.
 
@@ -138,6 +138,7 @@ def run_once(
             interrupted try has left, None to begin anew.
         reuse: see `read_finished`.
         again: one that is done is done anew.
+        resumes: whether the work goes on from a file that it was told, whatever changed since.
 
     Raises:
         DataError: the work has left no summary.
@@ -149,7 +150,7 @@ def run_once(
     record, left = read_summary(folder / RECORD), None
     changes = [] if record is None else state.changes(record)
     if record is None or record.get("ended") or changes:
-        if changes:
+        if changes and not resumes:
             log.info("%s: begun anew, as these changed: %s", folder, list_first(changes))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "began": time.time()}

@@ -269,3 +269,13 @@ def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     assert not caplog.messages
     run_once(tmp_path, state(settings={"seed": 0, "effort": 2}), ends(tmp_path, 1))
     assert caplog.messages == [f"{tmp_path}: begun anew, as these changed: settings.effort"]
+
+
+def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):
+    """`ckpt_path=` is no setting of the fit, and wins over whatever else changed."""
+    caplog.set_level("INFO")
+    one, other = (OmegaConf.create({"seed": 0, "ckpt_path": path}) for path in (None, "RUN"))
+    assert State.from_config(one) == State.from_config(other)
+    run_once(tmp_path, state(settings={"effort": 1}), ends(tmp_path))
+    run_once(tmp_path, state(settings={"effort": 3}), ends(tmp_path), again=True, resumes=True)
+    assert not any("begun anew" in message for message in caplog.messages)

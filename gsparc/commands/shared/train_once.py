@@ -42,7 +42,8 @@ def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs]
         data, split = measurements_hash(inputs.data), inputs.split.sha256
         state = State.from_config(config, data, split)
         state = replace(unread, data=data, split=split) if unread else state
-        return run_once(run_dir, state, work, reuse=config.reuse, again=not job)
+        resumes = config.ckpt_path is not None
+        return run_once(run_dir, state, work, reuse=config.reuse, again=not job, resumes=resumes)
 
 
 def objective(config: DictConfig, facts: Mapping[str, Any]) -> float:
