@@ -15,7 +15,7 @@ from gsparc.apps.maps.kmz import write_kmz
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
-from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
@@ -58,6 +58,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, settings = begin_run(config)
     floor = read_plan_settings(settings)
     predictor = load(config.ckpt)
+    warn_of_held_out(predictor)
     how = PromiseSettings(**settings["promise"])
     query = {
         "area": settings["area"], "height_m": config.height_m, "step_m": config.step_m,

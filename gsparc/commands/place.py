@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promise import read_or_gather, reopen_training
-from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
@@ -23,6 +23,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
     predictor = load(path)
+    warn_of_held_out(predictor)
     where = {
         "area": settings["area"], "height_m": config.height_m, "sites": config.sites, "count": config.count,
         "station_height_m": config.station_height_m, "antenna": placing.NewAntenna(**settings["antenna"]),

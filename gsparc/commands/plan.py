@@ -14,7 +14,7 @@ from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
-from gsparc.commands.shared.output import begin_run, finish_run
+from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.prediction.operating_point import load
 
@@ -26,6 +26,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     floor = read_plan_settings(settings)
     # Before anything is measured there is no model, and places are spread over the area.
     predictor = None if config.ckpt is None else load(config.ckpt)
+    if predictor is not None:
+        warn_of_held_out(predictor)
     promise = None if predictor is None else read_or_gather(str(config.ckpt), settings)
     plan = plan_measurements(
         predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,

@@ -18,7 +18,10 @@ from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import open_console, repeated_warnings
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_summary
 from gsparc.evaluation.table import Table
+from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
+
+log = logging.getLogger(__name__)
 
 
 def run_directory() -> Path:
@@ -35,6 +38,15 @@ def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
     """
     RunSettings.from_config(config)
     return run_directory(), to_dict(config)
+
+
+def warn_of_held_out(predictor: Predictor) -> None:
+    """Warn of rows that were held out for a test: to a map they are places where nobody measured."""
+    if count := predictor.extra.get("tested"):
+        log.warning(
+            "%d rows of its file were held out for the test, and count as not measured here: train the final "
+            "model with split=none", count,
+        )  # fmt: skip
 
 
 def in_multirun() -> bool:

@@ -114,7 +114,7 @@ def keep_fold(
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     extra = fitting.run_extra(report, data, fold, context)
-    extra |= {"fold": number, "split_sha256": split.sha256, "run_id": run_id}
+    extra |= {"fold": number, "split_sha256": split.sha256, "run_id": run_id, "tested": len(fold.test)}
     extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
