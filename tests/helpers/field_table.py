@@ -57,7 +57,7 @@ def _section(name: str, rows: pd.DataFrame) -> str:
     rows = rows.sort_values("score_db", ascending=False, kind="stable")
     figure, draws = rows.figure.iloc[0], rows.draws.any()
     columns = [
-        Column("method", "", of=_named), Column("beside places", "", of="given"),
+        Column("method", "", of=_named), Column("extra input", "", of="given"),
         Column(score_heading(figure), ".2f", of=_score),
         *(Column(heading, ".3g", of=name) for name, heading in MEDIANS.items() if rows[name].notna().any()),
         CPU, P50, Column("Gaussians", ".0f", of=lambda row: row["gaussians"] or None),

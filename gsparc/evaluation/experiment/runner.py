@@ -96,10 +96,9 @@ class Job:
 Fit = Callable[[Job, str | None], object]
 
 
-def _minutes(jobs: Sequence[Job]) -> list[str]:
-    """Say what each job is expected to take, the longest first."""
-    longest = sorted(jobs, key=lambda job: -job.expected_s)
-    return [f"{job.name} {job.expected_s / 60:.2g} min" for job in longest]
+def _duration(seconds: float) -> str:
+    """Seconds of a forecast, which is of an idle core, in words."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 Piece = TypeVar("Piece")
@@ -167,8 +166,10 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
     missing = [one for one in jobs if str(one.name) not in found]
     log.info("%d cells, %d already done", len(jobs), len(found))
     if train and missing:
-        every = sum(job.expected_s for job in missing) / 60
-        log.info("about %.3g min; longest: %s", every, list_first(_minutes(missing), LONGEST))
+        every = _duration(sum(job.expected_s for job in missing))
+        longest = sorted(missing, key=lambda job: -job.expected_s)
+        each = list_first([f"{job.name} {_duration(job.expected_s)}" for job in longest], LONGEST)
+        log.info("about %s of an idle core; longest: %s", every, each)
     # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 

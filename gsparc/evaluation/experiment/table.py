@@ -201,7 +201,8 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         ahead = lead_over_runs(row.results, own.results)
         if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
-    close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
+    # Of a published row the milliseconds are another machine's.
+    close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna() & ~_published(block)]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
@@ -231,12 +232,17 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
-    mark = np.where(block.method == ours, " (ours)", "")
+    mark = np.where(_published(block), " (published)", np.where(block.method == ours, " (ours)", ""))
     rows = block.assign(named=block.method + block.label + mark).to_dict("records")
     shown = [column for there, column in columns if there]
     lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None
     bold = rows[0]["named"] if lead and lead.sure else None
     return Table.from_rows(title_of(block), shown, rows, bold=bold)  # type: ignore[arg-type]
+
+
+def _published(block: pd.DataFrame) -> pd.Series:
+    """Whether rows (n,) bool stand beside those that were measured here."""
+    return block.results.map(len) == 0
 
 
 def shown(figure: str, score_db: float) -> float:

@@ -20,7 +20,7 @@ for (const head of document.querySelectorAll("th")) {
   head.addEventListener("keydown", event => { if (event.key === "Enter") sort(); });
 }
 // A choice above tables that have a column of this name shows the rows of one of its values.
-const COLUMN = "beside places";
+const COLUMN = "extra input";
 for (const table of document.querySelectorAll("table")) {
   const heads = [...(table.tHead?.rows[0]?.cells ?? [])].map(head => head.textContent.trim());
   const column = heads.indexOf(COLUMN);
