@@ -287,7 +287,7 @@ SPOILT = {
     "text in a column of numbers": (
         "# my drive\nx,y,rssi\n1,2,-80\n\n2,3,none heard\n", {}, "column 'rssi', line 5: 'none heard': is no",
     ),
-    "no place in a row": ("x,y,rssi\n1,2,-80\n,3,-81\n", {}, "column 'x', line 3: no value; x is needed"),
+    "no x in any row": ("x,y,rssi\n,2,-80\n,3,-81\n", {}, "column 'x', line 2: no value; x is needed"),
     "no place at all": ("rssi,speed\n-80,1\n-81,2\n", {}, "no coordinates among 'rssi', 'speed'"),
     "no y": ("x,rssi\n1,-80\n2,-81\n", {}, "column 'x' is x, and none is y; say dataset.columns.y=COLUMN"),
     "dBW beside dB": (

@@ -230,6 +230,13 @@ def test_rows_between_two_fixes_were_refused_one_by_one(tmp_path):
     assert len(read_any(path).data) == 20 and "no place; these 40 of 60 rows are left out" in said(path)
 
 
+def test_half_a_place_hid_all_other_faults_of_a_file(tmp_path):
+    path, longitude = tmp_path / "drive.csv", np.char.mod("%.6f", LONGITUDE)
+    longitude[3] = ""
+    path.write_text(text("lat,lon,RSRP", np.char.mod("%.6f", LATITUDE), longitude, LEVEL[:, 0]))
+    assert len(read_any(path).data) == COUNT - 1 and "line 5: no place" in said(path)
+
+
 def test_advice_on_columns_was_no_word_of_a_shell():
     """`dataset.columns.rssi_db=RSRP (LTE pcell)` is refused by the shell and by the settings."""
     assert say_column("rssi_db", "RSRP (x)") == "'dataset.columns.rssi_db=\"RSRP (x)\"'"

@@ -131,7 +131,7 @@ def _in_metres(check: Checker) -> Georeference | None:
                 check.notes.append(f"no {name}_height: taken as 0 m")
             del arrays[f"{prefix}latitude"], arrays[f"{prefix}longitude"]
     check.notes += map(Severe, degree_warnings(*places[""]))
-    where = f"{origin.latitude:g}, {origin.longitude:g} degrees"
+    where = f"latitude {origin.latitude:g}, longitude {origin.longitude:g}"
     check.notes.append(f"positions are metres east and north of {where}")
     return origin
 

@@ -88,13 +88,13 @@ def read_ends(sheet: Sheet, chosen: Chosen, strict: bool = True) -> dict[str, Pl
 
 
 def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
-    """Leave out rows in which both coordinates of an end are empty, as loggers write them between fixes."""
+    """Leave out rows in which a coordinate of an end is empty, as loggers write them between fixes."""
     lost = np.zeros(len(sheet), bool)
     for end in ENDS[:-1]:
         for pair in (("x", "y"), ("latitude", "longitude")):
             heads = [chosen[f"{end}{axis}"][0].head for axis in pair if f"{end}{axis}" in chosen]
             if len(heads) == 2 and None not in heads:
-                lost |= np.all([sheet.words(head or "") == "" for head in heads], axis=0)
+                lost |= np.any([sheet.words(head or "") == "" for head in heads], axis=0)
     if not lost.any() or lost.all():
         return sheet
     named = np.array(sheet.rows)
