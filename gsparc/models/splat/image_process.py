@@ -75,9 +75,6 @@ class ImageProcess(LearnedField):
             why = array_obstacle(data.site, "rx", "the receiver moves") if array else None
             if why is not None:
                 raise ValueError(f"{self.name}: {why}")
-            # Without Gaussians no step changes anything.
-            if not self.settings.field.count:
-                self.most_steps = 0
             choices, _ = resolve_auto(self.settings, self.init.name, data.site)
             log.info(
                 "training by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
