@@ -133,8 +133,9 @@ class LearnedField(Method):
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
         # A guess about a callback that is left out reads None (oc.select).
         self.refit, self.guesses = refit, tuple(guess for guess in guesses if " None" not in guess)
-        # Without Gaussians no step changes anything.
-        self.keep_best, self.most_steps = keep_best, 0 if not field.count else None if steps == "auto" else steps
+        self.keep_best, self.most_steps = keep_best, None if steps == "auto" else steps
+        if not field.count:  # then no step changes anything
+            self.most_steps = 0
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
