@@ -30,7 +30,7 @@ def find_times(sheet: Sheet, used: Container[str | None]) -> tuple[str, ...]:
 
 
 def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | None:
-    """Return seconds (S,) of columns that hold times together, NaN where none is, and what they are taken for.
+    """Return seconds (S,) of columns that hold times together, NaN where none is, and what they were.
 
     Dates count from 1970, clocks without one from midnight of their first day, other numbers as they do. None
     where some are no times.
