@@ -112,12 +112,11 @@ def inside(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
 
 
 def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
-    """After `STOPS` more places by a way, outdoors: errors of the strongest, of all [dB], share misjudged."""
+    """After `STOPS` more places by a way to choose: errors of the strongest, of all [dB], share misjudged."""
     one = town(seed, buildings)
     predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
     stops, rng = one.asked[EVEN:], np.random.default_rng(seed)
-    out = ~one.indoors[:EVEN]
-    level = float(np.quantile(one.truth[:EVEN][out].max(1), 0.25).round())
+    level = float(np.quantile(one.truth[:EVEN][~one.indoors[:EVEN]].max(1), 0.25).round())
     ways = {"before": np.zeros(0, int), "random": rng.permutation(len(stops))[:STOPS]}
     far, ways["farthest"] = cKDTree(one.moment).query(stops)[0], []
     while len(ways["farthest"]) < STOPS:
@@ -137,10 +136,9 @@ def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
         method.fit(data, Fold(every, every[:0], every[:0]), FitContext(folder, stations="together"))
         checkpoint.save(folder / "again.ckpt", method)
         again = gsparc.load(folder / "again.ckpt")
-        truth = one.truth[:EVEN][out]
-        said = joint_levels(again, one.asked[:EVEN][out], np.arange(len(one.place)))[:, 0]
-        best, true = said.max(1), truth.max(1)
-        errors = (best - true), (said - truth)
+        said = joint_levels(again, one.asked[:EVEN], np.arange(len(one.place)))[:, 0]
+        best, true = said.max(1), one.truth[:EVEN].max(1)
+        errors = (best - true), (said - one.truth[:EVEN])
         wrong = float(((best >= level) != (true >= level)).mean())
         figures = [*(float(np.sqrt((e**2).mean())) for e in errors), wrong]
         yield (seed, name, *(round(v, 4) for v in figures))
