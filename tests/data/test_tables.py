@@ -88,7 +88,7 @@ def test_every_guess_is_said_and_what_is_not_used(write):
     assert arrays["rssi_db"].tolist() == [4, 8]
 
 
-def test_a_column_that_holds_no_times_is_listed_with_what_it_is_good_for(write):
+def test_a_column_of_times_was_listed_as_not_used_without_a_word(write):
     notes = parse_table(write("x,y,rssi,day\n1,2,-80,Mon\n4,5,-81,Tue\n")).notes
     said = next(note for note in notes if "'day'" in note)
     assert "rows count in the order of the file" in said and "dataset.columns.run=COLUMN" in said
