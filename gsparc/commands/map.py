@@ -65,7 +65,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "threshold_db": float(config.threshold_db), "stations": stations_of(settings["stations"]),
         "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
         "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
-        "buildings": config.buildings,
+        "buildings": config.buildings, "indoor_db": settings["indoor_db"],
     }  # fmt: skip
     # Refuses what cannot be before any evidence is gathered.
     first = predict_map(predictor, dry=True, **query)

@@ -189,7 +189,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
     data = Measurements(
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
-        position_std=position_std, device=devices, **of_rows,
+        position_std=position_std, device=devices, sequence=check.read_sequence(rows, kind), **of_rows,
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     data = convert_conventions(data, named)

@@ -175,6 +175,13 @@ class Checker:
         names, device = np.unique(array.astype(str), return_inverse=True)
         return tuple(names.tolist()), device.reshape(-1).astype(np.int64)
 
+    def read_sequence(self, rows: int, kind: str) -> np.ndarray | None:
+        """Return numbers (S,) int64 of powers in the order of their times; None: as they stand."""
+        time = self.read_array("time_s", (rows,)) if kind == "rssi" else None
+        if time is None or not np.isfinite(time).all() or (np.diff(time) >= 0).all():
+            return None
+        return np.argsort(np.argsort(time, kind="stable"))
+
     def read_mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
         """Return bool, like the measurement; None: all was measured. Only `censored` rows may be empty."""
         array = self.read_array("mask", shape)

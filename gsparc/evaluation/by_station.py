@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.spatial import cKDTree
 
+from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.schema import Measurements, show_names
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
 from gsparc.evaluation.scores import FEW, Scores
@@ -16,6 +18,7 @@ from gsparc.models.powers.groups import number_squares
 
 WORST = 3  # stations shown; the file has all
 BY_CHANCE, SURE = 0.02, 0.999  # chance at which a station is missed; most that a prediction is trusted
+NEAR_M = 50.0  # of a list, whose stations another should hold: shadowing is alike
 ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
 
 
@@ -75,6 +78,48 @@ def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
     found = shares.groupby("station").agg(moments=("share", "size"), expected=("share", "sum"))
     found["chance"] = missed.groupby("station").prod()
     return found[found.chance < BY_CHANCE]
+
+
+def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
+    """Return stations that lists of a later drive hold and none of the earlier, a row each.
+
+    Columns `lists`: of the later drive that hold it; `expected`: earlier ones that should, by how often they
+    hold what the later list within `NEAR_M` has at the same place among its stations, of stations that both
+    drives heard; `chance` that none does though the station was there, squares counted as by
+    `unlisted_stations`. Empty of other data than lists of the strongest.
+    """
+    before, now = strongest_lists(old), strongest_lists(new)
+    if before is None or now is None:
+        return pd.DataFrame(columns=["lists", "expected", "chance"])
+    gap, near = cKDTree(now.place).query(before.place)
+    pairs = np.flatnonzero(gap <= NEAR_M)
+    held, listed, later = np.isfinite(before.level)[pairs], np.isfinite(now.level), near[pairs]
+    known = np.isfinite(before.level).any(0)
+    fresh = np.flatnonzero(listed.any(0) & ~known)
+    rank = np.argsort(np.argsort(-np.nan_to_num(now.level, nan=-np.inf), 1), 1)[later]
+    links = pd.DataFrame({"rank": rank[:, known][listed[later][:, known]]})
+    links["held"] = held[:, known][listed[later][:, known]]
+    again = links.groupby("rank").held.mean().reindex(range(listed.shape[1])).fillna(0.0).to_numpy()
+    share = np.where(listed[later], again[rank], 0.0)[:, fresh]
+    missed = np.ones((0, len(fresh)))
+    if len(pairs):
+        squares = number_squares(before.place[pairs])
+        missed = 1 - pd.DataFrame(share).groupby(squares).max().clip(upper=SURE).to_numpy()
+    figures = {"lists": listed[:, fresh].sum(0), "expected": share.sum(0), "chance": missed.prod(0)}
+    return pd.DataFrame(figures, index=fresh)
+
+
+def describe_new(old: Measurements, new: Measurements) -> str | None:
+    """Return stations of `newly_listed` in words, the surest first; None without."""
+    found, stations = newly_listed(old, new).sort_values("chance"), new.site.stations
+    if stations is None or not len(found):
+        return None
+    names = np.array(stations.shown)[found.index]
+    surely = np.where(found.chance < BY_CHANCE, "new", "new, or out of its reach before")
+    said = zip(names, found.lists, found.expected, surely, found.chance, strict=True)
+    return ", ".join(
+        f"{n} (in {k} lists, for {e:.0f} of the earlier drive: {s}; chance {c:.0e})" for n, k, e, s, c in said
+    )
 
 
 def describe_unlisted(scores: Scores, data: Measurements) -> str | None:

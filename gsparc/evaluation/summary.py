@@ -160,10 +160,13 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
-            f"{GIVEN_HEARD}; maps and predict show them listed or not, {above:.1f} dB lower in the mean"
+            f"{GIVEN_HEARD}; maps and predict show them listed or not, {above:.1f} dB lower in the mean: "
+            "compare these with levels of all cells (a scanner), not of lists"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"off, or gone? expected in lists and in none: {unlisted}")
+    if new := facts.get(f"{prefix}/new"):
+        rest.append(f"heard for the first time, with lists that should have held it: {new}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [LINE.format(of_what=folds, cost=facts["time/cost"])] if facts.get("time/cost") else []
     lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]

@@ -89,9 +89,42 @@ def test_every_guess_is_said_and_what_is_not_used(write):
 
 
 def test_a_column_of_times_was_listed_as_not_used_without_a_word(write):
-    notes = parse_table(write("x,y,rssi,time\n1,2,-80,0\n4,5,-81,1\n")).notes
-    said = next(note for note in notes if "'time'" in note)
+    notes = parse_table(write("x,y,rssi,day\n1,2,-80,Mon\n4,5,-81,Tue\n")).notes
+    said = next(note for note in notes if "'day'" in note)
     assert "rows count in the order of the file" in said and "dataset.columns.run=COLUMN" in said
+
+
+SECONDS, DAY = 45296.5, 1793836800.0  # of 12:34:56.5, and of 5 November 2026
+
+
+@pytest.mark.parametrize("head, first, second, seconds, what", [
+    ("Time", "12:34:56.500", "12:34:57", SECONDS, "clock times of a day that is not named"),
+    ("Time", "12:34:56:500", "00:00:01:000", SECONDS, "clock times"),
+    ("UTC time", "2026-11-05T12:34:56.5Z", "2026-11-05T12:34:57Z", DAY + SECONDS, "dates"),
+    ("Timestamp", "2026-11-05 13:34:56.5+01:00", "", DAY + SECONDS, "dates"),
+    ("Timestamp", "05/11/2026 12:34:56.5", "13/11/2026 12:34:57", DAY + SECONDS, "dates"),
+    ("DateTime", "05.11.2026 12:34:56.5", "06.11.2026 12:34:56", DAY + SECONDS, "dates"),
+    ("Timestamp", "05/11/2026 12:34:56.5", "06/11/2026 12:34:57", DAY + SECONDS, "dates, day before month?"),
+    ("Time", "11/5/2026 12:34:56 PM", "11/5/2026 1:34:56 PM", DAY + SECONDS - 0.5, "dates"),
+    ("epoch", "1793882096.5", "1793882097", DAY + SECONDS, "since 1970, in units of 1 s"),
+    ("timestamp", "1793882096500", "1793882096700", DAY + SECONDS, "since 1970, in units of 0.001 s"),
+    ("time_ms", "500", "700", 0.5, "milliseconds"),
+    ("time_s", "0.5", "0.2", 0.5, "seconds, not in order of time"),
+])  # fmt: skip
+def test_times_are_read_as_drive_tests_write_them(write, head, first, second, seconds, what):
+    table = parse_table(write(f"x,y,rssi,{head}\n1,2,-80,{first}\n4,5,-81,{second}\n"))
+    assert table.arrays["time_s"][0] == pytest.approx(seconds, abs=1e-3)
+    assert any(note.startswith(f"column '{head}' taken as time_s: {what}") for note in table.notes)
+
+
+def test_midnight_passes_and_a_date_stands_beside_its_clock(write, refused):
+    clock = parse_table(write("x,y,rssi,time\n1,2,-80,23:59:59\n4,5,-81,00:00:01\n"))
+    assert np.diff(clock.arrays["time_s"]) == 2
+    rows = "25/11/2026,1,2,-80,12:34:57\n25/11/2026,4,5,-81,12:34:56\n26/11/2026,4,6,-82,12:34:56\n"
+    both = parse_table(write(f"Date,x,y,rssi,Time\n{rows}"))
+    assert "columns 'Date' and 'Time' taken as time_s: dates, not in order of time" in both.notes
+    assert interpret(both, "drive").data.sequence.tolist() == [1, 0, 2]
+    refused("holds no times", parse_table, write("x,y,rssi,day\n1,2,-80,Mon\n"), {"time_s": "day"})
 
 
 def test_columns_of_levels_in_db_did_not_say_how_dbm_are_asked_for(write):

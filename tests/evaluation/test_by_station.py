@@ -13,7 +13,9 @@ from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.by_station import (
     best_server,
+    describe_new,
     describe_unlisted,
+    newly_listed,
     rmse_after_constants,
     unlisted_stations,
     worst_stations,
@@ -238,6 +240,19 @@ def lists_along(seed, off=()):
         "rssi_db": level[moment, station],
     }  # fmt: skip
     return from_arrays(arrays)
+
+
+def test_a_station_that_is_new_is_told_from_one_that_was_out_of_reach():
+    later = lists_along(1)
+    found = newly_listed(lists_along(0, (3,)), align_to_site(later, lists_along(0).site))
+    assert found.index.tolist() == [3] and found.chance[3] < 1e-6
+    assert 0.5 * found.lists[3] < found.expected[3] < 1.2 * found.lists[3]
+    first = lists_along(0)
+    near = first.subset(np.flatnonzero(first.moving[:, 0] < 0))  # half of the street
+    unsure = newly_listed(near, later)
+    assert len(unsure) and (unsure.chance == 1).all()
+    assert "new, or out of its reach before; chance 1e+00" in describe_new(near, later)
+    assert newly_listed(first, later).empty and describe_new(first, later) is None
 
 
 @pytest.mark.parametrize("off", [(), (3,)])

@@ -1,13 +1,17 @@
 """What a planner is told of simulated networks, beside their truth, by seeds; FOLDER keeps their models.
 
 python tests/grid/planner.py covered FOLDER 0 1 2 >> docs/results/maps/covered.csv
+python tests/grid/planner.py inside FOLDER 910 911 >> docs/results/maps/inside.csv
 python tests/grid/planner.py planned FOLDER 0 1 2 3 4 >> docs/results/maps/planned.csv
 python tests/grid/planner.py azimuths FOLDER 10 11 >> docs/results/maps/azimuths.csv
 python tests/grid/planner.py off FOLDER 801 802 >> docs/results/maps/off.csv
+
+BUILT=1 takes networks with buildings alone.
 """
 
 import csv
 import logging
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -38,7 +42,9 @@ from gsparc.models.powers.together import network as network_learning
 from gsparc.models.powers.together.network import check_azimuths
 from gsparc.prediction.levels import joint_levels
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import to_local
 from gsparc.prediction.refit import Learned
+from gsparc.processes.uncertainty import half_width
 from gsparc.training.context import FitContext
 
 LISTED, MOMENTS, EVEN, STEP_M, AREA = 6, 350, 1000, 50.0, (250.0, 250.0, 2250.0, 2250.0)
@@ -86,6 +92,23 @@ def covered(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
         shares = said[known & out].mean(), (best >= level)[known & out].mean(), (best >= level)[known].mean()
         figures = (1 - np.nanmean(field.outage), *ends, *shares, 1 - known.mean())
         yield (seed, int(buildings), level, *(round(float(v), 4) for v in figures))
+
+
+def inside(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
+    """Shares of 90 % intervals of `predict`, outdoors, that hold the strongest cell, all; refused of both."""
+    one = town(seed, buildings)
+    predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
+    places, cells = one.asked[:EVEN][~one.indoors[:EVEN]], np.arange(len(one.place))
+    truth = one.truth[:EVEN][~one.indoors[:EVEN]]
+    level, spread, _ = np.moveaxis(joint_levels(predictor, places, cells), 1, 0)
+    asked = np.repeat(to_local(predictor.site, places, None), len(cells), 0), np.tile(cells, len(places))
+    error = promise.expected_errors(*asked, spread.reshape(-1)).reshape(level.shape)
+    best = np.arange(len(places)), level.argmax(1)
+    figures = []
+    for chosen in (best, np.s_[:]):
+        held, known = np.abs(level - truth)[chosen] < half_width(0.9) * error[chosen], error[chosen] > 0
+        figures += [held[known].mean(), 1 - known.mean()]
+    yield (seed, int(buildings), *(round(float(v), 4) for v in figures))
 
 
 def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
@@ -173,12 +196,13 @@ def off(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
             yield (seed, int(buildings), "" if site is None else site, *figures, others)
 
 
-PARTS = {"off": off, "covered": covered, "planned": planned, "azimuths": azimuths}
+PARTS = {"off": off, "covered": covered, "inside": inside, "planned": planned, "azimuths": azimuths}
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)
     network_learning.list_first = lambda names, _: ", ".join(names)  # all that are untested, not the first
     part, folder, *seeds = sys.argv[1:]
-    for seed, buildings in product(map(int, seeds), (False, True)[: 1 + (part != "planned")]):
+    kinds = (True,) if os.environ.get("BUILT") else (False, True)[: 1 + (part != "planned")]
+    for seed, buildings in product(map(int, seeds), kinds):
         csv.writer(sys.stdout, lineterminator="\n").writerows(PARTS[part](seed, buildings, Path(folder)))
         sys.stdout.flush()

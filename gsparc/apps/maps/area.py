@@ -37,6 +37,7 @@ class Grid:
         step: side of a cell [m].
         inside: (ny, nx) bool, cells that are asked for.
         origin: of the metres, where places came in degrees.
+        indoors: (ny, nx) bool, cells in buildings that are asked for; None: none are known.
     """
 
     x: np.ndarray
@@ -45,6 +46,7 @@ class Grid:
     step: float
     inside: np.ndarray
     origin: Georeference | None = None
+    indoors: np.ndarray | None = None
 
     def places(self, cells: np.ndarray | None = None) -> np.ndarray:
         """Return world places (n, 3) [m] of `cells` (n,), numbers into the flat map.
@@ -64,7 +66,7 @@ class Grid:
 
 def lay_grid(
     site: Site | None, area: Any = None, height_m: float | None = None, step_m: float | None = None,
-    plan: FloorPlan | None = None, stations: int = 1, buildings: Any = None,
+    plan: FloorPlan | None = None, stations: int = 1, buildings: Any = None, indoors: bool = False,
 ) -> Grid:  # fmt: skip
     """Return the cells of a map.
 
@@ -77,6 +79,7 @@ def lay_grid(
         plan: beneath the map.
         stations: layers of each cell, for what memory is needed.
         buildings: GeoJSON file of footprints, whose cells are left out.
+        indoors: they are kept, and told.
 
     Raises:
         DataError: an area that is none, no height, a step that gives no cells, or more than memory holds.
@@ -95,17 +98,18 @@ def lay_grid(
         )
     nx, ny = (max(int(n), 1) for n in count)
     x, y = (low[i] + step * (0.5 + np.arange(n)) for i, n in enumerate((nx, ny)))
-    within = None if buildings is None else _drawn(site, buildings, "buildings")[1]
-
-    def is_asked(places: np.ndarray) -> np.ndarray:
-        chosen: np.ndarray = np.ones(len(places), bool) if contains is None else contains(places)
-        return chosen if within is None else np.asarray(chosen & ~within(places))
-
     # By rows: a million places at once take memory.
-    inside = np.array([is_asked(np.column_stack([x, np.full(nx, one)])) for one in y])
+    rows = [np.column_stack([x, np.full(nx, one)]) for one in y]
+    inside = np.array([np.ones(nx, bool) if contains is None else contains(row) for row in rows])
+    within = np.zeros_like(inside)
+    if buildings is not None:
+        is_built = _drawn(site, buildings, "buildings")[1]
+        within = np.array([is_built(row) for row in rows])
+    inside &= indoors | ~within
     if not inside.any():
         raise DataError(f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer")
-    return Grid(x, y, height, step, inside, None if site is None else site.georeference)
+    about = None if site is None else site.georeference
+    return Grid(x, y, height, step, inside, about, within & inside if indoors else None)
 
 
 def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:

@@ -20,6 +20,7 @@ from gsparc.data import limits
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
 from gsparc.data.instantiate import suggest_or_list
+from gsparc.data.limits import finite_array
 from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.schema import Site
 from gsparc.data.spacing import neighbour_distance
@@ -44,6 +45,7 @@ def predict_map(
     other_end: Sequence[float] | None = None, plan: FloorPlan | None = None,
     promise: Promise | Literal["stored"] | None = "stored", share: float = 0.9, tolerance_db: float = 0.1,
     unit: str | None = None, dry: bool = False, buildings: Any = None,
+    indoor_db: Sequence[float] | None = None,
 ) -> FieldMap:  # fmt: skip
     """Predict every cell of an area.
 
@@ -67,6 +69,7 @@ def predict_map(
         unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as measured.
         dry: predict one cell of each station alone: whether everything asked for is possible.
         buildings: see `lay_grid`.
+        indoor_db: (2,) loss of squares in buildings, which are mapped then, and its deviation [dB].
 
     Raises:
         DataError: anything wrong with what is asked for.
@@ -76,7 +79,10 @@ def predict_map(
         raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
     promise = read_promise(predictor.extra) if promise == "stored" else promise
     names, notes = choose_stations(predictor, stations, promise)
-    grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings)
+    loss = None if indoor_db is None else finite_array(indoor_db)
+    if loss is not None and (loss.shape != (2,) or (loss < 0).any() or buildings is None):
+        raise DataError(f"indoor_db={indoor_db}: a loss and its deviation, [15,6], beside buildings=FILE")
+    grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings, loss is not None)
     numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
     about = station_facts(site, numbers)
     load_of = field_map.read_loads(load, names, about["stations"])
@@ -130,6 +136,13 @@ def predict_map(
             local = to_local(site, grid.places(cells), other_end)
             far = np.stack([promise.distance(local, number) for number in numbers])
         half, error = calibration.half_and_error(spread, far, numbers[:, None])
+        related = errors_alike[:, cells]
+        if loss is not None and grid.indoors is not None:
+            lost, doubt = np.outer(loss, grid.indoors.reshape(-1)[cells])
+            wider, strongest = np.hypot(error, doubt), (mean.argmax(0), np.arange(len(cells)))
+            # What is not known of the loss is one error of all stations.
+            related = (related * error * error[strongest] + doubt**2) / (wider * wider[strongest])
+            mean, half, error = mean - lost, np.hypot(half, half_width(share) * doubt), wider
         # The strongest before anything is refused, to which `alike` is the correlation.
         first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
         error = np.where(np.isfinite(mean), error, np.nan)
@@ -138,7 +151,7 @@ def predict_map(
         best = best_server(power)
         strongest = np.maximum(best, 0), np.arange(len(best))
         below = calibration.probability_below(threshold_db, power[strongest], error[strongest])
-        alike_here = np.where(first == best, errors_alike[:, cells], 0.0)
+        alike_here = np.where(first == best, np.nan_to_num(related), 0.0)
         part = {
             "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
             "best_server": best, "sinr_db": sinr(power, load_of, noise_db, carrier),

@@ -15,6 +15,7 @@ from gsparc.data.errors import Caution, list_first, suggest_name
 from gsparc.data.tables import heads
 from gsparc.data.tables.heads import CHANNELS, ENDS, KINDS, LISTS, POLAR, Head, unit_of, unit_suits, words_of
 from gsparc.data.tables.sheet import Sheet
+from gsparc.data.tables.times import find_times
 from gsparc.data.units import SCHEMA, UNITS, Unit, list_units
 
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)
@@ -162,6 +163,9 @@ def choose_columns(
     # Only where nothing was found by its head: columns called like stations may be their levels.
     if only is None and not any(roles[0] in chosen for roles in MEASURED):
         _wide_survey(sheet, chosen)
+    if only is None and "time_s" not in chosen and any(role in chosen for role in heads.MANY):
+        timed = tuple(Column("time_s", head=head) for head in find_times(sheet, used_heads(chosen)))
+        chosen |= {"time_s": timed} if timed else {}
     used = used_heads(chosen)
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:

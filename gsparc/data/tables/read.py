@@ -26,6 +26,7 @@ from gsparc.data.tables.opening import read_sheet
 from gsparc.data.tables.places import Places, StationList
 from gsparc.data.tables.sheet import MEASURED, Sheet
 from gsparc.data.tables.slots import unfold_slots, unfold_tones
+from gsparc.data.tables.times import read_times
 from gsparc.data.tables.unused import say_effects
 from gsparc.data.units import UNITS, WATTS
 
@@ -99,9 +100,20 @@ class Builder:
         for role in ("run", "row_name", "device"):
             if role in self.chosen:
                 self.arrays[role] = self.sheet.joined(column.head for column in self.chosen[role])
+        self._times([column.head or "" for column in self.chosen.get("time_s", ())])
         # Without names rows are called by their line in the file, so that messages survive dropped rows.
         self.arrays.setdefault("row_name", np.array(self.sheet.rows))
         return self.arrays
+
+    def _times(self, named: list[str]) -> None:
+        """Add seconds of columns of times."""
+        if not named:
+            return
+        if (found := read_times(self.sheet, named)) is None:
+            return self.refuse("holds no times; expected seconds, dates or a clock", named[0])
+        self.arrays["time_s"], what = found
+        quoted = " and ".join(map(repr, named))
+        self.notes.append(f"column{'s' * (len(named) > 1)} {quoted} taken as time_s: {what}")
 
     def _measurement(self) -> str | None:
         """Add the measurement; its quantity."""

@@ -24,7 +24,7 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
         return []
     links, measured = LevelsAtPlaces.of(data)
     row = file_row[measured]
-    used = used_heads(chosen)
+    used = used_heads(chosen) - {column.head for column in chosen.get("time_s", ())}  # levels may drift
     words = {head: sheet.words(head) for head in sheet.heads if head not in used}
     names = [column.head or "" for column in chosen.get("station", ())]
     devices = list[str]()

@@ -42,6 +42,8 @@ def test_squares_inside_buildings_counted_as_covered(tmp_path):
     house = geojson(tmp_path / "house.geojson", [[[2, 2], [6, 2], [6, 5], [2, 5], [2, 2]]])
     grid = lay_grid(None, [0, 0, 10, 10], 1.5, 0.5, buildings=house)
     assert grid.inside.sum() == 400 - 8 * 6 and not grid.inside[5, 5] and grid.inside[3, 5]
+    kept = lay_grid(None, [0, 0, 10, 10], 1.5, 0.5, buildings=house, indoors=True)
+    assert kept.inside.all() and kept.indoors.sum() == 8 * 6 and kept.indoors[5, 5]
     refused("buildings=.*: no such file", lay_grid, None, [0, 0, 9, 9], 1.5, buildings=tmp_path / "a.geojson")
 
 

@@ -1,5 +1,6 @@
 """A map is what the model predicts cell by cell, with its layers over stations and words on its pictures."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -52,6 +53,23 @@ def test_cells_hold_what_the_model_predicts(predictor):
     west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]
     assert (west, east) == (0, 1)
     assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
+
+
+def test_squares_in_buildings_take_a_stated_loss(predictor, tmp_path):
+    ring = [[8, 8], [40, 8], [40, 40], [8, 40], [8, 8]]
+    (tmp_path / "house.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    how = {"area": [0, 0, 80, 60], "step_m": 4.0, "threshold_db": -90}
+    inside = {"buildings": tmp_path / "house.geojson", "indoor_db": [15, 6]}
+    without, found = (predict_map(predictor, **how, **more) for more in ({}, inside))
+    lost, wider = without.power_db - found.power_db, found.expected_error_db**2 - without.expected_error_db**2
+    assert found.grid.indoors.sum() == 64 and found.grid.inside.all()
+    np.testing.assert_allclose(lost, 15.0 * np.broadcast_to(found.grid.indoors, lost.shape), atol=1e-4)
+    np.testing.assert_allclose(
+        wider, 36.0 * np.broadcast_to(found.grid.indoors, lost.shape), rtol=1e-3, atol=1e-3
+    )
+    assert (found.best_server == without.best_server).all()
+    assert (found.outage >= without.outage - 1e-6).all()
+    refused("indoor_db=.*buildings=FILE", predict_map, predictor, **how, indoor_db=[15, 6])
 
 
 def test_a_unit_of_maps_changed_their_names_alone():
