@@ -17,6 +17,7 @@ from gsparc.evaluation.table import Column, Table
 from gsparc.models.powers.groups import number_squares
 
 WORST = 3  # stations shown; the file has all
+OFFSET = 0.5  # of the squared errors of a station, that one offset explains
 BY_CHANCE, SURE = 0.02, 0.999  # chance at which a station is missed; most that a prediction is trusted
 NEAR_M = 50.0  # of a list, whose stations another should hold: shadowing is alike
 ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
@@ -122,7 +123,7 @@ def describe_new(old: Measurements, new: Measurements) -> str | None:
     )
 
 
-def describe_unlisted(scores: Scores, data: Measurements) -> str | None:
+def describe_never_listed(scores: Scores, data: Measurements) -> str | None:
     """Return stations of `unlisted_stations` in words, the surest first; None without."""
     found, stations = unlisted_stations(scores, data).sort_values("chance"), data.site.stations
     if stations is None or not len(found):
@@ -171,4 +172,9 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     note = f"{method} is better {', '.join(better)} of {compared}" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
+    offset = named[rows.bias_db**2 > OFFSET * rows.rmse_db**2] if "bias_db" in rows else rows[:0]
+    if len(offset):
+        those = ", ".join(f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples())
+        note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
+        note += ": of a later log, gsparc update learns that"
     return [Table.from_rows(title, shown, named[:WORST].to_dict("records"), note=note)]

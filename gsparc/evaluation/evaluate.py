@@ -15,7 +15,7 @@ from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, hash_indices
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
-from gsparc.evaluation.by_station import describe_new, describe_unlisted, station_columns
+from gsparc.evaluation.by_station import describe_never_listed, describe_new, station_columns
 from gsparc.evaluation.examples import FILE, Examples
 from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import judged_by
@@ -147,7 +147,7 @@ def evaluate(
         if lead is not None and other is not same:
             facts |= {f"{room}/{ahead}{key}": value for key, value in lead.facts().items()}
     facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}
-    facts[f"{eval_on}/unlisted"] = describe_unlisted(scores, data)
+    facts[f"{eval_on}/unlisted"] = describe_never_listed(scores, data)
     facts[f"{eval_on}/new"] = None if learned is None else describe_new(learned[0], data)
     decided = scores.dominant_row()
     if decided and data.row_names:

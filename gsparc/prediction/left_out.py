@@ -59,12 +59,12 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Predic
 
 def gather_evidence(method: Method, data: Measurements, rows: np.ndarray, rivals: Trusted) -> Evidence:
     """Return the errors of what `method` predicts of rows (n,), its confidence and those of rivals."""
-    return judge_answers(
+    return score_answers(
         predict_rows(method, data, rows), data.targets(rows), rows, data.moving[rows], rivals
     )
 
 
-def judge_answers(
+def score_answers(
     said: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, rivals: Trusted
 ) -> Evidence:
     """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m], and their scores.

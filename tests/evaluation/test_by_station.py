@@ -13,8 +13,8 @@ from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.by_station import (
     best_server,
+    describe_never_listed,
     describe_new,
-    describe_unlisted,
     newly_listed,
     rmse_after_constants,
     unlisted_stations,
@@ -94,6 +94,12 @@ def test_a_method_was_better_than_itself_at_none_of_the_stations():
     (worst,) = worst_stations({**rows, **baselines}, "gp")
     assert worst.note == "gp is better than idw at 1 of 2 stations of 10 rows or more"
     assert worst.texts()[0] == ["station", "rows", "gp", "its bias_db", "idw"]
+
+
+def test_a_cell_that_lost_ten_decibels_was_said_to_need_another_baseline():
+    columns = {"station": ["A", "B"], "rows": [40, 40], "rmse_db": [3.0, 11.7], "bias_db": [0.2, 11.3]}
+    (worst,) = worst_stations(columns, "gsparc")
+    assert worst.note.startswith("measured levels differ from predicted by one offset: B (-11.3 dB)")
 
 
 def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meaning():
@@ -267,7 +273,7 @@ def test_a_station_that_was_off_went_unseen(off):
     scores = score_methods([method], align_to_site(judged, learned.site), whole, learned=(learned, taught))
     found = unlisted_stations(scores, judged)
     assert found.index.tolist() == list(off)
-    said = describe_unlisted(scores, judged)
+    said = describe_never_listed(scores, judged)
     assert (said is None) == (not off) and (not off or judged.site.stations.name[3] in said)
     heard = np.flatnonzero(judged.censored_side(rows) == 0)
     links = pd.DataFrame({"place": judged.place, "station": judged.station, "level": judged.target[:, 0]})

@@ -19,7 +19,7 @@ from gsparc.models.uplink.interface import SeparatesPaths
 from gsparc.physics.row_factors import align_factors
 from gsparc.prediction.channels import interpolate_tones
 from gsparc.prediction.confidence import Trusted
-from gsparc.prediction.left_out import Evidence, judge_answers
+from gsparc.prediction.left_out import Evidence, score_answers
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World
@@ -100,7 +100,7 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
 def band_evidence(band: BandChannels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Return evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     said = Prediction(band.predicted, band.variance, 1 - band.confidence)
-    return judge_answers(said, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold))
+    return score_answers(said, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold))
 
 
 @lru_cache(maxsize=1)
