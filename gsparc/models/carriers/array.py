@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.query import Query
 from gsparc.data.schema import LIGHT, Measurements, Site, Stations
 from gsparc.data.splits import Fold
@@ -23,15 +24,13 @@ from gsparc.processes.left_out import rows_of_groups
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext
 
-SAME_PLACE = 1e-3  # [m]
-
 
 def carriers_obstacle(site: Site) -> str | None:
     """Return why spectra of this site are not those of one array at several carriers; None where they are."""
     stations = site.stations
     if site.kind != "spectrum" or stations is None or stations.carrier_hz is None:
         return "targets are no spectra at several carriers"
-    if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE:
+    if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE_M:
         return "receivers at several places"
     turned = stations.rotation
     if turned is not None and not np.allclose(turned, turned[0], atol=1e-6):
@@ -105,8 +104,8 @@ class OneArray(Method):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self._spectra = site, None
-        for name in self.stored:
-            setattr(self, name, from_plain(state[name]))
+        for name, value in state.items():
+            setattr(self, name, from_plain(value))
 
     def add_carrier(self, frequency_hz: float) -> Self:
         """See `AddsCarriers`."""
