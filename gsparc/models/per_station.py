@@ -283,7 +283,7 @@ class PerStation(Method):
         """See `AddsCarriers`."""
         copy, site = self._copies.get(UNHEARD), self.fitted_site
         if not self._shared or not isinstance(copy, AddsCarriers) or site.stations is None:
-            known = "knows only the carriers it learned from" if self._shared else "learned each carrier alone"
+            known = "knows its own carriers alone" if self._shared else "learned each carrier alone"
             raise ValueError(f"{self.name} {known}; model=carriers answers at others")
         result = PerStation(self.factory)
         result._copies, result._shared = {UNHEARD: copy.add_carrier(frequency_hz)}, True

@@ -73,7 +73,7 @@ class JointChoice(NamedTuple):
     """A covariance, the weight of paths beside it, and what both miss (n, P) of rows left out.
 
     Attributes:
-        carried: share of what both say of a carrier without rows that is believed; the rest is the mean image.
+        carried: share of what both say of a carrier without rows, beside the mean image.
         new: without all rows of the place.
         seen: one by one.
     """
