@@ -4,9 +4,9 @@ python bench/bands.py FOLDER SEED          # rooms of a seed; docs/results/bands
 python bench/bands.py FOLDER SEED box      # rooms whose names begin so; a file that is there is added to
 
 Three rooms of Sionna (`make sionna`): the meshes of `../shared/data/wideband`, the conference room, cabinets
-in a box; three shoeboxes of known mirrors; the last of either is turned. Fifty places .9 m apart, half of them
-in sight of the gateway; array and spectrum of XFreq-GS. Held out: ten places (three draws), half of the carriers
-there, every third carrier in its turn. `true_paths`: the mean over phases of the paths that there are, a ceiling.
+in a box; three shoeboxes of known mirrors; the last of either is turned. Fifty places .9 m apart, half of
+them in sight of the gateway; array and spectrum of XFreq-GS. Held out: ten places (three draws), half of the
+carriers there, every third carrier in its turn. `true_paths`: the paths that there are, without phases.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,7 +36,7 @@ from gsparc.simulate.effects import Effects
 from gsparc.simulate.llvm import prepare_llvm
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.solid import Solid, box, sheet
+from gsparc.simulate.scenes.solid import Solid, box
 from gsparc.simulate.scenes.transmitters import Antenna
 from gsparc.simulate.shoebox import Room, mirror_images, visible_images
 from gsparc.training.context import FitContext
@@ -48,8 +50,8 @@ COUNT, APART_M, TURN, STRONGEST = 50, 0.9, 0.4, 60  # of places; of the world [r
 CORNERS = {"home": [[-6, -3, 0], [6, 3, 3]], "hall": [[0, 0, 0], [14, 10, 4]]}  # [m]
 METHODS = ("gsparc", "mean", "nearest", "idw", "gp", "other_carriers", "direct_beam")
 # Of places (n, 3), a gateway (3,), a carrier [Hz] and most bounces: gains (n, P) without the carrier's phase,
-# metres (n, P), directions at the gateway (n, P, 3), and which paths are direct (n, P).
-Paths = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+# metres (n, P), directions at the gateway (n, P, 3).
+Paths = tuple[np.ndarray, np.ndarray, np.ndarray]
 Trace = Callable[[np.ndarray, np.ndarray, float, int], Paths]
 
 
@@ -60,73 +62,58 @@ def rooms(seed: int) -> Iterator[tuple[str, np.ndarray, Trace]]:
         size = rng.uniform([8, 6, 2.6], [12, 9, 3.6])
         low = np.c_[rng.uniform(0.1, 0.8, (6, 2)) * size[:2], np.zeros(6)]
         cabinets = np.stack([low, low + rng.uniform([0.4, 0.4, 1.2], [1.6, 1.6, 2.4], (6, 3))], 1)
-        trace = mirrored(rng, size, cabinets) if "box" in name else traced(name, size, cabinets)
-        yield name, np.array(CORNERS.get(name, [[0, 0, 0], size])), trace
+        solids = [box(f"cabinet{i}", ("wood", "metal")[i % 2], *one) for i, one in enumerate(cabinets)]
+        traces: dict[str, Trace] = {
+            "home": partial(traced, SCENE),
+            "hall": partial(traced, conference_room(int(1e6 * size[0]))),
+            "cabinets": partial(traced, [box("shell", "concrete", 0 * size, size), *solids]),
+        }
+        walls = partial(mirrored, size, cabinets, rng.uniform(0.3, 0.8, 6), rng.uniform(0, 0.1, 6))
+        yield name, np.array(CORNERS.get(name, [[0, 0, 0], size])), traces.get(name, walls)
 
 
-def mirrored(rng: np.random.Generator, size: np.ndarray, cabinets: np.ndarray) -> Trace:
-    """Return what traces a shoebox whose walls reflect less from octave to octave."""
-    strength, falls = rng.uniform(0.3, 0.8, 6), rng.uniform(0, 0.1, 6)
-
-    def trace(places: np.ndarray, gateway: np.ndarray, carrier: float, depth: int) -> Paths:
-        room = Room(0 * size, size, -strength * (carrier / 1e9) ** -falls, cabinets)
-        images = mirror_images(room, min(depth, 2))
-        free = room.contains(places) & room.contains(gateway)
-        seen = visible_images(room, images, places, gateway) & free[:, None]
-        way = images.mirror_points(places) - gateway
-        metres = np.linalg.norm(way, axis=2)
-        return seen * images.gain / metres, metres, way / metres[..., None], seen & (images.order == 0)
-
-    return trace
+def mirrored(
+    size: np.ndarray, cabinets: np.ndarray, strength: np.ndarray, falls: np.ndarray, *asked: Any
+) -> Paths:
+    """Trace a shoebox whose walls reflect less from octave to octave; `asked` as of `Trace`."""
+    places, gateway, carrier, depth = asked
+    room = Room(0 * size, size, -strength * (carrier / 1e9) ** -falls, cabinets)
+    images = mirror_images(room, min(depth, 2))
+    free = room.contains(places) & room.contains(gateway)
+    seen = visible_images(room, images, places, gateway) & free[:, None]
+    way = images.mirror_points(places) - gateway
+    metres = np.linalg.norm(way, axis=2)
+    return seen * images.gain / metres, metres, way / metres[..., None]
 
 
-def traced(name: str, size: np.ndarray, cabinets: np.ndarray) -> Trace:
-    """Return what traces a room of Sionna, from the gateway: ways are the same back."""
-    source: Path | list[Solid] = SCENE
-    if name == "hall":
-        source = conference_room(int(1e6 * size[0]))
-    elif name == "cabinets":
-        along = dict(zip("xyz", np.diag(size), strict=True))
-        sides = {"xy": along["z"], "xz": along["y"], "yz": along["x"]}
-        source = [
-            sheet(f"{axes}{far}", "concrete", far * other, *map(along.get, axes))
-            for axes, other in sides.items() for far in (0, 1)
-        ]  # fmt: skip
-        source += [box(f"cabinet{i}", ("wood", "metal")[i % 2], *one) for i, one in enumerate(cabinets)]
+def traced(
+    source: Path | list[Solid], places: np.ndarray, gateway: np.ndarray, carrier: float, depth: int
+) -> Paths:
+    """Trace a room of Sionna from the gateway: ways are the same back."""
+    prepare_llvm()
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-    def trace(places: np.ndarray, gateway: np.ndarray, carrier: float, depth: int) -> Paths:
-        prepare_llvm()
-        from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
-
-        for laws in ITU_MATERIALS_PROPERTIES.values():
-            laws[0.0, 1e3] = [*laws.values()][-1]  # brick's ends at 40 GHz
-        engine = RayTracer(source, gateway, carrier, Sampling(30_000, len(places)), antenna=Antenna("dipole"))
-        found = next(engine.trace_in_batches(places, replace(EFFECTS, depth=depth)))[0]
-        gains = np.array(found.a[0]) + 1j * np.array(found.a[1])
-        away, turn = np.array(found.theta_t)[:, 0], np.array(found.phi_t)[:, 0]
-        direction = np.stack([np.sin(away) * np.cos(turn), np.sin(away) * np.sin(turn), np.cos(away)], 2)
-        direct = ~(np.array(found.interactions) > 0).any(0).reshape(away.shape)
-        free = engine.clear_of_surfaces(places, 0.2) & engine.clear_of_surfaces(gateway[None], 0.2)
-        gains = gains.reshape(away.shape) * np.array(found.valid).reshape(away.shape) * free[:, None]
-        metres = LIGHT * np.array(found.tau).reshape(away.shape)
-        return gains, metres, direction, direct & (gains != 0)
-
-    return trace
+    for laws in ITU_MATERIALS_PROPERTIES.values():
+        laws[0.0, 1e3] = [*laws.values()][-1]  # brick's ends at 40 GHz
+    engine = RayTracer(source, gateway, carrier, Sampling(30_000, len(places)), antenna=Antenna("dipole"))
+    found = next(engine.trace_in_batches(places, replace(EFFECTS, depth=depth)))[0]
+    away, turn, delay = (np.array(one)[:, 0] for one in (found.theta_t, found.phi_t, found.tau))
+    direction = np.stack([np.sin(away) * np.cos(turn), np.sin(away) * np.sin(turn), np.cos(away)], 2)
+    free = engine.clear_of_surfaces(places, 0.2) & engine.clear_of_surfaces(gateway[None], 0.2)
+    gains = (np.array(found.a[0]) + 1j * np.array(found.a[1])).reshape(away.shape)
+    return gains * np.array(found.valid).reshape(away.shape) * free[:, None], LIGHT * delay, direction
 
 
 def make_room(folder: Path, rng: np.random.Generator, corners: np.ndarray, trace: Trace, turn: float) -> None:
     """Write a room in the layout that `dataset=rfid` reads, and its strongest paths."""
     low, high = corners
-    along = [
-        np.arange(a + rng.uniform(0.2, 0.7), b - 0.2, APART_M) for a, b in zip(low[:2], high[:2], strict=True)
-    ]
+    along = map(np.arange, low[:2] + rng.uniform(0.2, 0.7, 2), high[:2] - 0.2, [APART_M] * 2)
     every = np.stack(np.meshgrid(*along), -1).reshape(-1, 2)
     every = rng.permutation(np.c_[every, low[2] + rng.uniform(0.8, 1.7, len(every))])
     found = []
     for gateway in rng.uniform(0.8 * low + 0.2 * high, 0.2 * low + 0.8 * high, (4, 3)):
-        gains, *_, direct = trace(every, gateway, 5e9, 1)
-        seen = direct.any(1)
-        found.append((seen, (gains != 0).any(1) & ~seen, gateway))
+        seen, heard = ((trace(every, gateway, 5e9, depth)[0] != 0).any(1) for depth in (0, 1))
+        found.append((seen, heard & ~seen, gateway))
     seen, hidden, gateway = max(found, key=lambda one: min(one[0].sum(), one[1].sum()))
     half = max(COUNT // 2, COUNT - int(hidden.sum()))
     places = every[np.r_[np.flatnonzero(seen)[:half], np.flatnonzero(hidden)[: COUNT - half]]]
@@ -135,34 +122,30 @@ def make_room(folder: Path, rng: np.random.Generator, corners: np.ndarray, trace
     zenith, azimuth = np.radians(np.meshgrid(np.arange(90), np.arange(360), indexing="ij"))  # runs clockwise
     looks = np.stack([np.sin(zenith) * np.cos(azimuth), -np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
     steering = np.exp(-2j * np.pi * np.einsum("kij,mk->mij", looks, ELEMENTS))
-    powers, directions, images = [], [], []
+    images, powers, directions = [], [], []
     for carrier in np.array(GHZ) * 1e9:
-        gains, metres, direction, _ = trace(places, gateway, carrier, 3)
+        gains, metres, direction = trace(places, gateway, carrier, 3)
+        waves, turned = gains * np.exp(-2j * np.pi * np.mod(carrier / LIGHT * metres, 1.0)), direction @ world
+        vectors = np.einsum("np,npm->nm", waves, np.exp(2j * np.pi * turned @ ELEMENTS.T))
+        images.append(np.abs(np.einsum("nm,mij->nij", vectors, steering)))
         order = np.argsort(-np.abs(gains), 1)[:, :STRONGEST]
-        gains, metres, direction = (
-            np.take_along_axis(one, order.reshape(*order.shape, *[1] * (one.ndim - 2)), 1)
-            for one in (gains, metres, direction)
-        )
-        direction = direction @ world
-        waves = gains * np.exp(-2j * np.pi * np.mod(carrier / LIGHT * metres, 1.0))
-        vectors = np.einsum("np,npm->nm", waves, np.exp(2j * np.pi * direction @ ELEMENTS.T))
-        image = np.abs(np.einsum("nm,mij->nij", vectors, steering))
-        images.append(image / image.max((1, 2), keepdims=True))
-        powers.append(np.abs(gains) ** 2)
-        directions.append(direction)
+        powers.append(np.take_along_axis(np.abs(gains) ** 2, order, 1))
+        directions.append(np.take_along_axis(turned, order[..., None], 1))
     heard = np.all([power.any(1) for power in powers], 0)
+    image, power, direction = (
+        np.concatenate([one[heard] for one in all]) for all in (images, powers, directions)
+    )
     (folder / "spectrum").mkdir(parents=True)
-    for number, image in enumerate(np.concatenate([one[heard] for one in images]), 1):
-        Image.fromarray(np.round(255 * image).astype(np.uint8)).save(
-            folder / "spectrum" / f"{number:05d}.png"
-        )
+    for number, one in enumerate(
+        np.round(255 * image / image.max((1, 2), keepdims=True)).astype(np.uint8), 1
+    ):
+        Image.fromarray(one).save(folder / "spectrum" / f"{number:05d}.png")
     pose = f"gateway1: {{position: {(gateway @ world).tolist()}, orientation: [0, 0, 0, 1]}}\n"
     (folder / "gateway_info.yml").write_text("dataset_name: bands\n" + pose)
     np.savetxt(folder / "freq.txt", np.repeat(GHZ, heard.sum()), "%g")
     rows = np.tile(places[heard] @ world, (len(GHZ), 1))
     np.savetxt(folder / "tx_pos.csv", rows, "%.6f", ",", header="x,y,z", comments="")
-    truth = {"power": np.concatenate([one[heard] for one in powers])}
-    np.savez(folder / "paths.npz", direction=np.concatenate([one[heard] for one in directions]), **truth)
+    np.savez(folder / "paths.npz", direction=direction, power=power)
 
 
 def folds(data: Measurements, seed: int) -> Iterator[tuple[str, Fold]]:

@@ -3,6 +3,10 @@
 Carriers of one place have the same paths under other phases: the mean of their spectra in power is nearly the
 incoherent sum of the paths. Planes are those whose images explain the means at all training places together,
 found one after the other; what each path carries there is solved in nonnegative numbers.
+
+`moving_array` solves powers alike, for sources that stand: there they are points where bearings of a moving
+array meet, here planes, as the images of a moving transmitter move. `image_sources` reads phases: its planes
+are bisectors of sources that a coherent likelihood places, which spectra without phases do not have.
 """
 
 from __future__ import annotations
@@ -11,13 +15,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsparc.data.ends import SAME_PLACE_M
+from gsparc.models.moving_array.triangulate import nonnegative_powers, sum_lags
 from gsparc.physics.array_response import normalise_spectrum
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.lags import SpectrumLags
@@ -28,6 +31,7 @@ from gsparc.processes.stored import Stored
 PLANES = 8  # at most
 REACH, STEP = 3.0, 0.05  # beyond the box of both ends, and between planes that are tried [m]
 COARSE_STEP, TURN_STEP = 0.2, 6  # of planes that tell how the room is turned [m], and of turns [degrees]
+NEARLY = 0.9  # of what planes along the axes leave over, which others must be below
 LEAST_GAIN = 0.003  # of the energy: a plane that explains less is none
 LEAST_ALONE = 0.02  # of an image's energy
 RIDGE = 0.02  # of the powers' solve
@@ -90,7 +94,7 @@ def find_paths(
     # Walls stand at right angles to each other: which way is told by a coarse search in every direction.
     tried = [_planes_to_try(ends, turn, COARSE_STEP) for turn in torch.arange(0, 90, TURN_STEP).deg2rad()]
     left = torch.stack([_choose_planes(looks, one, target)[2].square().sum() for one in tried])
-    left[0] -= LEAST_GAIN * target.square().sum()  # along the axes, where that is nearly as good
+    left[0] *= NEARLY  # along the axes, where that is nearly as good
     turn = torch.tensor(TURN_STEP * int(left.argmin())).deg2rad()
     planes, powers, _ = _choose_planes(looks, _planes_to_try(ends, turn, STEP), target)
     distance = ways(places, planes, receiver, rotation)[1]
@@ -132,13 +136,8 @@ def _planes_to_try(ends: Tensor, turn: Tensor, step: float) -> Tensor:
 
 def _solve(looks: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Nonnegative powers (n, K) whose sums of looks (n, K, D) are nearest to the target (n, D); the rest."""
-    ridge = RIDGE * float(looks.norm(dim=2).mean()) * np.eye(looks.shape[1])
-    none = np.zeros(looks.shape[1])
-    pairs = zip(looks.numpy(), target.numpy(), strict=True)
-    powers = torch.from_numpy(
-        np.stack([nnls(np.vstack([own.T, ridge]), np.concatenate([one, none]))[0] for own, one in pairs])
-    )
-    return powers, target - (powers[:, None] @ looks)[:, 0]
+    powers = nonnegative_powers(target, looks, (RIDGE * float(looks.norm(dim=2).mean())) ** 2)
+    return powers, target - sum_lags(powers, looks)
 
 
 class ExpectedSpectra:

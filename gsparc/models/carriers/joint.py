@@ -73,16 +73,16 @@ class JointChoice(NamedTuple):
     """A covariance, the weight of paths beside it, and what both miss (n, P) of rows left out.
 
     Attributes:
-        carried: share of what both say of a carrier without rows, beside the mean image.
         new: without all rows of the place.
         seen: one by one.
+        carrier: without all rows of the carrier.
     """
 
     covariance: Covariance
     weight: float
-    carried: float
     new: Tensor
     seen: Tensor
+    carrier: Tensor
 
 
 def row_noise(images: Tensor, groups: list[Tensor]) -> Tensor:
@@ -120,15 +120,16 @@ def choose_joint(
         away = left_out_residuals(inverse, solved, groups)
         # Residuals are linear in what is taken off: the best weight is a quotient.
         image, path = away.residual.chunk(2, dim=1)
-        weight = _share(image, path, noise)
+        given = path / noise[:, None]
+        weight = float((image * given).sum() / (path * given).sum().clamp_min(1e-9))
+        weight = min(max(weight, 0.0), 1.0)
         new, seen = (_without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved)))
         # As of ratios in decibels: what is told well counts as much as what is not.
         error = sum(float(one.square().sum(1).clamp_min(1e-9).log().mean()) for one in (new, seen))
         if error < best:
             scaled = replace(one, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries)
-            told = images - _without_paths(left_out_residuals(inverse, solved, carriers), weight)
-            carried = _share(images, told, noise) if len(carriers) > 1 else 1.0
-            best, result = error, JointChoice(scaled, weight, carried, new, seen)
+            carrier = _without_paths(left_out_residuals(inverse, solved, carriers), weight)
+            best, result = error, JointChoice(scaled, weight, new, seen, carrier)
     assert result is not None
     return result
 
@@ -136,12 +137,6 @@ def choose_joint(
 def _candidates(diagonal: float) -> Iterator[Covariance]:
     for length, *parts in product(LENGTHS, SHARES, NEAR_CARRIERS, OWN, NOISES):
         yield Covariance(length * diagonal, *parts)
-
-
-def _share(wanted: Tensor, told: Tensor, noise: Tensor) -> float:
-    """Return how much of what is told (n, P), from 0 to 1, comes nearest to what is wanted."""
-    given = told / noise[:, None]
-    return min(max(float((wanted * given).sum() / (told * given).sum().clamp_min(1e-9)), 0.0), 1.0)
 
 
 def _without_paths(errors: LeftOutErrors, weight: float) -> Tensor:

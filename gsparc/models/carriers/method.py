@@ -123,15 +123,16 @@ class CarrierField(OneArray):
         at, count, entries = self.rows[rows], len(self._stations), len(self.mean)
         groups = (rows_of_groups(one.numpy()) for one in (place, station))
         joint = choose_joint(at, values, paths, self.noise[rows], *groups, entries)
-        self.covariance, self.weight, self.carried = joint.covariance, joint.weight, joint.carried
+        self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
         known, missed = self.alone.has_process(station), self.alone.left_out(station)
-        none, unit = torch.zeros_like(values[known]), place[known].numpy()
-        shares = []
-        for errors in (joint.new, joint.seen):
-            products = error_products([errors[known], missed[known]], none)
-            shares.append(float(choose_weights(products, unit, deviations=2.0)[1]) if known.any() else 0.0)
-        self.shares = shares[0], shares[1]
+        own = [(one[known], missed[known], place[known]) for one in (joint.new, joint.seen)]
+        new, seen, self.carried = (
+            _second_share(*errors) for errors in (*own, (values, joint.carrier, station))
+        )
+        self.shares = new, seen
+        if len(station.unique()) == 1:  # nothing tells of others
+            self.carried = 1.0
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `query.station` says which carrier.
@@ -198,6 +199,14 @@ class CarrierField(OneArray):
             self._thin = mean[0], torch.linalg.pinv(axes)
         mean, to_values = self._thin
         return ((self.expected(self.paths, places) - mean) @ to_values).double()
+
+
+def _second_share(first: Tensor, second: Tensor, unit: Tensor) -> float:
+    """Weight of the second of two predictions by their errors (n, P) on rows of units (n,); 0 without rows."""
+    if not len(unit):
+        return 0.0
+    products = error_products([first, second], torch.zeros_like(first))
+    return float(choose_weights(products, unit.numpy(), deviations=2.0)[1])
 
 
 def _at_covering_places(places: np.ndarray, most: int) -> np.ndarray:
