@@ -125,14 +125,13 @@ class CarrierField(OneArray):
         joint = choose_joint(at, values, paths, self.noise[rows], *groups, entries)
         self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
-        known, missed = self.alone.has_process(station), self.alone.left_out(station)
-        own = [(one[known], missed[known], place[known]) for one in (joint.new, joint.seen)]
-        new, seen, self.carried = (
-            _second_share(*errors) for errors in (*own, (values, joint.carrier, station))
-        )
+        known = self.alone.has_process(station)
+        missed, unit = self.alone.left_out(station)[known], place[known]
+        new, seen = (_second_share(one[known], missed, unit) for one in (joint.new, joint.seen))
         self.shares = new, seen
-        if len(station.unique()) == 1:  # nothing tells of others
-            self.carried = 1.0
+        # One carrier alone tells nothing of others.
+        several = len(station.unique()) > 1
+        self.carried = _second_share(values, joint.carrier, station) if several else 1.0
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `query.station` says which carrier.
@@ -202,7 +201,7 @@ class CarrierField(OneArray):
 
 
 def _second_share(first: Tensor, second: Tensor, unit: Tensor) -> float:
-    """Weight of the second of two predictions by their errors (n, P) on rows of units (n,); 0 without rows."""
+    """Weight of the second of two predictions by errors (n, P) of rows of units (n,); 0 without rows."""
     if not len(unit):
         return 0.0
     products = error_products([first, second], torch.zeros_like(first))
