@@ -101,8 +101,8 @@ class CarrierField(OneArray):
             place[rows] = number
         self._inverse = self._thin = None
         paths = self._expected_values(self.places)[place]
-        self.noise = row_noise(values, groups)
-        self._choose(values[few], paths[few], place[few], station[few], few)
+        self.noise = noise = row_noise(values, groups)
+        self._choose(values[few], paths[few], noise[few], place[few], station[few], few)
         factor = Factor.from_gram(self.covariance.gram(self.rows, self.noise))
         self.left = factor.solve(values - self.weight * paths)
         self.alone = self.alone.condition(self.rows[:, :3], values, station)
@@ -117,12 +117,12 @@ class CarrierField(OneArray):
         return FitReport(watch.seconds, tuple(notes))
 
     def _choose(
-        self, values: Tensor, paths: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
+        self, values: Tensor, paths: Tensor, noise: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
     ) -> None:
         """Set settings by some rows (n,) whose places and carriers (n,) are numbered."""
         at, count, entries = self.rows[rows], len(self._stations), len(self.mean)
-        groups = (rows_of_groups(one.numpy()) for one in (place, station))
-        joint = choose_joint(at, values, paths, self.noise[rows], *groups, entries)
+        places, carriers = (rows_of_groups(one.numpy()) for one in (place, station))
+        joint = choose_joint(at, values, paths, noise, places, carriers, entries)
         self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
         known = self.alone.has_process(station)
