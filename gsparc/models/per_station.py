@@ -288,7 +288,8 @@ class PerStation(Method):
         """See `AddsCarriers`."""
         copy, site = self._copies.get(UNHEARD), self.fitted_site
         if not self._shared or not isinstance(copy, AddsCarriers) or site.stations is None:
-            raise ValueError(f"{self.name} learned each carrier alone; model=carriers answers at others")
+            known = "knows its own carriers alone" if self._shared else "learned each carrier alone"
+            raise ValueError(f"{self.name} {known}; model=carriers answers at others")
         result = PerStation(self.factory)
         result._copies, result._shared = {UNHEARD: copy.add_carrier(frequency_hz)}, True
         result.site = replace(site, stations=site.stations.add_carrier(frequency_hz))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.query import Query
 from gsparc.data.schema import LIGHT, Measurements, Site, Stations
 from gsparc.data.splits import Fold
@@ -23,15 +24,13 @@ from gsparc.processes.left_out import rows_of_groups
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext
 
-SAME_PLACE = 1e-3  # [m]
-
 
 def carriers_obstacle(site: Site) -> str | None:
     """Return why spectra of this site are not those of one array at several carriers; None where they are."""
     stations = site.stations
     if site.kind != "spectrum" or stations is None or stations.carrier_hz is None:
         return "targets are no spectra at several carriers"
-    if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE:
+    if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE_M:
         return "receivers at several places"
     turned = stations.rotation
     if turned is not None and not np.allclose(turned, turned[0], atol=1e-6):
@@ -105,8 +104,8 @@ class OneArray(Method):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self._spectra = site, None
-        for name in self.stored:
-            setattr(self, name, from_plain(state[name]))
+        for name, value in state.items():
+            setattr(self, name, from_plain(value))
 
     def add_carrier(self, frequency_hz: float) -> Self:
         """See `AddsCarriers`."""
@@ -146,6 +145,10 @@ class OneArray(Method):
 
     def expected(self, paths: SharedPaths, places: Tensor) -> Tensor:
         """Return mean images (n, pixels) of the paths to places (n, 3), every `stride`-th row and column."""
+        return self.expect_paths(paths.ways(places)[0], paths.powers(places))
+
+    def expect_paths(self, directions: Tensor, powers: Tensor) -> Tensor:
+        """Return mean images (n, pixels) of waves from (n, K, 3), receiver frame, of powers (n, K)."""
         if self._spectra is None:
             (array, wavelength), grid = self.array(), self.fitted_site.grid
             assert grid is not None
@@ -154,4 +157,4 @@ class OneArray(Method):
             turns = torch.from_numpy(2 * np.pi / wavelength * array).float()
             how = self.fitted_site.normalisation
             self._spectra = ExpectedSpectra(renderer, turns, how, self.exponent)
-        return self._spectra(paths.ways(places)[0], paths.powers(places))
+        return self._spectra(directions, powers)

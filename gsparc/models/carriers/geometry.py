@@ -3,19 +3,24 @@
 Carriers of one place have the same paths under other phases: the mean of their spectra in power is nearly the
 incoherent sum of the paths. Planes are those whose images explain the means at all training places together,
 found one after the other; what each path carries there is solved in nonnegative numbers.
+
+`moving_array` solves powers alike, for sources that stand: there they are points where bearings of a moving
+array meet, here planes, as the images of a moving transmitter move. `image_sources` reads phases: its planes
+are bisectors of sources that a coherent likelihood places, which spectra without phases do not have.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsparc.data.ends import SAME_PLACE_M
+from gsparc.models.moving_array.triangulate import nonnegative_powers, sum_lags
 from gsparc.physics.array_response import normalise_spectrum
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.lags import SpectrumLags
@@ -25,12 +30,13 @@ from gsparc.processes.stored import Stored
 
 PLANES = 8  # at most
 REACH, STEP = 3.0, 0.05  # beyond the box of both ends, and between planes that are tried [m]
+COARSE_STEP, TURN_STEP = 0.2, 6  # of planes that tell how the room is turned [m], and of turns [degrees]
+NEARLY = 0.9  # of what planes along the axes leave over, which others must be below
 LEAST_GAIN = 0.003  # of the energy: a plane that explains less is none
 LEAST_ALONE = 0.02  # of an image's energy
 RIDGE = 0.02  # of the powers' solve
 NEIGHBOURS, LEAST_M, COMMON = 8, 0.3, 0.15  # shares at a place: of the nearest, by distance, and of all
 DRAWS = 24  # of the phases between paths
-SAME_M = 1e-3  # [m], a place itself, which does not tell its own shares
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,8 @@ class SharedPaths(Stored):
     def powers(self, places: Tensor) -> Tensor:
         """Return what paths carry to places (n, 3), (n, K + 1), of sum 1; one that was measured by others."""
         apart = torch.cdist(places, self.places)
-        weight = torch.where(apart < SAME_M, 0.0, 1 / apart.clamp_min(LEAST_M).square())
+        # A place does not tell its own shares.
+        weight = torch.where(apart < SAME_PLACE_M, 0.0, 1 / apart.clamp_min(LEAST_M).square())
         near = weight.topk(min(NEIGHBOURS, len(self.places)), dim=1)
         own = (near.values[..., None] * self.shares[near.indices]).sum(1) / near.values.sum(1, keepdim=True)
         shares = (1 - COMMON) * own + COMMON * self.shares.mean(0)
@@ -78,14 +85,28 @@ def find_paths(
 ) -> SharedPaths:
     """Return planes and shares that explain lags `seen` (n, count) at places (n, 3) [m]."""
     metric = Factor.from_gram(lags.gram).lower  # of lags to pixels: energies are of images
+    target, ends = seen.double() @ metric, torch.cat([places, receiver[None]])
 
-    def looks(directions: Tensor) -> Tensor:
+    def looks(planes: Tensor) -> Tensor:
+        directions = ways(places, planes, receiver, rotation)[0]
         return lags.plane_wave_lags(directions.float()).double() @ metric
 
-    target, tried = seen.double() @ metric, _planes_to_try(torch.cat([places, receiver[None]]))
-    images = looks(ways(places, tried, receiver, rotation)[0])[:, 1:]
-    planes, energy = NO_PLANES, float(target.square().sum())
-    known = looks(ways(places, planes, receiver, rotation)[0])
+    # Walls stand at right angles to each other: which way is told by a coarse search in every direction.
+    tried = [_planes_to_try(ends, turn, COARSE_STEP) for turn in torch.arange(0, 90, TURN_STEP).deg2rad()]
+    left = torch.stack([_choose_planes(looks, one, target)[2].square().sum() for one in tried])
+    left[0] *= NEARLY  # along the axes, where that is nearly as good
+    turn = torch.tensor(TURN_STEP * int(left.argmin())).deg2rad()
+    planes, powers, _ = _choose_planes(looks, _planes_to_try(ends, turn, STEP), target)
+    distance = ways(places, planes, receiver, rotation)[1]
+    return SharedPaths(planes, receiver, rotation, places, normalize(powers * distance.square(), p=1, dim=1))
+
+
+def _choose_planes(
+    looks: Callable[[Tensor], Tensor], tried: Tensor, target: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return those (K, 4) of planes (Q, 4) whose looks explain the target (n, D), powers, and the rest."""
+    planes, energy, every = NO_PLANES, float(target.square().sum()), looks(tried)
+    known, images = every[:, :1], every[:, 1:]
     powers, left = _solve(known, target)
     while len(planes) < PLANES:
         # Of an image only what known paths cannot imitate tells: orthogonal least squares.
@@ -98,30 +119,25 @@ def find_paths(
         if float((left.square().sum() - rest.square().sum()) / energy) < LEAST_GAIN:
             break
         planes, known, powers, left = torch.cat([planes, tried[best : best + 1]]), more, solved, rest
-    distance = ways(places, planes, receiver, rotation)[1]
-    return SharedPaths(planes, receiver, rotation, places, normalize(powers * distance.square(), p=1, dim=1))
+    return planes, powers, left
 
 
-def _planes_to_try(ends: Tensor) -> Tensor:
-    """Planes (Q, 4) across the axes, on both sides of the box of ends (n, 3) [m]."""
-    planes = []
-    for axis in range(3):
-        low, high = float(ends[:, axis].min()), float(ends[:, axis].max())
-        beyond = STEP * torch.arange(1, round(REACH / STEP), dtype=torch.float64)
+def _planes_to_try(ends: Tensor, turn: Tensor, step: float) -> Tensor:
+    """Planes (Q, 4) across axes turned about z [rad], on both sides of the box of ends (n, 3) [m]."""
+    planes, axes = [], torch.eye(3).double()
+    axes[:2, :2] = torch.stack([turn.cos(), turn.sin(), -turn.sin(), turn.cos()]).view(2, 2)
+    for axis in axes:
+        low, high = (ends @ axis).aminmax()
+        beyond = step * torch.arange(1, round(REACH / step), dtype=torch.float64)
         offset = torch.cat([low - beyond, high + beyond])
-        planes.append(torch.cat([torch.eye(3).double()[axis].expand(len(offset), 3), offset[:, None]], 1))
+        planes.append(torch.cat([axis.expand(len(offset), 3), offset[:, None]], 1))
     return torch.cat(planes)
 
 
 def _solve(looks: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """Nonnegative powers (n, K) whose sums of looks (n, K, D) are nearest to the target (n, D); the rest."""
-    ridge = RIDGE * float(looks.norm(dim=2).mean()) * np.eye(looks.shape[1])
-    none = np.zeros(looks.shape[1])
-    pairs = zip(looks.numpy(), target.numpy(), strict=True)
-    powers = torch.from_numpy(
-        np.stack([nnls(np.vstack([own.T, ridge]), np.concatenate([one, none]))[0] for own, one in pairs])
-    )
-    return powers, target - (powers[:, None] @ looks)[:, 0]
+    powers = nonnegative_powers(target, looks, (RIDGE * float(looks.norm(dim=2).mean())) ** 2)
+    return powers, target - sum_lags(powers, looks)
 
 
 class ExpectedSpectra:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsparc.models.carriers.array import SAME_PLACE
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
@@ -20,6 +20,7 @@ from gsparc.processes.stored import Stored
 LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
 SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
 NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
+USUAL = 0.5  # places, as which the usual noise counts beside a place's own
 OWN, ALONE = (0.0, 2.0), 0.2  # of the same, what images within .2 octaves share at neighbouring places
 
 
@@ -32,7 +33,7 @@ class Covariance(Stored):
         shared: of what neighbouring places share, at all carriers.
         near: of what near carriers of a place share.
         own: of what neighbouring places share at near carriers alone.
-        noise: of each row.
+        noise: of a row, in the mean over places: `row_noise`.
         amplitude: of the whole, per pixel.
     """
 
@@ -47,14 +48,14 @@ class Covariance(Stored):
         """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
         apart = distances(a[:, :3], b[:, :3])
         octaves = (a[:, None, 3] - b[None, :, 3]).abs()
-        here, alike = (apart < SAME_PLACE).double(), matern32(octaves, OCTAVES)
+        here, alike = matern32(apart, SAME_PLACE_M), matern32(octaves, OCTAVES)
         around, own = matern32(apart, self.length), self.own * matern32(octaves, ALONE)
         # Of a carrier alone: its mean image, and what varies over places.
         return self.shared * around + own * (1 + around) + here * (1 + self.near * alike)
 
-    def gram(self, rows: Tensor) -> Tensor:
-        """Return covariances (n, n) of rows (n, 4) with their noise."""
-        return self.between(rows, rows) + self.noise * torch.eye(len(rows), dtype=torch.float64)
+    def gram(self, rows: Tensor, noise: Tensor | float) -> Tensor:
+        """Return covariances (n, n) of rows (n, 4) with theirs (n,) of `row_noise`."""
+        return self.between(rows, rows) + self.noise * noise * torch.eye(len(rows), dtype=torch.float64)
 
     @property
     def prior(self) -> float:
@@ -74,40 +75,61 @@ class JointChoice(NamedTuple):
     Attributes:
         new: without all rows of the place.
         seen: one by one.
+        carrier: without all rows of the carrier.
     """
 
     covariance: Covariance
     weight: float
     new: Tensor
     seen: Tensor
+    carrier: Tensor
+
+
+def row_noise(images: Tensor, groups: list[Tensor]) -> Tensor:
+    """Return how far images (n, P) of a place are from each other (n,), 1 in the mean over places.
+
+    Where one path is most of what arrives all carriers see the same; phases between several differ.
+    """
+    squared = torch.stack([(images[rows] - images[rows].mean(0)).square().sum() for rows in groups])
+    free = torch.tensor([len(rows) - 1.0 for rows in groups], dtype=torch.float64)
+    usual = squared.sum().clamp_min(1e-9) / free.sum().clamp_min(1.0)
+    noise = images.new_ones(len(images))
+    for rows, one in zip(groups, (squared / usual + USUAL) / (free + USUAL), strict=True):
+        noise[rows] = one
+    return noise
 
 
 def choose_joint(
-    rows: Tensor, images: Tensor, paths: Tensor, groups: list[Tensor], entries: int
-) -> JointChoice:
+    rows: Tensor, images: Tensor, paths: Tensor, noise: Tensor, groups: list[Tensor],
+    carriers: list[Tensor], entries: int,
+) -> JointChoice:  # fmt: skip
     """Return the covariance and weight of paths of least error at places and at rows left out.
 
     Args:
         rows: (n, 4), places [m] and log2 of carriers.
         images: (n, P) float64, components of images of so many `entries`, about their mean.
         paths: (n, P) float64, images expected of paths, about the same mean.
-        groups: rows of each place.
+        noise: (n,) of `row_noise`.
+        groups, carriers: rows of each place, and of each carrier.
         entries: pixels.
     """
     both, best, result = torch.cat([images, paths], 1), math.inf, None
     for one in _candidates(float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0):
-        inverse = Factor.from_gram(one.gram(rows)).inverse
+        inverse = Factor.from_gram(one.gram(rows, noise)).inverse
         solved = inverse @ both
         away = left_out_residuals(inverse, solved, groups)
         # Residuals are linear in what is taken off: the best weight is a quotient.
         image, path = away.residual.chunk(2, dim=1)
-        weight = float((image * path).sum() / path.square().sum().clamp_min(1e-9))
+        given = path / noise[:, None]
+        weight = float((image * given).sum() / (path * given).sum().clamp_min(1e-9))
         weight = min(max(weight, 0.0), 1.0)
         new, seen = (_without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved)))
-        error = float(new.square().mean()) * float(seen.square().mean())
+        # As of ratios in decibels: what is told well counts as much as what is not.
+        error = sum(float(one.square().sum(1).clamp_min(1e-9).log().mean()) for one in (new, seen))
         if error < best:
             scaled = replace(one, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries)
-            best, result = error, JointChoice(scaled, weight, new, seen)
+            carrier = _without_paths(left_out_residuals(inverse, solved, carriers), weight)
+            best, result = error, JointChoice(scaled, weight, new, seen, carrier)
     assert result is not None
     return result
 

@@ -14,14 +14,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import principal_components
 from gsparc.models.carriers.alone import CarriersAlone
-from gsparc.models.carriers.array import SAME_PLACE, OneArray
+from gsparc.models.carriers.array import OneArray
 from gsparc.models.carriers.geometry import SharedPaths, find_paths
-from gsparc.models.carriers.joint import Covariance, choose_joint
+from gsparc.models.carriers.joint import Covariance, choose_joint, row_noise
 from gsparc.models.method import Prediction
 from gsparc.models.stack import choose_weights, error_products
 from gsparc.models.target_rows import training_targets
@@ -48,7 +49,7 @@ class CarrierField(OneArray):
     effects = "line_of_sight, specular"
     stored = (
         *OneArray.stored, "paths", "weight", "covariance", "rows", "left", "pixels", "middle", "axes", "lost",
-        "alone", "shares",
+        "alone", "shares", "carried", "noise",
     )  # fmt: skip
     paths: SharedPaths
     weight: float  # of paths
@@ -61,6 +62,8 @@ class CarrierField(OneArray):
     lost: float  # mean square per pixel that the components leave out
     alone: CarriersAlone
     shares: tuple[float, float]  # of `alone` at new places, and at places with rows
+    carried: float = 1.0  # share of what is told of a carrier without rows; the rest is the mean image
+    noise: Tensor | float = 1.0  # (n,) of the rows, of the usual
     _inverse: Tensor | None = None
     _thin: tuple[Tensor, Tensor] | None = None  # the mean (p,) and what gives components (p, P) of pixels
 
@@ -98,12 +101,14 @@ class CarrierField(OneArray):
             place[rows] = number
         self._inverse = self._thin = None
         paths = self._expected_values(self.places)[place]
-        self._choose(values[few], paths[few], place[few], station[few], few)
-        factor = Factor.from_gram(self.covariance.gram(self.rows))
+        self.noise = noise = row_noise(values, groups)
+        self._choose(values[few], paths[few], noise[few], place[few], station[few], few)
+        factor = Factor.from_gram(self.covariance.gram(self.rows, self.noise))
         self.left = factor.solve(values - self.weight * paths)
         self.alone = self.alone.condition(self.rows[:, :3], values, station)
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
         shares = "{:.0%} of new places and {:.0%} of known ones by carriers alone".format(*self.shares)
+        shares += f", {self.carried:.0%} of it for carriers without rows"
         chosen = f"{planes}; {self.covariance.description}; {shares}, chosen on rows left out"
         notes = [f"{self.name}: {chosen}"]
         if len(known) < whole:
@@ -112,20 +117,21 @@ class CarrierField(OneArray):
         return FitReport(watch.seconds, tuple(notes))
 
     def _choose(
-        self, values: Tensor, paths: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
+        self, values: Tensor, paths: Tensor, noise: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
     ) -> None:
         """Set settings by some rows (n,) whose places and carriers (n,) are numbered."""
         at, count, entries = self.rows[rows], len(self._stations), len(self.mean)
-        joint = choose_joint(at, values, paths, rows_of_groups(place.numpy()), entries)
+        places, carriers = (rows_of_groups(one.numpy()) for one in (place, station))
+        joint = choose_joint(at, values, paths, noise, places, carriers, entries)
         self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
-        known, missed = self.alone.has_process(station), self.alone.left_out(station)
-        none, unit = torch.zeros_like(values[known]), place[known].numpy()
-        shares = []
-        for errors in (joint.new, joint.seen):
-            products = error_products([errors[known], missed[known]], none)
-            shares.append(float(choose_weights(products, unit, deviations=2.0)[1]) if known.any() else 0.0)
-        self.shares = shares[0], shares[1]
+        known = self.alone.has_process(station)
+        missed, unit = self.alone.left_out(station)[known], place[known]
+        new, seen = (_second_share(one[known], missed, unit) for one in (joint.new, joint.seen))
+        self.shares = new, seen
+        # One carrier alone tells nothing of others.
+        several = len(station.unique()) > 1
+        self.carried = _second_share(values, joint.carrier, station) if several else 1.0
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `query.station` says which carrier.
@@ -145,10 +151,12 @@ class CarrierField(OneArray):
         value = cross @ self.left
         if self.weight:  # else the paths, which are most of a query, explain nothing
             value = value + self.weight * self._expected_values(places)[which]
+        measured = self.alone.has_process(station)
+        value = torch.where(measured[:, None], value, self.carried * value)
         variance = (one.prior - (cross @ self._inverse_of_rows() * cross).sum(1)).clamp(0, one.prior)
         unknown, error = variance / one.prior, one.amplitude * (variance + one.noise)
-        near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE
-        share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * self.alone.has_process(station)
+        near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE_M
+        share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * measured
         if share.any():
             mean, own = (part.nan_to_num() for part in self.alone.answer(at, station))
             apart = (mean - value).square().sum(1) / len(self.mean)
@@ -168,7 +176,7 @@ class CarrierField(OneArray):
     def _inverse_of_rows(self) -> Tensor:
         """Inverse (n, n) of the rows' covariance, made once."""
         if self._inverse is None:
-            self._inverse = Factor.from_gram(self.covariance.gram(self.rows)).inverse
+            self._inverse = Factor.from_gram(self.covariance.gram(self.rows, self.noise)).inverse
         return self._inverse
 
     def count_components(self) -> int:
@@ -190,6 +198,14 @@ class CarrierField(OneArray):
             self._thin = mean[0], torch.linalg.pinv(axes)
         mean, to_values = self._thin
         return ((self.expected(self.paths, places) - mean) @ to_values).double()
+
+
+def _second_share(first: Tensor, second: Tensor, unit: Tensor) -> float:
+    """Weight of the second of two predictions by errors (n, P) of rows of units (n,); 0 without rows."""
+    if not len(unit):
+        return 0.0
+    products = error_products([first, second], torch.zeros_like(first))
+    return float(choose_weights(products, unit.numpy(), deviations=2.0)[1])
 
 
 def _at_covering_places(places: np.ndarray, most: int) -> np.ndarray:

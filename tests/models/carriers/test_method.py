@@ -21,6 +21,7 @@ from gsparc.models.carriers.method import CarrierField
 from gsparc.models.carriers.plain import DirectBeam, OtherCarriers
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, wrap_per_station
+from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.lags import SpectrumLags
 from gsparc.prediction.predictor import Predictor
@@ -52,18 +53,22 @@ def fitted(room):
     return fit(CarrierField(), room, LAST)
 
 
-def test_mirrors_were_found_beyond_their_places_where_beams_overlap():
-    """Of beams without cross terms they are found to a step: what other paths imitate tells nothing."""
+@pytest.mark.parametrize("turn", [0, 30])
+def test_mirrors_were_found_beyond_their_places_where_beams_overlap(turn):
+    """Of beams without cross terms they are found to a step, along the axes alone until rooms were turned."""
     rng, turned = np.random.default_rng(0), torch.eye(3).double()
     lags = SpectrumLags(ELEMENTS, SphereGrid.hemisphere(24, 48), 1.0)
     places = torch.from_numpy(np.c_[rng.uniform(2, 6, 30), rng.uniform(-3, 3, 30), rng.uniform(0.8, 1.6, 30)])
-    mirrors = torch.tensor([[0, 1, 0, WALL], [0, 0, 1, CEILING]]).double()
+    across, along = np.sin(np.radians(turn)), np.cos(np.radians(turn))
+    mirrors = torch.tensor([[-across, along, 0, WALL], [0, 0, 1, CEILING]]).double()
+    places[:, :2] = places[:, :2] @ torch.tensor([[along, across], [-across, along]])
     receiver = torch.tensor([0, 0, 1.0])
     directions, distance = ways(places, mirrors, receiver.double(), turned)
     power = torch.tensor([1, 0.64, 0.49]) / distance.square()
     seen = (power[..., None] * lags.plane_wave_lags(directions.float())).sum(1)
     found = find_paths(lags, seen, places, receiver.double(), turned).planes
     assert sorted(found[:, 3].tolist()) == pytest.approx([CEILING, WALL], abs=STEP / 2)
+    assert float((found[:, :3] @ mirrors[:, :3].T).abs().amax(1).min()) > 0.999
 
 
 def test_new_places_are_told_by_paths_not_by_averages(room, fitted):
@@ -80,6 +85,19 @@ def test_what_some_carriers_said_of_a_place_tells_the_others(room, fitted):
     rest = LAST[room.station[LAST] >= 3]
     half = fit(CarrierField(), room, rest)
     assert error(half, room, rest) < error(fitted, room, rest)
+
+
+def test_a_carrier_unlike_all_others_was_told_what_they_saw_at_the_place(room):
+    """In the public scene the default was behind the mean image of all other carriers."""
+    rng, rows = np.random.default_rng(2), np.arange(len(room)).reshape(-1, CARRIERS)
+    mixed = np.empty_like(room.target)
+    for own in rows.T:
+        mixed[own] = room.target[rng.permutation(own)]
+    unlike, test = replace(room, target=mixed), np.flatnonzero(room.station == 2)
+    field = fit(CarrierField(), unlike, test)
+    mean = np.delete(mixed, test, axis=0).mean(0)
+    assert field.carried < 0.5
+    assert error(field, unlike, test) < 1.05 * np.square(mixed[test] - mean).mean()
 
 
 @pytest.mark.slow
@@ -169,5 +187,8 @@ def test_a_carrier_of_a_model_that_has_none_is_refused(room):
     plain = fit(wrap_per_station(GaussianProcess(), room), room, np.setdiff1d(np.arange(len(room)), few))
     with pytest.raises(ValueError, match="learned each carrier alone; model=carriers answers at others"):
         Predictor(plain, room.site).select_carrier(7e9)
+    network = fit(wrap_per_station(method_class("wideband")(count=20, max_steps=3), room), room, few)
+    with pytest.raises(ValueError, match="wideband knows its own carriers alone; model=carriers answers"):
+        Predictor(network, room.site).select_carrier(7e9)
     for wrong in (0.0, np.nan, -1e9):
         refused("a frequency above 0", Predictor(plain, room.site).select_carrier, wrong)

@@ -1,0 +1,225 @@
+"""Places and carriers that nobody measured: rooms at ten carriers, ours beside plain methods.
+
+python bench/bands.py FOLDER SEED          # rooms of a seed; docs/results/bands.csv, half an hour of one core
+python bench/bands.py FOLDER SEED box      # rooms whose names begin so; a file that is there is added to
+
+Three rooms of Sionna (`make sionna`): the meshes of `../shared/data/wideband`, the conference room, cabinets
+in a box; three shoeboxes of known mirrors; the last of either is turned. Fifty places .9 m apart, half of
+them in sight of the gateway; array and spectrum of XFreq-GS. Held out: ten places (three draws), half of the
+carriers there, every third carrier in its turn. `true_paths`: the paths that there are, without phases.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from PIL import Image
+
+from gsparc.data.datasets.rfid import planar_array
+from gsparc.data.load import load
+from gsparc.data.schema import LIGHT, Measurements
+from gsparc.data.splits import Fold
+from gsparc.field.losses import ssim
+from gsparc.models.carriers.plain import DirectBeam
+from gsparc.models.per_station import wrap_per_station
+from gsparc.models.registry import method_class
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.llvm import prepare_llvm
+from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.scenes.conference import conference_room
+from gsparc.simulate.scenes.solid import Solid, box
+from gsparc.simulate.scenes.transmitters import Antenna
+from gsparc.simulate.shoebox import Room, mirror_images, visible_images
+from gsparc.training.context import FitContext
+
+SCENE = Path(__file__).resolve().parents[2] / "shared" / "data" / "wideband" / "scene" / "scene.xml"
+OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "bands.csv"
+GHZ = (1, 2.4, 5, 10, 24.25, 37, 47, 60, 77, 94)
+ELEMENTS = planar_array(spacing_m=0.5)[:, [2, 0, 1]]  # [wavelengths]
+EFFECTS = Effects(diffuse=False, edge_diffraction=False, polarisation=False)
+COUNT, APART_M, TURN, STRONGEST = 50, 0.9, 0.4, 60  # of places; of the world [rad]; paths
+CORNERS = {"home": [[-6, -3, 0], [6, 3, 3]], "hall": [[0, 0, 0], [14, 10, 4]]}  # [m]
+METHODS = ("gsparc", "mean", "nearest", "idw", "gp", "other_carriers", "direct_beam")
+# Of places (n, 3), a gateway (3,), a carrier [Hz] and most bounces: gains (n, P) without the carrier's phase,
+# metres (n, P), directions at the gateway (n, P, 3).
+Paths = tuple[np.ndarray, np.ndarray, np.ndarray]
+Trace = Callable[[np.ndarray, np.ndarray, float, int], Paths]
+
+
+def rooms(seed: int) -> Iterator[tuple[str, np.ndarray, Trace]]:
+    """Yield names, corners (2, 3) [m] and what traces paths there."""
+    for number, name in enumerate(("home", "hall", "cabinets", "box_0", "box_1", "box_2")):
+        rng = np.random.default_rng([seed, number])
+        size = rng.uniform([8, 6, 2.6], [12, 9, 3.6])
+        low = np.c_[rng.uniform(0.1, 0.8, (6, 2)) * size[:2], np.zeros(6)]
+        cabinets = np.stack([low, low + rng.uniform([0.4, 0.4, 1.2], [1.6, 1.6, 2.4], (6, 3))], 1)
+        solids = [box(f"cabinet{i}", ("wood", "metal")[i % 2], *one) for i, one in enumerate(cabinets)]
+        traces: dict[str, Trace] = {
+            "home": partial(traced, SCENE),
+            "hall": partial(traced, conference_room(int(1e6 * size[0]))),
+            "cabinets": partial(traced, [box("shell", "concrete", 0 * size, size), *solids]),
+        }
+        walls = partial(mirrored, size, cabinets, rng.uniform(0.3, 0.8, 6), rng.uniform(0, 0.1, 6))
+        yield name, np.array(CORNERS.get(name, [[0, 0, 0], size])), traces.get(name, walls)
+
+
+def mirrored(
+    size: np.ndarray, cabinets: np.ndarray, strength: np.ndarray, falls: np.ndarray, *asked: Any
+) -> Paths:
+    """Trace a shoebox whose walls reflect less from octave to octave; `asked` as of `Trace`."""
+    places, gateway, carrier, depth = asked
+    room = Room(0 * size, size, -strength * (carrier / 1e9) ** -falls, cabinets)
+    images = mirror_images(room, min(depth, 2))
+    free = room.contains(places) & room.contains(gateway)
+    seen = visible_images(room, images, places, gateway) & free[:, None]
+    way = images.mirror_points(places) - gateway
+    metres = np.linalg.norm(way, axis=2)
+    return seen * images.gain / metres, metres, way / metres[..., None]
+
+
+def traced(
+    source: Path | list[Solid], places: np.ndarray, gateway: np.ndarray, carrier: float, depth: int
+) -> Paths:
+    """Trace a room of Sionna from the gateway: ways are the same back."""
+    prepare_llvm()
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    for laws in ITU_MATERIALS_PROPERTIES.values():
+        laws[0.0, 1e3] = [*laws.values()][-1]  # brick's ends at 40 GHz
+    engine = RayTracer(source, gateway, carrier, Sampling(30_000, len(places)), antenna=Antenna("dipole"))
+    found = next(engine.trace_in_batches(places, replace(EFFECTS, depth=depth)))[0]
+    away, turn, delay = (np.array(one)[:, 0] for one in (found.theta_t, found.phi_t, found.tau))
+    direction = np.stack([np.sin(away) * np.cos(turn), np.sin(away) * np.sin(turn), np.cos(away)], 2)
+    free = engine.clear_of_surfaces(places, 0.2) & engine.clear_of_surfaces(gateway[None], 0.2)
+    gains = (np.array(found.a[0]) + 1j * np.array(found.a[1])).reshape(away.shape)
+    return gains * np.array(found.valid).reshape(away.shape) * free[:, None], LIGHT * delay, direction
+
+
+def make_room(folder: Path, rng: np.random.Generator, corners: np.ndarray, trace: Trace, turn: float) -> None:
+    """Write a room in the layout that `dataset=rfid` reads, and its strongest paths."""
+    low, high = corners
+    along = map(np.arange, low[:2] + rng.uniform(0.2, 0.7, 2), high[:2] - 0.2, [APART_M] * 2)
+    every = np.stack(np.meshgrid(*along), -1).reshape(-1, 2)
+    every = rng.permutation(np.c_[every, low[2] + rng.uniform(0.8, 1.7, len(every))])
+    found = []
+    for gateway in rng.uniform(0.8 * low + 0.2 * high, 0.2 * low + 0.8 * high, (4, 3)):
+        seen, heard = ((trace(every, gateway, 5e9, depth)[0] != 0).any(1) for depth in (0, 1))
+        found.append((seen, heard & ~seen, gateway))
+    seen, hidden, gateway = max(found, key=lambda one: min(one[0].sum(), one[1].sum()))
+    half = max(COUNT // 2, COUNT - int(hidden.sum()))
+    places = every[np.r_[np.flatnonzero(seen)[:half], np.flatnonzero(hidden)[: COUNT - half]]]
+    cosine, sine = np.cos(turn), np.sin(turn)
+    world = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])  # of rows
+    zenith, azimuth = np.radians(np.meshgrid(np.arange(90), np.arange(360), indexing="ij"))  # runs clockwise
+    looks = np.stack([np.sin(zenith) * np.cos(azimuth), -np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
+    steering = np.exp(-2j * np.pi * np.einsum("kij,mk->mij", looks, ELEMENTS))
+    images, powers, directions = [], [], []
+    for carrier in np.array(GHZ) * 1e9:
+        gains, metres, direction = trace(places, gateway, carrier, 3)
+        waves, turned = gains * np.exp(-2j * np.pi * np.mod(carrier / LIGHT * metres, 1.0)), direction @ world
+        vectors = np.einsum("np,npm->nm", waves, np.exp(2j * np.pi * turned @ ELEMENTS.T))
+        images.append(np.abs(np.einsum("nm,mij->nij", vectors, steering)))
+        order = np.argsort(-np.abs(gains), 1)[:, :STRONGEST]
+        powers.append(np.take_along_axis(np.abs(gains) ** 2, order, 1))
+        directions.append(np.take_along_axis(turned, order[..., None], 1))
+    heard = np.all([power.any(1) for power in powers], 0)
+    image, power, direction = (
+        np.concatenate([one[heard] for one in all]) for all in (images, powers, directions)
+    )
+    (folder / "spectrum").mkdir(parents=True)
+    for number, one in enumerate(
+        np.round(255 * image / image.max((1, 2), keepdims=True)).astype(np.uint8), 1
+    ):
+        Image.fromarray(one).save(folder / "spectrum" / f"{number:05d}.png")
+    pose = f"gateway1: {{position: {(gateway @ world).tolist()}, orientation: [0, 0, 0, 1]}}\n"
+    (folder / "gateway_info.yml").write_text("dataset_name: bands\n" + pose)
+    np.savetxt(folder / "freq.txt", np.repeat(GHZ, heard.sum()), "%g")
+    rows = np.tile(places[heard] @ world, (len(GHZ), 1))
+    np.savetxt(folder / "tx_pos.csv", rows, "%.6f", ",", header="x,y,z", comments="")
+    np.savez(folder / "paths.npz", direction=direction, power=power)
+
+
+def folds(data: Measurements, seed: int) -> Iterator[tuple[str, Fold]]:
+    """Yield what is held out."""
+    place, none = np.unique(data.tx, axis=0, return_inverse=True)[1].reshape(-1), np.zeros(0, np.int64)
+
+    def hold_out(rows: np.ndarray) -> Fold:
+        return Fold(np.flatnonzero(~rows), none, np.flatnonzero(rows))
+
+    for draw in range(3):
+        out = np.isin(place, np.random.default_rng([seed, draw]).permutation(place.max() + 1)[:10])
+        yield "places", hold_out(out)
+        yield "half", hold_out(out & (data.station % 2 == 1))
+    for carrier in range(0, len(GHZ), 3):
+        yield "carriers", hold_out(data.station == carrier)
+
+
+def judge(name: str, data: Measurements, fold: Fold) -> dict[str, float | str]:
+    """Return figures of a method."""
+    method, batch = wrap_per_station(method_class(name)(), data), data.batch(fold.test)
+    start = time.process_time()
+    method.fit(data, fold, FitContext(Path()))
+    fitted = time.process_time()
+    mean, one, asked = method.predict(batch).mean, data.batch(fold.test[:1]), time.process_time()
+    for _ in range(10):
+        method.predict(one)
+    query_ms = (time.process_time() - asked) / 10 * 1e3
+    return {
+        "method": name,
+        **score(mean, batch.target),
+        "fit_cpu_s": fitted - start,
+        "query_cpu_ms": query_ms,
+    }
+
+
+def ceiling(truth: Path, data: Measurements, fold: Fold) -> dict[str, float | str]:
+    """Return figures of the true paths without their phases."""
+    beam, batch = DirectBeam(), data.batch(fold.test)
+    beam.fit(data, fold, FitContext(Path()))
+    with np.load(truth) as paths:
+        known = (torch.from_numpy(paths[name][fold.test]) for name in ("direction", "power"))
+        images = beam.expect_paths(*known)
+    return {"method": "true_paths", **score(beam.answer_images(images, batch), batch.target)}
+
+
+def score(images: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
+    """Return the means over rows."""
+    squared = (images - target).square().flatten(1).mean(1)
+    alike = torch.cat([ssim(*pair) for pair in zip(images.split(1), target.split(1), strict=True)])
+    return {"ssim_gauss": float(alike.mean()), "psnr_db": float(-10 * squared.log10().mean())}
+
+
+def main() -> None:
+    """Make rooms, fit, write a row a room, what is held out and method, and print the means over rooms."""
+    folder, seed, *names = sys.argv[1:]
+    torch.set_num_threads(1)
+    rows = []
+    for number, (name, corners, trace) in enumerate(rooms(int(seed))):
+        if not name.startswith(tuple(names or [""])):
+            continue
+        root = Path(folder) / f"{name}_{seed}"
+        if not root.exists():
+            rng = np.random.default_rng([int(seed), number, 1])
+            make_room(root, rng, corners, trace, TURN * (number % 3 == 2))
+        data = load({"name": "rfid", "root": str(root)})
+        for held_out, fold in folds(data, int(seed)):
+            judged = [judge(one, data, fold) for one in METHODS]
+            judged += [ceiling(root / "paths.npz", data, fold)] if held_out == "places" else []
+            rows += [{"room": root.name, "held_out": held_out, **one} for one in judged]
+    by = ["room", "held_out", "method"]
+    mean = pd.DataFrame(rows).groupby(by, sort=False).mean().round(4)
+    mean.to_csv(OUT, mode="a", header=not OUT.exists())
+    sys.stdout.write(f"{mean.groupby(by[1:], sort=False).mean().to_string()}\n")
+
+
+if __name__ == "__main__":
+    main()
