@@ -1,6 +1,6 @@
 """Maps that are told of later rows, beside what else could be done: docs/results/changes.csv.
 
-    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors]
+    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors] [updates] [kills]
 
 Room and network are simulated here; months of a library and rounds of a garage are looked for in
 ../shared/data/change. Errors are of places that nobody told of, rmse [dB].
@@ -8,6 +8,8 @@ Room and network are simulated here; months of a library and rounds of a garage 
 
 import csv
 import logging
+import os
+import signal
 import sys
 import tempfile
 import time
@@ -19,13 +21,18 @@ import torch
 from scipy.spatial import cKDTree
 
 import gsparc
+from gsparc.data.query import Query
+from gsparc.models import checkpoint
+from gsparc.models.updated import map_level
 from gsparc.prediction.drift import Watch
-from gsparc.processes.changes import LaterRows
+from gsparc.prediction.updating import versions_extra
+from gsparc.processes.changes import ERRORS, KINDS, LEAST, NEAR, TINY, LaterRows, correct, learn
 
 MEASURED = Path(__file__).parents[2] / "shared/data/change"
 OUT = Path(__file__).parents[1] / "docs/results/changes.csv"
 SIDE, STATIONS, KEPT = 40.0, 30, 80
 DRAWS, READINGS, BEGINS = 200, 1000, 300
+UPDATES, EACH, KILLS = 100_000, 1000, 20
 
 
 def field(places, seed, length=8.0):
@@ -220,8 +227,144 @@ def priors():
             yield f"six towns, {name}", f"{count} rows", "most of no map's", round(max(ratio), 3), ""
 
 
+def world():
+    """A model of 300 rows of a room, and what later rows (n,) measure at places, by number.
+
+    The screen of `rooms` comes, or goes, after every 10,000 of them.
+    """
+    before, noise = draw(300, 0, 20.0), np.random.default_rng(2)
+
+    def measure(number, places):
+        stands = (np.asarray(number) // 10_000 % 2 == 1) & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4)
+        return -60 + field(places, 1, 4.0) - 12 * stands + noise.normal(size=len(places))
+
+    return gsparc.fit(rx=before, rssi=measure(0, before), tx=[9.0, 9.0, 2.6], model="gp"), measure
+
+
+def solve(belief, rows, level, doubt, apart, among, middle):
+    """Level [dB] at a place, at distances `apart` (n,) and `among` (n, n) [m]: one plain solve a kind."""
+    matern = lambda distance, length: (1 + 3**0.5 * distance / length) * np.exp(-(3**0.5) * distance / length)  # noqa: E731
+    weight, added = (np.asarray(part) for part in belief.of(0))
+    kept, result = weight >= LEAST, 0.0
+    for share, kind in zip(weight, KINDS, strict=True):
+        if share < LEAST:
+            continue
+        own = [
+            kind.keeps * np.sqrt(variance * rows.doubt.numpy()) * matern(distance, belief.extent * ERRORS)
+            + kind.offset**2 + kind.local**2 * matern(distance, belief.extent * kind.size)
+            for variance, distance in ((doubt, apart), (rows.doubt.numpy()[:, None], among))
+        ]  # fmt: skip
+        noise = added + (rows.noise + rows.faded).numpy() + TINY
+        told = rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
+        mean = own[0] @ np.linalg.solve(own[1] + np.diag(noise), told)
+        mean += kind.keeps * level + (1 - kind.keeps) * middle
+        result += share / weight[kept].sum() * mean
+    return result
+
+
+def updates():
+    """A row at a time, many of them: differences to fresh solves, memory and seconds."""
+    model, measure = world()
+    places, asked = draw(UPDATES, 6, 20.0), torch.from_numpy(draw(20, 11, 20.0))
+    levels, query = measure(np.arange(UPDATES), places), asked - torch.from_numpy(model.site.origin)
+    before = map_level(
+        model.method, model.predict_query(Query.from_places(model.site, query.float())), model.site
+    )
+    worst, few, seconds, alarms, began = {NEAR: 0.0, 1000: 0.0}, [], [], 0, 0.0
+    for number in range(UPDATES):
+        began = time.process_time()
+        alarms += len(model.update(rx=places[[number]], rssi=levels[[number]]).alarms)
+        seconds.append(time.process_time() - began)
+        if number % EACH != EACH - 1:
+            continue
+        rows, extent = model.versions[-1].changes.stations[0], model.versions[-1].changes.belief.extent
+        said = correct(model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt).mean
+        belief, apart = learn({0: rows}, extent), torch.cdist(query, rows.places).numpy()
+        for count in worst if number % (5 * EACH) == 5 * EACH - 1 else (NEAR,):
+            for one, distance in enumerate(apart):
+                near = np.argsort(distance)[:count]
+                part = rows[torch.from_numpy(near)]
+                among = torch.cdist(part.places, part.places).numpy()
+                fresh = solve(
+                    belief, part, float(before.mean[one]), float(before.doubt[one]), distance[near], among,
+                    rows.middle.item(),
+                )  # fmt: skip
+                worst[count] = max(worst[count], abs(fresh - float(said[one])))
+        memory = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        few.append(memory)
+    name, told = "a row at a time, 1,000 kept", f"{UPDATES} updates"
+    figures = {
+        "from a fresh solve of the 64 nearest rows, at most [dB]": worst[NEAR],
+        "from a fresh solve of all rows kept, at most [dB]": worst[1000],
+        "memory after 1,000 updates [MiB]": few[0], "memory at the end [MiB]": few[-1],
+        "alarms, of 9 changes": alarms, "an update, median [ms]": 1e3 * np.median(seconds),
+        "of the last 1,000, median [ms]": 1e3 * np.median(seconds[-EACH:]),
+    }  # fmt: skip
+    for way, figure in figures.items():
+        yield name, told, way, float(f"{figure:.3g}"), round(sum(seconds)) if way.startswith("an") else ""
+    states = []
+    for turn in range(10):
+        states.append(model.predict(rx=asked.numpy()))
+        model.update(rx=places[[turn]], rssi=levels[[turn]])
+    same = 0
+    for state in states[::-1]:
+        model.undo()
+        now = model.predict(rx=asked.numpy())
+        same += bool((now.mean == state.mean).all() and (now.variance == state.variance).all())
+    yield name, "10 updates, then 10 undos", "bit-identical", same, ""
+
+
+def kills():
+    """A process that updates a file, killed at random moments: the file holds the state before, or after."""
+    model, measure = world()
+    places, asked, rng = draw(2000, 6, 20.0), draw(20, 11, 20.0), np.random.default_rng(0)
+    levels, whole, lost, writes = measure(np.arange(2000), places), 0, 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        file, known = Path(folder) / "model.ckpt", [model.rssi(rx=asked)]
+        checkpoint.save(file, model.method)
+        for _ in range(KILLS):
+            begins, (heard, says) = len(gsparc.load(file).rows), os.pipe()
+            if (child := os.fork()) == 0:
+                mine = gsparc.load(file)
+                for number in range(begins, len(places)):
+                    mine.update(rx=places[[number]], rssi=levels[[number]], window=len(places))
+                    checkpoint.update_extra(file, versions_extra(mine.versions), file)
+                    os.write(says, b".")
+                os._exit(1)
+            time.sleep(rng.uniform(0.2, 1.2))
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            os.close(says)
+            done, after = begins + len(os.read(heard, 2**16)), gsparc.load(file)
+            os.close(heard)
+            for number in range(len(known) - 1, len(after.rows)):
+                model.update(rx=places[[number]], rssi=levels[[number]], window=len(places))
+                known.append(model.rssi(rx=asked))
+            writes, lost = len(after.rows), lost + (len(after.rows) < done)
+            whole += (
+                len(after.rows) in (done, done + 1) and (after.rssi(rx=asked) == known[len(after.rows)]).all()
+            )
+        left = len(list(Path(folder).iterdir())) - 1
+    yield (
+        "killed at random",
+        f"{KILLS} kills, {writes} writes",
+        "the state before, or after, bit for bit",
+        int(whole),
+        "",
+    )
+    yield (
+        "killed at random",
+        f"{KILLS} kills, {writes} writes",
+        "updates lost that were said to be stored",
+        lost,
+        "",
+    )
+    yield "killed at random", f"{KILLS} kills, {writes} writes", "partial files left", left, ""
+
+
 PARTS = {
     "networks": networks, "rooms": rooms, "detections": detections, "priors": priors,
+    "updates": updates, "kills": kills,
     "months": lambda: measured("library-months.npz", "month"),
     "rounds": lambda: measured("garage-rounds.npz", "round"),
 }  # fmt: skip

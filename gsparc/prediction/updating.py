@@ -27,6 +27,7 @@ from gsparc.processes.stored import Stored, from_plain, to_plain
 
 WINDOW = 1_000  # later rows of a station that are kept
 FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before
+JOURNAL = 1_000  # lines that a version keeps
 VERSIONS = 11  # that are kept, the one that answers among them
 LOUD = 2.0  # deviations that a map must be above a level for silence to contradict it
 
@@ -38,7 +39,7 @@ class Version(Stored):
     Attributes:
         changes: rows, and what they say together.
         watch: state of the sequential test.
-        journal: a line for each thing that was done, the last one last.
+        journal: a line for each thing that was done, the last ones, in their order.
     """
 
     changes: Changes
@@ -224,7 +225,7 @@ class UpdateMixin:
 
     @property
     def journal(self) -> tuple[str, ...]:
-        """A line for each thing that was done since the fit."""
+        """A line for each thing that was done since the fit, of the last `JOURNAL`."""
         return self._current.journal
 
     # -- versions --------------------------------------------------------------------------------------
@@ -246,7 +247,7 @@ class UpdateMixin:
             changes or now.changes, rows=tuple(sorted(stations.items())),
             belief=learn(stations, now.changes.belief.extent),
         )  # fmt: skip
-        version = Version(changes, watch or now.watch, (*now.journal, said))
+        version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:])
         self._become((*(self.versions or (now,)), version)[-VERSIONS:])
 
     def _become(self, versions: tuple[Version, ...]) -> None:
