@@ -1,6 +1,7 @@
 """Maps that are told of later rows, beside what else could be done: docs/results/changes.csv.
 
-    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors] [updates] [kills]
+    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors]
+                            [seconds] [updates] [kills]
 
 Room and network are simulated here; months of a library and rounds of a garage are looked for in
 ../shared/data/change. Errors are of places that nobody told of, rmse [dB].
@@ -19,6 +20,8 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 import gsparc
 from gsparc.data.query import Query
@@ -27,6 +30,9 @@ from gsparc.models.updated import map_level
 from gsparc.prediction.drift import Watch
 from gsparc.prediction.updating import versions_extra
 from gsparc.processes.changes import ERRORS, KINDS, LEAST, NEAR, TINY, LaterRows, correct, learn
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.raytracer import Sampling
+from gsparc.simulate.scenes.build import SceneSettings, build_survey
 
 MEASURED = Path(__file__).parents[2] / "shared/data/change"
 OUT = Path(__file__).parents[1] / "docs/results/changes.csv"
@@ -99,38 +105,93 @@ def networks():
         yield from judge(f"office {seed}, as before", model, later, network(later, seed, False), (5, 20))
 
 
-def rooms():
-    """One transmitter, 300 rows; then a screen of 12 dB in a disc of 4 m, and rows in and around it."""
-    before, asked, near = draw(300, 0, 20.0), draw(3000, 11, 20.0), draw(4000, 6, 20.0)
+def disc():
+    """A smooth field, then a screen of 12 dB in a disc of 4 m; rows are in and around it."""
+    asked, near = draw(3000, 11, 20.0), draw(4000, 6, 20.0)
 
     def level(places, later=True):
-        disc = np.linalg.norm(places[:, :2] - 5, axis=1) < 4
-        return -60 + field(places, 1, 4.0) - 12 * (disc & later), disc
-
-    def measure(places, seed, later=True):
-        return level(places, later)[0] + np.random.default_rng(seed).normal(size=len(places))
+        return -60 + field(places, 1, 4.0) - 12 * (later & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
 
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6]
-    truth, disc = level(asked)
-    rows, heard, right = before, measure(before, 2, False), ~level(before)[1]
-    post = {"tx": [9.0, 9.0, 2.6], "model": "gp"}
-    model = gsparc.fit(rx=rows, rssi=heard, **post)
-    for count in (5, 10, 20, 50):
-        new, told = near[:count], measure(near, 3)[:count]
-        old, began = model.rssi(rx=asked)[:, 0], time.monotonic()
-        model.update(rx=new, rssi=told)
-        spent = round(time.monotonic() - began, 3)
-        ways = {"old map": old, "updated": model.rssi(rx=asked)[:, 0]}
-        sets = {"retrained on all": slice(None), "retrained on the right rows": right}
-        for way, kept in sets.items():
-            part = {"rx": np.r_[rows[kept], new], "rssi": np.r_[heard[kept], told]}
-            ways[way] = gsparc.fit(**part, **post).rssi(rx=asked)[:, 0]
-        ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=told, **post).rssi(rx=asked)[:, 0]
-        for way, said in ways.items():
-            for part, where in (("in the disc", disc), ("elsewhere", ~disc)):
-                figure = rmse(said[where], truth[where])
-                yield f"room, {part}", f"{count} rows", way, figure, spent if way == "updated" else ""
-        model.undo()
+    return "room", [9.0, 9.0, 2.6], draw(300, 0, 20.0), near, asked, level
+
+
+def cabinet():
+    """A shoebox of 14 x 10 m, simulated, whose cabinet is moved; rows are where that changes 3 dB."""
+    post, moves = [2.0, 5.0, 2.6], [{"name": "box0", "by_m": [0.0, 4.0, 0.0]}]
+    room = {"size_m": [14.0, 10.0, 3.0], "boxes_m": [[[8.0, 2.0, 0.0], [9.0, 4.0, 2.5]]], "reflection": -0.5}
+    facts = {"name": "cabinet", "carrier_hz": 2.44e9, "bandwidth_hz": 0.0, "subcarriers": 1, "room": room}
+    facts |= {"transmitter_m": post, "area_m": [[0.3, 0.3], [13.7, 9.7]]}
+    before, asked, near = (
+        build_survey(SceneSettings(num_receivers=count, seed=seed, moved=moved, **facts), Sampling())
+        for count, seed, moved in ((300, 0, []), (3000, 11, moves), (1000, 6, moves))
+    )
+
+    def level(places, later=True):
+        paths = (asked if later else before).engine.trace(places, Effects())
+        return 10 * np.log10(paths.received_power())
+
+    changed = np.abs(level(near.places) - level(near.places, False)) > 3
+    apart = cKDTree(near.places[changed]).query(near.places)[0]
+    return "cabinet", post, before.places, near.places[apart < 0.5], asked.places, level
+
+
+def space_time(before, heard, new, told, asked):
+    """Levels at places later by scikit-learn's process of space and time, 0 before and 1 later."""
+    places, level = (
+        np.r_[np.c_[before[:, :2], 0 * heard], np.c_[new[:, :2], 0 * told + 1]],
+        np.r_[heard, told],
+    )
+    kernel = ConstantKernel(20.0) * Matern([3.0, 3.0, 3.0], (0.1, 100.0), nu=1.5) + WhiteKernel(1.0)
+    process = GaussianProcessRegressor(kernel, normalize_y=True).fit(places, level)
+    return process.predict(np.c_[asked[:, :2], np.ones(len(asked))])
+
+
+def rooms():
+    """One transmitter, 300 rows with 1 dB of noise; then something is moved, and rows in and around tell."""
+    for name, post, before, near, asked, level in (disc(), cabinet()):
+        heard = level(before, False) + np.random.default_rng(2).normal(size=len(before))
+        told = level(near) + np.random.default_rng(3).normal(size=len(near))
+        truth, changed, right = (
+            level(asked), *(np.abs(level(at) - level(at, False)) > 3 for at in (asked, before))
+        )  # fmt: skip
+        fixed = {"tx": post, "model": "gp"}
+        model = gsparc.fit(rx=before, rssi=heard, **fixed)
+        for count in (5, 10, 20, 50):
+            new, levels, ways = near[:count], told[:count], {"old map": model.rssi(rx=asked)[:, 0]}
+            for way, refit in (("updated", False), ("updated, refit=true", True)):
+                began = time.process_time()
+                model.update(rx=new, rssi=levels, refit=refit)
+                seconds = round(time.process_time() - began, 3)
+                ways[way] = model.rssi(rx=asked)[:, 0], seconds
+                model.undo()
+            sets = {"all": slice(None), "the right rows": ~right, "a window of 300": slice(count, None)}
+            for way, kept in sets.items():
+                part = {"rx": np.r_[before[kept], new], "rssi": np.r_[heard[kept], levels]}
+                ways[f"retrained on {way}"] = gsparc.fit(**part, **fixed).rssi(rx=asked)[:, 0]
+            ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=levels, **fixed).rssi(rx=asked)[:, 0]
+            ways["space and time"] = space_time(before, heard, new, levels, asked)
+            for way, said in ways.items():
+                answer, seconds = said if isinstance(said, tuple) else (said, "")
+                for part, where in (("where it changed", changed), ("elsewhere", ~changed)):
+                    yield f"{name}, {part}", f"{count} rows", way, rmse(answer[where], truth[where]), seconds
+
+
+def seconds():
+    """One row, and 50, told to a model of 5,000 rows with 5,000 kept: the least of ten each."""
+    before, new = draw(5000, 0, 20.0), draw(6000, 6, 20.0)
+    level, later = (
+        -60 + field(at, 1, 4.0) + np.random.default_rng(2).normal(size=len(at)) for at in (before, new)
+    )
+    model = gsparc.fit(rx=before, rssi=level, tx=[9.0, 9.0, 2.6], model="gp")
+    model.update(rx=new[:5000], rssi=later[:5000], window=5000)
+    for count in (1, 50):
+        spent = []
+        for turn in range(10):
+            rows, began = slice(5000 + count * turn, 5000 + count * (turn + 1)), time.process_time()
+            model.update(rx=new[rows], rssi=later[rows], window=5000)
+            spent.append(1e3 * (time.process_time() - began))
+        yield "an update, 5,000 rows kept", f"{count} rows", "least of ten [ms]", round(min(spent), 1), ""
 
 
 def readings(kind, seed, count):
@@ -364,7 +425,7 @@ def kills():
 
 PARTS = {
     "networks": networks, "rooms": rooms, "detections": detections, "priors": priors,
-    "updates": updates, "kills": kills,
+    "seconds": seconds, "updates": updates, "kills": kills,
     "months": lambda: measured("library-months.npz", "month"),
     "rounds": lambda: measured("garage-rounds.npz", "round"),
 }  # fmt: skip

@@ -19,10 +19,10 @@ from gsparc.data.units import PowerUnit
 from gsparc.models.device_offsets import without_devices
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
-from gsparc.models.updated import STORED, Changes, Level, map_level, stored_changes, with_changes
+from gsparc.models.updated import STORED, Changes, Level, Updated, map_level, stored_changes, with_changes
 from gsparc.prediction.drift import ROWS, Alarm, Watch
-from gsparc.prediction.query import read_places
-from gsparc.processes.changes import Belief, LaterRows, learn
+from gsparc.prediction.query import Queries, read_places
+from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
 WINDOW = 1_000  # later rows of a station that are kept
@@ -93,6 +93,7 @@ class UpdateMixin:
 
     site: Site
     method: Method
+    queries: Queries
     versions: tuple[Version, ...]
     _whole: Method
     _prepared: list[Method]
@@ -106,7 +107,7 @@ class UpdateMixin:
     def update(
         self, rows: Measurements | LevelRows | None = None, *, tx: Any = None, rx: Any = None,
         rssi: Any = None, unit: str | None = None, window: int = WINDOW, fade_db: float = FADE_DB,
-        false_alarm: float = ROWS,
+        false_alarm: float = ROWS, refit: bool = False,
     ) -> Found:  # fmt: skip
         """Condition on rows that came later, and tell what changed.
 
@@ -128,6 +129,7 @@ class UpdateMixin:
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
             fade_db: deviation that a hundred later rows of a station add to one that came before [dB].
             false_alarm: readings to a false alarm without any change, at least, in the mean.
+            refit: fit the length over which changes vary to the rows kept, too; tenths of a second.
 
         Raises:
             ValueError: no powers, both ends move, or arrays that do not go together.
@@ -140,19 +142,24 @@ class UpdateMixin:
         if window < 1:
             raise ValueError(f"update: window={window}: at least one row of a station is kept")
         version, first = self._current, self._current.changes.next_number
-        changes, stations, extent = version.changes, version.changes.stations, version.changes.belief.extent
+        changes, belief, stations = version.changes, version.changes.belief, version.changes.stations
+        extent = belief.extent
         new = self._read_rows(rows, changes)
         for name, later in new.items():
             before = stations.get(name, later[:0])
             stations[name] = before.fade(later, extent, fade_db).join(later)[-window:]
         # The test believes what earlier rows said of a station's noise.
-        belief = version.changes.belief
         noisy = {name: replace(one, noise=one.noise + belief.of(name)[1]) for name, one in stations.items()}
         watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
         alarms, skipped = watch.alarms[len(version.watch.alarms) :], len(rows) - len(numbers)
         said = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
-        changes = replace(changes, next_number=first + len(numbers), next_batch=changes.next_batch + 1)
+        if refit:
+            belief = replace(belief, scale=refit_scale(stations, belief))
+            said += f", lengths of changes at {belief.scale:.2g} of the usual"
+        changes = replace(
+            changes, belief=belief, next_number=first + len(numbers), next_batch=changes.next_batch + 1
+        )
         self._add_version(stations, said, changes, watch)
         return Found(numbers, deviations, alarms, skipped)
 
@@ -192,6 +199,20 @@ class UpdateMixin:
         if not 1 <= count < len(self.versions):
             raise ValueError(f"undo: {count} back, {max(len(self.versions) - 1, 0)} are kept")
         self._become(self.versions[:-count])
+
+    def change(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return how many decibels a station's level changed since the fit, and the deviation (B,) of that.
+
+        >>> found = predictor.update(rx=[[2.0, 1.0, 1.5]] * 4, rssi=[-90.0] * 4)
+        >>> change, deviation = predictor.change(rx=[[2.0, 1.0, 1.5]])
+        >>> bool(change < 0), predictor.undo()
+        (True, None)
+        """
+        query = self.queries.query(tx, rx).query
+        if not isinstance(self.method, Updated):
+            return np.zeros(len(query)), np.zeros(len(query))
+        mean, variance = self.method.change(query)
+        return mean.numpy(), variance.sqrt().numpy()
 
     @property
     def rows(self) -> np.ndarray:
@@ -243,10 +264,9 @@ class UpdateMixin:
     ) -> None:  # fmt: skip
         """Learn from stations' rows together, and answer by it."""
         now = self._current
-        changes = replace(
-            changes or now.changes, rows=tuple(sorted(stations.items())),
-            belief=learn(stations, now.changes.belief.extent),
-        )  # fmt: skip
+        changes = changes or now.changes
+        belief = learn(stations, changes.belief.extent, changes.belief.scale)
+        changes = replace(changes, rows=tuple(sorted(stations.items())), belief=belief)
         version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:])
         self._become((*(self.versions or (now,)), version)[-VERSIONS:])
 
