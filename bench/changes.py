@@ -68,6 +68,16 @@ def network(places, seed, later):
     return np.where(level > -95, level, np.nan)
 
 
+def screened(places, stands=True):
+    """Levels (n,) of a room; where `stands` (n,), a screen of 12 dB is before a disc of 4 m."""
+    return -60 + field(places, 1, 4.0) - 12 * (stands & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
+
+
+def planned(places, town=1):
+    """What a planning tool knows of a town [dBm]."""
+    return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, town, 60.0)
+
+
 def rmse(predicted, truth):
     """Over what was heard."""
     return round(float(np.sqrt(np.nanmean((predicted - truth) ** 2))), 3)
@@ -109,11 +119,8 @@ def disc():
     """A smooth field, then a screen of 12 dB in a disc of 4 m; rows are in and around it."""
     asked, near = draw(3000, 11, 20.0), draw(4000, 6, 20.0)
 
-    def level(places, later=True):
-        return -60 + field(places, 1, 4.0) - 12 * (later & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
-
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6]
-    return "room", [9.0, 9.0, 2.6], draw(300, 0, 20.0), near, asked, level
+    return "room", [9.0, 9.0, 2.6], draw(300, 0, 20.0), near, asked, screened
 
 
 def cabinet():
@@ -254,9 +261,6 @@ def priors():
     axis = np.arange(5.0, 700, 10)
     squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
 
-    def planned(places, town):
-        return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, town, 60.0)
-
     for count in (5, 10, 20, 50, 100):
         errors, spent = [], 0.0
         for town in range(1, 7):
@@ -296,8 +300,7 @@ def world():
     before, noise = draw(300, 0, 20.0), np.random.default_rng(2)
 
     def measure(number, places):
-        stands = (np.asarray(number) // 10_000 % 2 == 1) & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4)
-        return -60 + field(places, 1, 4.0) - 12 * stands + noise.normal(size=len(places))
+        return screened(places, np.asarray(number) // 10_000 % 2 == 1) + noise.normal(size=len(places))
 
     return gsparc.fit(rx=before, rssi=measure(0, before), tx=[9.0, 9.0, 2.6], model="gp"), measure
 

@@ -50,7 +50,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         size = config.batch or len(rows)
         for start in range(0, len(rows), size):
             refit = config.refit and start + size >= len(rows)
-            found = predictor.update(rows[start : start + size], refit=refit, **how)
+            found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
             told, skipped = told + len(found.rows), skipped + found.skipped
     seconds, out = watch.seconds, config.out or config.ckpt
     checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)

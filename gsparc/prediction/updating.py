@@ -23,6 +23,7 @@ from gsparc.models.updated import STORED, Changes, Level, Updated, map_level, st
 from gsparc.prediction.drift import ROWS, Alarm, Watch
 from gsparc.prediction.query import Queries, read_places
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
 WINDOW = 1_000  # later rows of a station that are kept
@@ -48,27 +49,17 @@ class Version(Stored):
 
 
 @dataclass(frozen=True)
-class LevelRows:
-    """Levels that were measured, as they came.
+class LevelRows(PowerRows):
+    """Levels of stored powers that were measured, as they came, at local places of the end that moves.
 
     Attributes:
-        places: (n, 3) of the end that moves, local [m].
-        level: (n,) [dB] of stored powers.
         station: (n,) int64.
-        side: (n,) int8, see `Measurements.censored`.
     """
 
-    places: np.ndarray
-    level: np.ndarray
     station: np.ndarray
-    side: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.level)
-
-    def __getitem__(self, chosen: slice) -> LevelRows:
-        """Return the rows `chosen`."""
-        return LevelRows(*(part[chosen] for part in vars(self).values()))
+        return len(self.station)
 
 
 @dataclass(frozen=True)
@@ -294,7 +285,7 @@ class UpdateMixin:
         stored = self._answer_unit(unit).stored(torch.from_numpy(powers)).numpy()
         row, station = np.nonzero(np.isfinite(powers) & (stored > 0))
         level = 10 * np.log10(stored[row, station])
-        return LevelRows(at[row], level, station, np.zeros(len(row), np.int8))
+        return LevelRows(at[row], level, np.zeros(len(row), np.int8), station)
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
@@ -310,7 +301,7 @@ class UpdateMixin:
             there = station_site(site, name) if isinstance(method, PerStation) else site
             query = Query.from_places(there, torch.from_numpy(rows.places[own]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
-            missed = rows.level[own] - level.mean.numpy() - shifts.get(name, 0.0)
+            missed = rows.decibels[own] - level.mean.numpy() - shifts.get(name, 0.0)
             # Of silence only a level is known that the power is below.
             tells = missed * -rows.side[own] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
             used = np.flatnonzero((rows.side[own] == 0) | tells)
@@ -318,7 +309,7 @@ class UpdateMixin:
             number[own[used]] = 0
         number[number == 0] = changes.next_number + np.arange((number == 0).sum())
         for name, (own, level) in said.items():
-            missed = torch.from_numpy(rows.level[own]) - level.mean - shifts.get(name, 0.0)
+            missed = torch.from_numpy(rows.decibels[own]) - level.mean - shifts.get(name, 0.0)
             result[name] = LaterRows(
                 torch.from_numpy(number[own]), torch.full((len(own),), changes.next_batch),
                 torch.from_numpy(rows.places[own]), level.mean, missed, level.doubt, level.noise,
@@ -345,7 +336,7 @@ def level_rows(data: Measurements, site: Site) -> LevelRows:
     side = data.censored_side(rows)
     station = data.stations_of(rows)
     level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
-    return LevelRows(data.moving[rows], level, station, side)
+    return LevelRows(data.moving[rows], level, side, station)
 
 
 def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.instantiate import from_settings, suggest_or_list
-from gsparc.data.limits import Checked, Limit, finite_array, or_null, setting
+from gsparc.data.errors import list_first, suggest_name
+from gsparc.data.instantiate import from_settings
+from gsparc.data.limits import MOST_NAMED, Checked, Limit, finite_array, or_null, setting
 from gsparc.data.walls import BOXES
 from gsparc.simulate.scenes.solid import Solid, box
 
@@ -64,8 +65,9 @@ def move_solids(solids: Sequence[Solid], moves: Sequence[Move]) -> tuple[list[So
             continue
         own = [k for k, one in enumerate(result) if one.name.startswith(move.name)]
         if not own:
-            there = suggest_or_list(move.name, [one.name for one in solids])
-            raise ValueError(f"moved: no object's name begins with {move.name!r}{there}")
+            names = [one.name for one in solids]
+            said = suggest_name(move.name, names) or f"; there are {list_first(names, MOST_NAMED)}"
+            raise ValueError(f"moved: no object's name begins with {move.name!r}{said}")
         for k in own:
             there, by = result[k].keep_out, np.array(move.by_m, float)
             keep_out = None if there is None else there + by
