@@ -29,7 +29,7 @@ from gsparc.models import checkpoint
 from gsparc.models.updated import map_level
 from gsparc.prediction.drift import Watch
 from gsparc.prediction.updating import versions_extra
-from gsparc.processes.changes import ERRORS, KINDS, LEAST, NEAR, TINY, LaterRows, correct, learn
+from gsparc.processes.changes import AWAY, ERRORS, KINDS, LEAST, NEAR, TINY, WHOLE, LaterRows, correct, learn
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.scenes.build import SceneSettings, build_survey
@@ -305,11 +305,15 @@ def world():
     return gsparc.fit(rx=before, rssi=measure(0, before), tx=[9.0, 9.0, 2.6], model="gp"), measure
 
 
-def solve(belief, rows, level, doubt, apart, among, middle):
+def matern(distance, length):
+    """Matern-3/2."""
+    return (1 + 3**0.5 * distance / length) * np.exp(-(3**0.5) * distance / length)
+
+
+def solve(belief, rows, level, doubt, apart, among, middle, seen):
     """Level [dB] at a place, at distances `apart` (n,) and `among` (n, n) [m]: one plain solve a kind."""
-    matern = lambda distance, length: (1 + 3**0.5 * distance / length) * np.exp(-(3**0.5) * distance / length)  # noqa: E731
     weight, added = (np.asarray(part) for part in belief.of(0))
-    kept, result = weight >= LEAST, 0.0
+    kept, result, near = weight >= LEAST, 0.0, matern(apart.min(), belief.extent * AWAY)
     for share, kind in zip(weight, KINDS, strict=True):
         if share < LEAST:
             continue
@@ -321,7 +325,8 @@ def solve(belief, rows, level, doubt, apart, among, middle):
         noise = added + (rows.noise + rows.faded).numpy() + TINY
         told = rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
         mean = own[0] @ np.linalg.solve(own[1] + np.diag(noise), told)
-        mean += kind.keeps * level + (1 - kind.keeps) * middle
+        away = 0.0 if kind.keeps else near + (1 - near) * seen
+        mean = (kind.keeps + away) * mean + (1 - away) * level + away * middle
         result += share / weight[kept].sum() * mean
     return result
 
@@ -344,6 +349,7 @@ def updates():
         rows, extent = model.versions[-1].changes.stations[0], model.versions[-1].changes.belief.extent
         said = correct(model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt).mean
         belief, apart = learn({0: rows}, extent), torch.cdist(query, rows.places).numpy()
+        seen = min(np.linalg.norm(np.ptp(rows.places.numpy(), axis=0)) / extent, 1.0) ** WHOLE
         for count in worst if number % (5 * EACH) == 5 * EACH - 1 else (NEAR,):
             for one, distance in enumerate(apart):
                 near = np.argsort(distance)[:count]
@@ -351,7 +357,7 @@ def updates():
                 among = torch.cdist(part.places, part.places).numpy()
                 fresh = solve(
                     belief, part, float(before.mean[one]), float(before.doubt[one]), distance[near], among,
-                    rows.middle.item(),
+                    rows.middle.item(), seen,
                 )  # fmt: skip
                 worst[count] = max(worst[count], abs(fresh - float(said[one])))
         memory = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20

@@ -38,6 +38,8 @@ ALIKE, COUNTS = (
     1.0,
     2,
 )  # prior variance of what all stations of a place miss alike [dB^2]; places it counts as
+WHOLE = 4  # power of the share of the place that rows lie in: whether a lone station was moved
+AWAY = 1 / 4  # length over which rows of a moved station tell against the map, as a share of the site
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
 TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
@@ -304,11 +306,11 @@ def correct(
     weight = weight[kept] / weight[kept].sum()
     noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kept]
     if len(rows) <= NEAR:
-        mean, left = _solve(belief, rows, noise, values, kept, places[None], doubt[None])
-        mean, left = mean[0], left[0]
+        mean, left, near = _solve(belief, rows, noise, values, kept, places[None], doubt[None])
+        mean, left, near = mean[0], left[0], near[0]
     else:
-        near = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
-        blocks = zip(near.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
+        nearest = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
+        blocks = zip(nearest.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
         parts = [
             _solve(
                 belief, rows[index], noise[index], values[:, index].movedim(0, 1), kept,
@@ -316,9 +318,12 @@ def correct(
             )
             for index, place, own in blocks
         ]  # fmt: skip
-        mean, left = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
-    keeps = KEEPS[kept, None]
-    mean = mean + belief.common + keeps * level + (1 - keeps) * rows.middle
+        mean, left, near = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
+    # Rows in a part of the place cannot tell what was moved elsewhere; of many stations their share does.
+    seen = float(torch.linalg.vector_norm(rows.places.amax(0) - rows.places.amin(0))) / belief.extent
+    seen = 1.0 if len(belief.names) > 1 else min(seen, 1.0) ** WHOLE
+    away = (1 - KEEPS[kept, None]) * (near + (1 - near) * seen)
+    mean = belief.common + level + (KEEPS[kept, None] + away) * mean + away * (rows.middle - level)
     middle = weight @ mean
     return MeanVariance(middle, weight @ (left + (mean - middle).square()))
 
@@ -326,8 +331,11 @@ def correct(
 def _solve(
     belief: Belief, rows: LaterRows, noise: Tensor, values: Tensor, kept: Tensor, places: Tensor,
     doubt: Tensor,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Means and variances (G, K', B) of groups of places (G, B, D) by rows (G or none, n)."""
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Means, variances and correlations with the nearest row (G, K', B).
+
+    Of groups of places (G, B, D) by rows (G or none, n).
+    """
     lengths = belief.extent, belief.scale, kept
     gram = _covariance(rows.places, rows.places, rows.doubt, rows.doubt, *lengths)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise.unsqueeze(-2))
@@ -336,7 +344,8 @@ def _solve(
     mean = (cross @ factor.solve(values[..., None]))[..., 0]
     prior = KEEPS[kept, None] * doubt[:, None] + (OFFSET.square() + LOCAL.square())[kept, None]
     told = factor.whiten(cross.mT.contiguous()).square().sum(-2)
-    return mean, (prior - told).clamp_min(0.0)
+    near = matern32(distances(places, rows.places), belief.extent * AWAY).amax(-1)
+    return mean, (prior - told).clamp_min(0.0), near[:, None].expand_as(mean)
 
 
 @torch.no_grad()
