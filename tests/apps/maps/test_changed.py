@@ -12,7 +12,8 @@ def test_a_screen_is_drawn_where_it_stands():
     predictor = gsparc.fit(rx=PLACES, rssi=levels(PLACES, 0), tx=[9.0, 9.0, 2.6], model="gp")
     before = predict_map(predictor, step_m=1.0, promise=None)
     assert add_changes(before, predictor) is before and not list(change_layers(before))
-    later = draw(120, 5)
+    later = draw(600, 5)
+    later = later[np.linalg.norm(later[:, :2] - CABINET, axis=1) < 1.5 * RADIUS][:100]
     predictor.update(rx=later, rssi=levels(later, 5, change=-12.0))
     field = add_changes(predict_map(predictor, step_m=1.0, promise=None), predictor)
     change, deviation = field.extra[CHANGE], field.extra[DEVIATION]
