@@ -1,6 +1,7 @@
 """Maps that are told of later rows, beside what else could be done: docs/results/changes.csv.
 
     python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors]
+                            [seconds] [updates] [kills]
 
 Room and network are simulated here; months of a library and rounds of a garage are looked for in
 ../shared/data/change. Errors are of places that nobody told of, rmse [dB].
@@ -8,6 +9,8 @@ Room and network are simulated here; months of a library and rounds of a garage 
 
 import csv
 import logging
+import os
+import signal
 import sys
 import tempfile
 import time
@@ -17,15 +20,25 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 import gsparc
+from gsparc.data.query import Query
+from gsparc.models import checkpoint
+from gsparc.models.updated import map_level
 from gsparc.prediction.drift import Watch
-from gsparc.processes.changes import LaterRows
+from gsparc.prediction.updating import versions_extra
+from gsparc.processes.changes import AWAY, ERRORS, KINDS, LEAST, NEAR, TINY, WHOLE, LaterRows, correct, learn
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.raytracer import Sampling
+from gsparc.simulate.scenes.build import SceneSettings, build_survey
 
 MEASURED = Path(__file__).parents[2] / "shared/data/change"
 OUT = Path(__file__).parents[1] / "docs/results/changes.csv"
 SIDE, STATIONS, KEPT = 40.0, 30, 80
 DRAWS, READINGS, BEGINS = 200, 1000, 300
+UPDATES, EACH, KILLS = 100_000, 1000, 20
 
 
 def field(places, seed, length=8.0):
@@ -53,6 +66,16 @@ def network(places, seed, later):
     level = -40 - 30 * np.log10(np.maximum(apart, 1)) + np.stack([field(places, s) for s in fields], 1)
     level += shift - 3 * later + np.random.default_rng(seed + 7 + later).normal(0, 2.5, level.shape)
     return np.where(level > -95, level, np.nan)
+
+
+def screened(places, stands=True):
+    """Levels (n,) of a room; where `stands` (n,), a screen of 12 dB is before a disc of 4 m."""
+    return -60 + field(places, 1, 4.0) - 12 * (stands & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
+
+
+def planned(places, town=1):
+    """What a planning tool knows of a town [dBm]."""
+    return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, town, 60.0)
 
 
 def rmse(predicted, truth):
@@ -92,38 +115,90 @@ def networks():
         yield from judge(f"office {seed}, as before", model, later, network(later, seed, False), (5, 20))
 
 
-def rooms():
-    """One transmitter, 300 rows; then a screen of 12 dB in a disc of 4 m, and rows in and around it."""
-    before, asked, near = draw(300, 0, 20.0), draw(3000, 11, 20.0), draw(4000, 6, 20.0)
-
-    def level(places, later=True):
-        disc = np.linalg.norm(places[:, :2] - 5, axis=1) < 4
-        return -60 + field(places, 1, 4.0) - 12 * (disc & later), disc
-
-    def measure(places, seed, later=True):
-        return level(places, later)[0] + np.random.default_rng(seed).normal(size=len(places))
+def disc():
+    """A smooth field, then a screen of 12 dB in a disc of 4 m; rows are in and around it."""
+    asked, near = draw(3000, 11, 20.0), draw(4000, 6, 20.0)
 
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6]
-    truth, disc = level(asked)
-    rows, heard, right = before, measure(before, 2, False), ~level(before)[1]
-    post = {"tx": [9.0, 9.0, 2.6], "model": "gp"}
-    model = gsparc.fit(rx=rows, rssi=heard, **post)
-    for count in (5, 10, 20, 50):
-        new, told = near[:count], measure(near, 3)[:count]
-        old, began = model.rssi(rx=asked)[:, 0], time.monotonic()
-        model.update(rx=new, rssi=told)
-        spent = round(time.monotonic() - began, 3)
-        ways = {"old map": old, "updated": model.rssi(rx=asked)[:, 0]}
-        sets = {"retrained on all": slice(None), "retrained on the right rows": right}
-        for way, kept in sets.items():
-            part = {"rx": np.r_[rows[kept], new], "rssi": np.r_[heard[kept], told]}
-            ways[way] = gsparc.fit(**part, **post).rssi(rx=asked)[:, 0]
-        ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=told, **post).rssi(rx=asked)[:, 0]
-        for way, said in ways.items():
-            for part, where in (("in the disc", disc), ("elsewhere", ~disc)):
-                figure = rmse(said[where], truth[where])
-                yield f"room, {part}", f"{count} rows", way, figure, spent if way == "updated" else ""
-        model.undo()
+    return "room", [9.0, 9.0, 2.6], draw(300, 0, 20.0), near, asked, screened
+
+
+def cabinet():
+    """A shoebox of 14 x 10 m, simulated, whose cabinet is moved; rows are where that changes 3 dB."""
+    post, moves = [2.0, 5.0, 2.6], [{"name": "box0", "by_m": [0.0, 4.0, 0.0]}]
+    room = {"size_m": [14.0, 10.0, 3.0], "boxes_m": [[[8.0, 2.0, 0.0], [9.0, 4.0, 2.5]]], "reflection": -0.5}
+    facts = {"name": "cabinet", "carrier_hz": 2.44e9, "bandwidth_hz": 0.0, "subcarriers": 1, "room": room}
+    facts |= {"transmitter_m": post, "area_m": [[0.3, 0.3], [13.7, 9.7]]}
+    before, asked, near = (
+        build_survey(SceneSettings(num_receivers=count, seed=seed, moved=moved, **facts), Sampling())
+        for count, seed, moved in ((300, 0, []), (3000, 11, moves), (1000, 6, moves))
+    )
+
+    def level(places, later=True):
+        paths = (asked if later else before).engine.trace(places, Effects())
+        return 10 * np.log10(paths.received_power())
+
+    changed = np.abs(level(near.places) - level(near.places, False)) > 3
+    apart = cKDTree(near.places[changed]).query(near.places)[0]
+    return "cabinet", post, before.places, near.places[apart < 0.5], asked.places, level
+
+
+def space_time(before, heard, new, told, asked):
+    """Levels at places later by scikit-learn's process of space and time, 0 before and 1 later."""
+    places, level = (
+        np.r_[np.c_[before[:, :2], 0 * heard], np.c_[new[:, :2], 0 * told + 1]],
+        np.r_[heard, told],
+    )
+    kernel = ConstantKernel(20.0) * Matern([3.0, 3.0, 3.0], (0.1, 100.0), nu=1.5) + WhiteKernel(1.0)
+    process = GaussianProcessRegressor(kernel, normalize_y=True).fit(places, level)
+    return process.predict(np.c_[asked[:, :2], np.ones(len(asked))])
+
+
+def rooms():
+    """One transmitter, 300 rows with 1 dB of noise; then something is moved, and rows in and around tell."""
+    for name, post, before, near, asked, level in (disc(), cabinet()):
+        heard = level(before, False) + np.random.default_rng(2).normal(size=len(before))
+        told = level(near) + np.random.default_rng(3).normal(size=len(near))
+        truth, changed, right = (
+            level(asked), *(np.abs(level(at) - level(at, False)) > 3 for at in (asked, before))
+        )  # fmt: skip
+        fixed = {"tx": post, "model": "gp"}
+        model = gsparc.fit(rx=before, rssi=heard, **fixed)
+        for count in (5, 10, 20, 50):
+            new, levels, ways = near[:count], told[:count], {"old map": model.rssi(rx=asked)[:, 0]}
+            for way, refit in (("updated", False), ("updated, refit=true", True)):
+                began = time.process_time()
+                model.update(rx=new, rssi=levels, refit=refit)
+                seconds = round(time.process_time() - began, 3)
+                ways[way] = model.rssi(rx=asked)[:, 0], seconds
+                model.undo()
+            sets = {"all": slice(None), "the right rows": ~right, "a window of 300": slice(count, None)}
+            for way, kept in sets.items():
+                part = {"rx": np.r_[before[kept], new], "rssi": np.r_[heard[kept], levels]}
+                ways[f"retrained on {way}"] = gsparc.fit(**part, **fixed).rssi(rx=asked)[:, 0]
+            ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=levels, **fixed).rssi(rx=asked)[:, 0]
+            ways["space and time"] = space_time(before, heard, new, levels, asked)
+            for way, said in ways.items():
+                answer, seconds = said if isinstance(said, tuple) else (said, "")
+                for part, where in (("where it changed", changed), ("elsewhere", ~changed)):
+                    yield f"{name}, {part}", f"{count} rows", way, rmse(answer[where], truth[where]), seconds
+
+
+def seconds():
+    """One row, and 50, told to a model of 5,000 rows with 5,000 kept: the least of ten each."""
+    before, new = draw(5000, 0, 20.0), draw(6000, 6, 20.0)
+    level, later = (
+        -60 + field(at, 1, 4.0) + np.random.default_rng(2).normal(size=len(at)) for at in (before, new)
+    )
+    model = gsparc.fit(rx=before, rssi=level, tx=[9.0, 9.0, 2.6], model="gp")
+    model.update(rx=new[:5000], rssi=later[:5000], window=5000)
+    for count in (1, 50):
+        spent = []
+        for turn in range(10):
+            rows, began = slice(5000 + count * turn, 5000 + count * (turn + 1)), time.process_time()
+            model.update(rx=new[rows], rssi=later[rows], window=5000)
+            spent.append(1e3 * (time.process_time() - began))
+        yield "an update, 5,000 rows kept", f"{count} rows", "least of ten [ms]", round(min(spent), 1), ""
 
 
 def readings(kind, seed, count):
@@ -186,9 +261,6 @@ def priors():
     axis = np.arange(5.0, 700, 10)
     squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
 
-    def planned(places, town):
-        return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, town, 60.0)
-
     for count in (5, 10, 20, 50, 100):
         errors, spent = [], 0.0
         for town in range(1, 7):
@@ -220,8 +292,149 @@ def priors():
             yield f"six towns, {name}", f"{count} rows", "most of no map's", round(max(ratio), 3), ""
 
 
+def world():
+    """A model of 300 rows of a room, and what later rows (n,) measure at places, by number.
+
+    The screen of `rooms` comes, or goes, after every 10,000 of them.
+    """
+    before, noise = draw(300, 0, 20.0), np.random.default_rng(2)
+
+    def measure(number, places):
+        return screened(places, np.asarray(number) // 10_000 % 2 == 1) + noise.normal(size=len(places))
+
+    return gsparc.fit(rx=before, rssi=measure(0, before), tx=[9.0, 9.0, 2.6], model="gp"), measure
+
+
+def matern(distance, length):
+    """Matern-3/2."""
+    return (1 + 3**0.5 * distance / length) * np.exp(-(3**0.5) * distance / length)
+
+
+def solve(belief, rows, level, doubt, apart, among, middle, seen):
+    """Level [dB] at a place, at distances `apart` (n,) and `among` (n, n) [m]: one plain solve a kind."""
+    weight, added = (np.asarray(part) for part in belief.of(0))
+    kept, result, near = weight >= LEAST, 0.0, matern(apart.min(), belief.extent * AWAY)
+    for share, kind in zip(weight, KINDS, strict=True):
+        if share < LEAST:
+            continue
+        own = [
+            kind.keeps * np.sqrt(variance * rows.doubt.numpy()) * matern(distance, belief.extent * ERRORS)
+            + kind.offset**2 + kind.local**2 * matern(distance, belief.extent * kind.size)
+            for variance, distance in ((doubt, apart), (rows.doubt.numpy()[:, None], among))
+        ]  # fmt: skip
+        noise = added + (rows.noise + rows.faded).numpy() + TINY
+        told = rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
+        mean = own[0] @ np.linalg.solve(own[1] + np.diag(noise), told)
+        away = 0.0 if kind.keeps else near + (1 - near) * seen
+        mean = (kind.keeps + away) * mean + (1 - away) * level + away * middle
+        result += share / weight[kept].sum() * mean
+    return result
+
+
+def updates():
+    """A row at a time, many of them: differences to fresh solves, memory and seconds."""
+    model, measure = world()
+    places, asked = draw(UPDATES, 6, 20.0), torch.from_numpy(draw(20, 11, 20.0))
+    levels, query = measure(np.arange(UPDATES), places), asked - torch.from_numpy(model.site.origin)
+    before = map_level(
+        model.method, model.predict_query(Query.from_places(model.site, query.float())), model.site
+    )
+    worst, few, seconds, alarms, began = {NEAR: 0.0, 1000: 0.0}, [], [], 0, 0.0
+    for number in range(UPDATES):
+        began = time.process_time()
+        alarms += len(model.update(rx=places[[number]], rssi=levels[[number]]).alarms)
+        seconds.append(time.process_time() - began)
+        if number % EACH != EACH - 1:
+            continue
+        rows, extent = model.versions[-1].changes.stations[0], model.versions[-1].changes.belief.extent
+        said = correct(model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt).mean
+        belief, apart = learn({0: rows}, extent), torch.cdist(query, rows.places).numpy()
+        seen = min(np.linalg.norm(np.ptp(rows.places.numpy(), axis=0)) / extent, 1.0) ** WHOLE
+        for count in worst if number % (5 * EACH) == 5 * EACH - 1 else (NEAR,):
+            for one, distance in enumerate(apart):
+                near = np.argsort(distance)[:count]
+                part = rows[torch.from_numpy(near)]
+                among = torch.cdist(part.places, part.places).numpy()
+                fresh = solve(
+                    belief, part, float(before.mean[one]), float(before.doubt[one]), distance[near], among,
+                    rows.middle.item(), seen,
+                )  # fmt: skip
+                worst[count] = max(worst[count], abs(fresh - float(said[one])))
+        memory = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        few.append(memory)
+    name, told = "a row at a time, 1,000 kept", f"{UPDATES} updates"
+    figures = {
+        "from a fresh solve of the 64 nearest rows, at most [dB]": worst[NEAR],
+        "from a fresh solve of all rows kept, at most [dB]": worst[1000],
+        "memory after 1,000 updates [MiB]": few[0], "memory at the end [MiB]": few[-1],
+        "alarms, of 9 changes": alarms, "an update, median [ms]": 1e3 * np.median(seconds),
+        "of the last 1,000, median [ms]": 1e3 * np.median(seconds[-EACH:]),
+    }  # fmt: skip
+    for way, figure in figures.items():
+        yield name, told, way, float(f"{figure:.3g}"), round(sum(seconds)) if way.startswith("an") else ""
+    states = []
+    for turn in range(10):
+        states.append(model.predict(rx=asked.numpy()))
+        model.update(rx=places[[turn]], rssi=levels[[turn]])
+    same = 0
+    for state in states[::-1]:
+        model.undo()
+        now = model.predict(rx=asked.numpy())
+        same += bool((now.mean == state.mean).all() and (now.variance == state.variance).all())
+    yield name, "10 updates, then 10 undos", "bit-identical", same, ""
+
+
+def kills():
+    """A process that updates a file, killed at random moments: the file holds the state before, or after."""
+    model, measure = world()
+    places, asked, rng = draw(2000, 6, 20.0), draw(20, 11, 20.0), np.random.default_rng(0)
+    levels, whole, lost, writes = measure(np.arange(2000), places), 0, 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        file, known = Path(folder) / "model.ckpt", [model.rssi(rx=asked)]
+        checkpoint.save(file, model.method)
+        for _ in range(KILLS):
+            begins, (heard, says) = len(gsparc.load(file).rows), os.pipe()
+            if (child := os.fork()) == 0:
+                mine = gsparc.load(file)
+                for number in range(begins, len(places)):
+                    mine.update(rx=places[[number]], rssi=levels[[number]], window=len(places))
+                    checkpoint.update_extra(file, versions_extra(mine.versions), file)
+                    os.write(says, b".")
+                os._exit(1)
+            time.sleep(rng.uniform(0.2, 1.2))
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            os.close(says)
+            done, after = begins + len(os.read(heard, 2**16)), gsparc.load(file)
+            os.close(heard)
+            for number in range(len(known) - 1, len(after.rows)):
+                model.update(rx=places[[number]], rssi=levels[[number]], window=len(places))
+                known.append(model.rssi(rx=asked))
+            writes, lost = len(after.rows), lost + (len(after.rows) < done)
+            whole += (
+                len(after.rows) in (done, done + 1) and (after.rssi(rx=asked) == known[len(after.rows)]).all()
+            )
+        left = len(list(Path(folder).iterdir())) - 1
+    yield (
+        "killed at random",
+        f"{KILLS} kills, {writes} writes",
+        "the state before, or after, bit for bit",
+        int(whole),
+        "",
+    )
+    yield (
+        "killed at random",
+        f"{KILLS} kills, {writes} writes",
+        "updates lost that were said to be stored",
+        lost,
+        "",
+    )
+    yield "killed at random", f"{KILLS} kills, {writes} writes", "partial files left", left, ""
+
+
 PARTS = {
     "networks": networks, "rooms": rooms, "detections": detections, "priors": priors,
+    "seconds": seconds, "updates": updates, "kills": kills,
     "months": lambda: measured("library-months.npz", "month"),
     "rounds": lambda: measured("garage-rounds.npz", "round"),
 }  # fmt: skip

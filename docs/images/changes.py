@@ -16,7 +16,7 @@ import gsparc
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "bench"))
 
-from changes import draw, field  # noqa: E402
+from changes import draw, field, planned, screened  # noqa: E402
 
 OUT = Path(__file__).parent / "changes.png"
 POST, SIDE, TOWN = [9.0, 9.0, 2.6], 20.0, 600.0
@@ -28,22 +28,15 @@ def grid(low, high, count=61):
     return np.c_[np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2), np.full(count**2, 1.5)]
 
 
-def room_level(places, later):
-    """Levels [dBm] of a room; later a screen of 12 dB stands before a disc of 4 m."""
-    return -60 + field(places, 1, 4.0) - 12 * (later & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
-
-
 def room():
     """Titles, maps (n,) and rows of the first line of panels."""
     noise = np.random.default_rng(2)
     before, near, asked = draw(300, 0, SIDE), draw(4000, 6, SIDE), grid(0, SIDE)
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6][:50]
-    model = gsparc.fit(
-        rx=before, rssi=room_level(before, False) + noise.normal(size=300), tx=POST, model="gp"
-    )
-    yield "true later: a screen in a disc", room_level(asked, True), None, None
+    model = gsparc.fit(rx=before, rssi=screened(before, False) + noise.normal(size=300), tx=POST, model="gp")
+    yield "true later: a screen in a disc", screened(asked), None, None
     yield "the map before", model.rssi(rx=asked)[:, 0], None, None
-    told = room_level(near, True) + noise.normal(size=50)
+    told = screened(near, True) + noise.normal(size=50)
     for count in (10, 50):
         found = model.update(rx=near[:count], rssi=told[:count])
         alarm = found.alarms[0] if found.alarms else None
@@ -51,11 +44,6 @@ def room():
         place = None if alarm is None else np.add(alarm.place, model.site.origin[:2])
         yield f"after {count} rows{said}", model.rssi(rx=asked)[:, 0], near[:count], place
         model.undo()
-
-
-def planned(places, town=1):
-    """What a planning tool knows of a town [dBm]."""
-    return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, town, 60.0)
 
 
 def town():

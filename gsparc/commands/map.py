@@ -7,13 +7,14 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from gsparc.apps.maps.changed import add_changes, change_layers
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.kmz import write_kmz
 from gsparc.apps.maps.making import predict_map
-from gsparc.apps.maps.pictures import draw_layer, file_name, list_layers
+from gsparc.apps.maps.pictures import Layer, draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
 from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.data.errors import DataError
@@ -39,6 +40,10 @@ def stations_of(setting: Any) -> list[str | int] | None:
     return setting
 
 
+def _layers(field: FieldMap) -> list[Layer]:
+    return [*list_layers(field), *change_layers(field)]
+
+
 def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
     """Patterns of the files that layers are drawn to.
 
@@ -46,7 +51,7 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
         DataError: `save` that no layer's file matches.
     """
     save = [] if config.save is None else [str(config.save)]
-    names = [file_name(layer, suffix) for layer in list_layers(field) for suffix in SUFFIXES]
+    names = [file_name(layer, suffix) for layer in _layers(field) for suffix in SUFFIXES]
     if save and not any(fnmatch(name, save[0]) for name in names):
         said = ", ".join(name for name in names if name.endswith(".pdf"))
         raise DataError(f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {said}")
@@ -68,17 +73,17 @@ def task(config: DictConfig) -> dict[str, Any]:
         "buildings": config.buildings, "indoor_db": settings["indoor_db"],
     }  # fmt: skip
     # Refuses what cannot be before any evidence is gathered.
-    first = predict_map(predictor, dry=True, **query)
+    first = add_changes(predict_map(predictor, dry=True, **query), predictor)
     wanted = _pictures(config, first)
     # Refused before evidence is gathered, which takes minutes.
     tiff = check_geotiff(config.geotiff)
     promise = read_or_gather(str(config.ckpt), settings)
-    field = predict_map(predictor, promise=promise, **query)
+    field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)
     lines = map_notes(field, coverage, ends)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
-    every = list(list_layers(field))
+    every = _layers(field)
     of_one = {f"power {station}" for station in field.stations}
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")

@@ -37,8 +37,9 @@ def campaign(config: DictConfig) -> CampaignSettings:
         ValueError: a setting that does not exist or cannot be.
     """
     settings = to_dict(config)
+    scene = scene_from_config({**settings["scene"], "moved": settings["moved"]})
     return CampaignSettings(
-        scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
+        scene, _effects(settings["effects"]), Sampling(**settings["sampling"]),
         from_settings(SpectrumSettings, settings["spectrum"], "spectrum"),
         from_settings(ArraySettings, settings["csi"], "csi"),
         **{name: settings[name] for name in ("shard", "check", "measurement")},

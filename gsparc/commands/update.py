@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
-from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
+from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, switch, whole
 from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 LIMITS = {
     "window": whole(1), "fade_db": number(0), "undo": whole(0), "false_alarm": POSITIVE,
-    "batch": or_null(whole(1)),
+    "batch": or_null(whole(1)), "refit": switch(),
 }  # fmt: skip
 COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")
 
@@ -47,8 +47,10 @@ def task(config: DictConfig) -> dict[str, Any]:
             raise DataError(f"{config.data}: has no places; later rows need them")
         how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
         rows = level_rows(data, predictor.site)
-        for start in range(0, len(rows), config.batch or len(rows)):
-            found = predictor.update(rows[start : start + (config.batch or len(rows))], **how)
+        size = config.batch or len(rows)
+        for start in range(0, len(rows), size):
+            refit = config.refit and start + size >= len(rows)
+            found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
             told, skipped = told + len(found.rows), skipped + found.skipped
     seconds, out = watch.seconds, config.out or config.ckpt
     checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
@@ -65,6 +67,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     said = f"{told} rows, {skipped} skipped, as they tell nothing, {len(table) - known} alarms"
     said = f"{config.undo} versions back" if config.undo else said
+    said += f", {seconds:.2g} s"
     before = f"update: {said}; model in {out}; summary "
     return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from gsparc.models.method import HasProcess, Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import linear_moments
+from gsparc.processes.averages import MeanVariance
 from gsparc.processes.changes import TINY, Belief, LaterRows, correct
 from gsparc.processes.stored import Stored, from_plain
 
@@ -100,11 +101,28 @@ class Updated(View):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        said, site = self.inner.predict(query), self.fitted_site
-        before = map_level(self.inner, said, site)
+        said = self.inner.predict(query)
+        before = map_level(self.inner, said, self.fitted_site)
+        now = self._level_now(query, before)
+        unknown = None
+        if said.unknown is not None:
+            share = (now.doubt + before.noise) / (before.doubt + before.noise + TINY)
+            unknown = (said.unknown * share).clamp(0, 1).to(said.unknown.dtype)
+        power, variance = linear_moments(now.mean, now.doubt + before.noise)
+        kind = said.mean.dtype
+        return Prediction(power.to(kind), variance.to(kind), unknown)
+
+    def change(self, query: Query) -> MeanVariance:
+        """Return what changed since the map was learned: mean (B,) [dB] and variance (B,) [dB^2]."""
+        before = map_level(self.inner, self.inner.predict(query), self.fitted_site)
+        # Of a map that is taken for true only a change is not known.
+        now = self._level_now(query, replace(before, doubt=0 * before.doubt))
+        return MeanVariance(now.mean - before.mean, now.doubt)
+
+    def _level_now(self, query: Query, before: Level) -> Level:
         mean, doubt = before.mean.clone(), before.doubt.clone()
-        rows, places, shifts = self.changes.stations, query.places(site), dict(self.changes.shifts)
-        number = query.station
+        rows, shifts = self.changes.stations, dict(self.changes.shifts)
+        places, number = query.places(self.fitted_site), query.station
         if self.own is not None or number is None:
             number = torch.full((len(query),), self.own or 0)
         for station in number.unique().tolist():
@@ -114,13 +132,7 @@ class Updated(View):
                     self.changes.belief, station, later, places[at], mean[at], doubt[at]
                 )
             mean[at] += shifts.get(station, 0.0)
-        unknown = None
-        if said.unknown is not None:
-            share = (doubt + before.noise) / (before.doubt + before.noise + TINY)
-            unknown = (said.unknown * share).clamp(0, 1).to(said.unknown.dtype)
-        power, variance = linear_moments(mean, doubt + before.noise)
-        kind = said.mean.dtype
-        return Prediction(power.to(kind), variance.to(kind), unknown)
+        return Level(mean, doubt, before.noise)
 
     def state(self) -> dict[str, Any]:  # type: ignore[override]
         """Return that of the map: later rows are stored beside it."""

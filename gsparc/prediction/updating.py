@@ -19,14 +19,16 @@ from gsparc.data.units import PowerUnit
 from gsparc.models.device_offsets import without_devices
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
-from gsparc.models.updated import STORED, Changes, Level, map_level, stored_changes, with_changes
+from gsparc.models.updated import STORED, Changes, Level, Updated, map_level, stored_changes, with_changes
 from gsparc.prediction.drift import ROWS, Alarm, Watch
-from gsparc.prediction.query import read_places
-from gsparc.processes.changes import Belief, LaterRows, learn
+from gsparc.prediction.query import Queries, read_places
+from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
 WINDOW = 1_000  # later rows of a station that are kept
 FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before
+JOURNAL = 1_000  # lines that a version keeps
 VERSIONS = 11  # that are kept, the one that answers among them
 LOUD = 2.0  # deviations that a map must be above a level for silence to contradict it
 
@@ -38,7 +40,7 @@ class Version(Stored):
     Attributes:
         changes: rows, and what they say together.
         watch: state of the sequential test.
-        journal: a line for each thing that was done, the last one last.
+        journal: a line for each thing that was done, the last ones, in their order.
     """
 
     changes: Changes
@@ -47,27 +49,17 @@ class Version(Stored):
 
 
 @dataclass(frozen=True)
-class LevelRows:
-    """Levels that were measured, as they came.
+class LevelRows(PowerRows):
+    """Levels of stored powers that were measured, as they came, at local places of the end that moves.
 
     Attributes:
-        places: (n, 3) of the end that moves, local [m].
-        level: (n,) [dB] of stored powers.
         station: (n,) int64.
-        side: (n,) int8, see `Measurements.censored`.
     """
 
-    places: np.ndarray
-    level: np.ndarray
     station: np.ndarray
-    side: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.level)
-
-    def __getitem__(self, chosen: slice) -> LevelRows:
-        """Return the rows `chosen`."""
-        return LevelRows(*(part[chosen] for part in vars(self).values()))
+        return len(self.station)
 
 
 @dataclass(frozen=True)
@@ -92,6 +84,7 @@ class UpdateMixin:
 
     site: Site
     method: Method
+    queries: Queries
     versions: tuple[Version, ...]
     _whole: Method
     _prepared: list[Method]
@@ -105,7 +98,7 @@ class UpdateMixin:
     def update(
         self, rows: Measurements | LevelRows | None = None, *, tx: Any = None, rx: Any = None,
         rssi: Any = None, unit: str | None = None, window: int = WINDOW, fade_db: float = FADE_DB,
-        false_alarm: float = ROWS,
+        false_alarm: float = ROWS, refit: bool = False,
     ) -> Found:  # fmt: skip
         """Condition on rows that came later, and tell what changed.
 
@@ -127,6 +120,7 @@ class UpdateMixin:
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
             fade_db: deviation that a hundred later rows of a station add to one that came before [dB].
             false_alarm: readings to a false alarm without any change, at least, in the mean.
+            refit: fit the length over which changes vary to the rows kept, too; tenths of a second.
 
         Raises:
             ValueError: no powers, both ends move, or arrays that do not go together.
@@ -139,19 +133,24 @@ class UpdateMixin:
         if window < 1:
             raise ValueError(f"update: window={window}: at least one row of a station is kept")
         version, first = self._current, self._current.changes.next_number
-        changes, stations, extent = version.changes, version.changes.stations, version.changes.belief.extent
+        changes, belief, stations = version.changes, version.changes.belief, version.changes.stations
+        extent = belief.extent
         new = self._read_rows(rows, changes)
         for name, later in new.items():
             before = stations.get(name, later[:0])
             stations[name] = before.fade(later, extent, fade_db).join(later)[-window:]
         # The test believes what earlier rows said of a station's noise.
-        belief = version.changes.belief
         noisy = {name: replace(one, noise=one.noise + belief.of(name)[1]) for name, one in stations.items()}
         watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
         alarms, skipped = watch.alarms[len(version.watch.alarms) :], len(rows) - len(numbers)
         said = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
-        changes = replace(changes, next_number=first + len(numbers), next_batch=changes.next_batch + 1)
+        if refit:
+            belief = replace(belief, scale=refit_scale(stations, belief))
+            said += f", lengths of changes at {belief.scale:.2g} of the usual"
+        changes = replace(
+            changes, belief=belief, next_number=first + len(numbers), next_batch=changes.next_batch + 1
+        )
         self._add_version(stations, said, changes, watch)
         return Found(numbers, deviations, alarms, skipped)
 
@@ -192,6 +191,20 @@ class UpdateMixin:
             raise ValueError(f"undo: {count} back, {max(len(self.versions) - 1, 0)} are kept")
         self._become(self.versions[:-count])
 
+    def change(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return how many decibels a station's level changed since the fit, and the deviation (B,) of that.
+
+        >>> found = predictor.update(rx=[[2.0, 1.0, 1.5]] * 4, rssi=[-90.0] * 4)
+        >>> change, deviation = predictor.change(rx=[[2.0, 1.0, 1.5]])
+        >>> bool(change < 0), predictor.undo()
+        (True, None)
+        """
+        query = self.queries.query(tx, rx).query
+        if not isinstance(self.method, Updated):
+            return np.zeros(len(query)), np.zeros(len(query))
+        mean, variance = self.method.change(query)
+        return mean.numpy(), variance.sqrt().numpy()
+
     @property
     def rows(self) -> np.ndarray:
         """Numbers (n,) of the later rows that are kept, in the order they came."""
@@ -224,7 +237,7 @@ class UpdateMixin:
 
     @property
     def journal(self) -> tuple[str, ...]:
-        """A line for each thing that was done since the fit."""
+        """A line for each thing that was done since the fit, of the last `JOURNAL`."""
         return self._current.journal
 
     # -- versions --------------------------------------------------------------------------------------
@@ -242,11 +255,10 @@ class UpdateMixin:
     ) -> None:  # fmt: skip
         """Learn from stations' rows together, and answer by it."""
         now = self._current
-        changes = replace(
-            changes or now.changes, rows=tuple(sorted(stations.items())),
-            belief=learn(stations, now.changes.belief.extent),
-        )  # fmt: skip
-        version = Version(changes, watch or now.watch, (*now.journal, said))
+        changes = changes or now.changes
+        belief = learn(stations, changes.belief.extent, changes.belief.scale)
+        changes = replace(changes, rows=tuple(sorted(stations.items())), belief=belief)
+        version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:])
         self._become((*(self.versions or (now,)), version)[-VERSIONS:])
 
     def _become(self, versions: tuple[Version, ...]) -> None:
@@ -273,7 +285,7 @@ class UpdateMixin:
         stored = self._answer_unit(unit).stored(torch.from_numpy(powers)).numpy()
         row, station = np.nonzero(np.isfinite(powers) & (stored > 0))
         level = 10 * np.log10(stored[row, station])
-        return LevelRows(at[row], level, station, np.zeros(len(row), np.int8))
+        return LevelRows(at[row], level, np.zeros(len(row), np.int8), station)
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
@@ -289,7 +301,7 @@ class UpdateMixin:
             there = station_site(site, name) if isinstance(method, PerStation) else site
             query = Query.from_places(there, torch.from_numpy(rows.places[own]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
-            missed = rows.level[own] - level.mean.numpy() - shifts.get(name, 0.0)
+            missed = rows.decibels[own] - level.mean.numpy() - shifts.get(name, 0.0)
             # Of silence only a level is known that the power is below.
             tells = missed * -rows.side[own] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
             used = np.flatnonzero((rows.side[own] == 0) | tells)
@@ -297,7 +309,7 @@ class UpdateMixin:
             number[own[used]] = 0
         number[number == 0] = changes.next_number + np.arange((number == 0).sum())
         for name, (own, level) in said.items():
-            missed = torch.from_numpy(rows.level[own]) - level.mean - shifts.get(name, 0.0)
+            missed = torch.from_numpy(rows.decibels[own]) - level.mean - shifts.get(name, 0.0)
             result[name] = LaterRows(
                 torch.from_numpy(number[own]), torch.full((len(own),), changes.next_batch),
                 torch.from_numpy(rows.places[own]), level.mean, missed, level.doubt, level.noise,
@@ -324,7 +336,7 @@ def level_rows(data: Measurements, site: Site) -> LevelRows:
     side = data.censored_side(rows)
     station = data.stations_of(rows)
     level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
-    return LevelRows(data.moving[rows], level, station, side)
+    return LevelRows(data.moving[rows], level, side, station)
 
 
 def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:

@@ -38,8 +38,12 @@ ALIKE, COUNTS = (
     1.0,
     2,
 )  # prior variance of what all stations of a place miss alike [dB^2]; places it counts as
+WHOLE = 4  # power of the share of the place that rows lie in: whether a lone station was moved
+AWAY = 1 / 4  # length over which rows of a moved station tell against the map, as a share of the site
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
 TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
+REFITTED = 200  # latest rows of a station that tell the lengths of changes
+STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0  # of a scale that are tried; deviations of an octave
 HUNDRED = 100.0  # later rows that a fading is stated for
 TINY = 1e-6  # [dB^2]
 
@@ -87,6 +91,7 @@ class Belief(Stored):
         share: (K,) of stations by kind of change.
         weight: (T, K) of each kind, by station.
         names: (T,) numbers of these stations.
+        scale: of the lengths of local changes.
     """
 
     extent: float
@@ -95,6 +100,7 @@ class Belief(Stored):
     share: Tensor = SHARE
     weight: Tensor = SHARE[None, :0]
     names: tuple[int, ...] = ()
+    scale: float = 1.0
 
     def of(self, station: int) -> tuple[Tensor, Tensor]:
         """Return weights (K,) of the kinds of a station, and its noise on top [dB^2]."""
@@ -173,13 +179,15 @@ class LaterRows(Stored):
 
 
 def _covariance(
-    a: Tensor, b: Tensor, doubt_a: Tensor, doubt_b: Tensor, extent: float, kinds: Tensor | slice = slice(None)
-) -> Tensor:
+    a: Tensor, b: Tensor, doubt_a: Tensor, doubt_b: Tensor, extent: float, scale: float = 1.0,
+    kinds: Tensor | slice = slice(None),
+) -> Tensor:  # fmt: skip
     """Covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D), by kind."""
     apart = distances(a, b)[..., None, :, :]
     doubt = (doubt_a[..., :, None] * doubt_b[..., None, :]).sqrt()[..., None, :, :]
     own = doubt * matern32(apart, extent * ERRORS)
-    each = (part[kinds, None, None] for part in (OFFSET.square(), LOCAL.square(), SIZE * extent, KEEPS))
+    sizes = SIZE * extent * torch.where(KEEPS > 0, scale, 1.0)
+    each = (part[kinds, None, None] for part in (OFFSET.square(), LOCAL.square(), sizes, KEEPS))
     offset, local, length, keeps = each
     return keeps * own + offset + local * matern32(apart, length)
 
@@ -189,9 +197,17 @@ def _values(rows: LaterRows, common: float) -> Tensor:
     return rows.missed + (1 - KEEPS)[:, None] * (rows.level - rows.middle) - common
 
 
-def evidence(stations: Sequence[LaterRows], extent: float, common: float) -> Tensor:
-    """Return log densities (T, len(NOISES), K) of the latest rows of each station [nats]."""
-    every = [rows[-LOOKED:] for rows in stations]
+def evidence(
+    stations: Sequence[LaterRows], extent: float, common: float, scale: float = 1.0, looked: int = LOOKED
+) -> Tensor:
+    """Return log densities (T, len(NOISES), K) of the `looked` latest rows of each station [nats].
+
+    Args:
+        stations: rows of each.
+        extent, common, scale: see `Belief`.
+        looked: rows of a station, at most.
+    """
+    every = [rows[-looked:] for rows in stations]
     most = max(len(rows) for rows in every)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
     missed = torch.stack([_padded(_values(rows, common).T, most) for rows in every]).mT
@@ -200,7 +216,7 @@ def evidence(stations: Sequence[LaterRows], extent: float, common: float) -> Ten
     noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in every])[:, None]
     faded = torch.stack([_padded(rows.faded, most) for rows in every])[:, None]
     noise = NOISES[:, None] + noise + faded + TINY
-    gram = _covariance(places, places, doubt, doubt, extent)[:, None].repeat(1, len(NOISES), 1, 1, 1)
+    gram = _covariance(places, places, doubt, doubt, extent, scale)[:, None].repeat(1, len(NOISES), 1, 1, 1)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise[:, :, None])
     factor = Factor.from_gram(gram, "raise")
     white = factor.whiten(missed[:, None, ..., None].expand(-1, len(NOISES), -1, -1, -1))
@@ -212,13 +228,18 @@ def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
     return torch.cat([values, values.new_full((length - len(values), *values.shape[1:]), filling)])
 
 
-def learn(stations: Mapping[int, LaterRows], extent: float) -> Belief:
-    """Return what the stations' rows say together: the common offset, the noise, and kinds of change."""
+def learn(stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0) -> Belief:
+    """Return what the stations' rows say together: the common offset, the noise, and kinds of change.
+
+    Args:
+        stations: rows of each.
+        extent, scale: see `Belief`.
+    """
     names = tuple(sorted(name for name, rows in stations.items() if len(rows)))
     if not names:
-        return Belief(extent)
+        return Belief(extent, scale=scale)
     common = _common_offset([stations[name] for name in names])
-    log_density = evidence([stations[name] for name in names], extent, common)
+    log_density = evidence([stations[name] for name in names], extent, common, scale)
     share, noisy = SHARE, NOISY
     for _ in range(SETTLED):
         weight = (noisy.log()[:, None] + share.log() + log_density).flatten(1).softmax(1)
@@ -226,7 +247,21 @@ def learn(stations: Mapping[int, LaterRows], extent: float) -> Belief:
         share = (weight.sum((0, 1)) + STRENGTH * SHARE) / (len(names) + STRENGTH)
         noisy = (weight.sum((0, 2)) + STRENGTH * NOISY) / (len(names) + STRENGTH)
     noise = weight.sum(2) @ NOISES
-    return Belief(extent, common, noise, share, weight.sum(1), names)
+    return Belief(extent, common, noise, share, weight.sum(1), names, scale)
+
+
+def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
+    """Return the scale of local changes, among halves and doubles of what it was, that makes rows likeliest.
+
+    1 is likeliest before any row, and one an octave off `OCTAVES` deviations away.
+    """
+    told, tried = [rows for rows in stations.values() if len(rows)], [belief.scale * step for step in STEPS]
+    if not told:
+        return belief.scale
+    common, before = _common_offset(told), NOISY.log()[:, None] + SHARE.log()
+    density = [evidence(told, belief.extent, common, scale, REFITTED) + before for scale in tried]
+    likely = torch.stack(density).flatten(2).logsumexp(2).sum(1)
+    return tried[int((likely - (OCTAVES * torch.tensor(tried).log2()).square() / 2).argmax())]
 
 
 def _common_offset(stations: Sequence[LaterRows]) -> float:
@@ -271,37 +306,46 @@ def correct(
     weight = weight[kept] / weight[kept].sum()
     noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kept]
     if len(rows) <= NEAR:
-        mean, left = _solve(belief.extent, rows, noise, values, kept, places[None], doubt[None])
-        mean, left = mean[0], left[0]
+        mean, left, near = _solve(belief, rows, noise, values, kept, places[None], doubt[None])
+        mean, left, near = mean[0], left[0], near[0]
     else:
-        near = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
-        blocks = zip(near.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
+        nearest = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
+        blocks = zip(nearest.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
         parts = [
             _solve(
-                belief.extent, rows[index], noise[index], values[:, index].movedim(0, 1), kept,
+                belief, rows[index], noise[index], values[:, index].movedim(0, 1), kept,
                 place[:, None], own[:, None],
             )
             for index, place, own in blocks
         ]  # fmt: skip
-        mean, left = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
-    keeps = KEEPS[kept, None]
-    mean = mean + belief.common + keeps * level + (1 - keeps) * rows.middle
+        mean, left, near = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
+    # Rows in a part of the place cannot tell what was moved elsewhere; of many stations their share does.
+    seen = float(torch.linalg.vector_norm(rows.places.amax(0) - rows.places.amin(0))) / belief.extent
+    seen = 1.0 if len(belief.names) > 1 else min(seen, 1.0) ** WHOLE
+    away = (1 - KEEPS[kept, None]) * (near + (1 - near) * seen)
+    mean = belief.common + level + (KEEPS[kept, None] + away) * mean + away * (rows.middle - level)
     middle = weight @ mean
     return MeanVariance(middle, weight @ (left + (mean - middle).square()))
 
 
 def _solve(
-    extent: float, rows: LaterRows, noise: Tensor, values: Tensor, kept: Tensor, places: Tensor, doubt: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Means and variances (G, K', B) of groups of places (G, B, D) by rows (G or none, n)."""
-    gram = _covariance(rows.places, rows.places, rows.doubt, rows.doubt, extent, kept)
+    belief: Belief, rows: LaterRows, noise: Tensor, values: Tensor, kept: Tensor, places: Tensor,
+    doubt: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Means, variances and correlations with the nearest row (G, K', B).
+
+    Of groups of places (G, B, D) by rows (G or none, n).
+    """
+    lengths = belief.extent, belief.scale, kept
+    gram = _covariance(rows.places, rows.places, rows.doubt, rows.doubt, *lengths)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise.unsqueeze(-2))
-    cross = _covariance(places, rows.places, doubt, rows.doubt, extent, kept)
+    cross = _covariance(places, rows.places, doubt, rows.doubt, *lengths)
     factor = Factor.from_gram(gram, "raise")
     mean = (cross @ factor.solve(values[..., None]))[..., 0]
     prior = KEEPS[kept, None] * doubt[:, None] + (OFFSET.square() + LOCAL.square())[kept, None]
     told = factor.whiten(cross.mT.contiguous()).square().sum(-2)
-    return mean, (prior - told).clamp_min(0.0)
+    near = matern32(distances(places, rows.places), belief.extent * AWAY).amax(-1)
+    return mean, (prior - told).clamp_min(0.0), near[:, None].expand_as(mean)
 
 
 @torch.no_grad()
@@ -319,9 +363,11 @@ def innovations(rows: LaterRows, first: int, extent: float, kind: int = 0) -> Me
     at, index = rows[new], near.indices
     known = rows[index]
     one = slice(kind, kind + 1)
-    own = _covariance(known.places, known.places, known.doubt, known.doubt, extent, one)[:, 0]
+    own = _covariance(known.places, known.places, known.doubt, known.doubt, extent, kinds=one)[:, 0]
     own.diagonal(dim1=-2, dim2=-1).add_(known.noise + known.faded + torch.where(unknown, UNTOLD, TINY))
-    cross = _covariance(at.places[:, None], known.places, at.doubt[:, None], known.doubt, extent, one)[:, 0]
+    cross = _covariance(at.places[:, None], known.places, at.doubt[:, None], known.doubt, extent, kinds=one)[
+        :, 0
+    ]
     weights = Factor.from_gram(own, "raise").solve(cross.mT)[..., 0]
     prior = KEEPS[kind] * at.doubt + OFFSET[kind].square() + LOCAL[kind].square()
     variance = prior + at.noise - (weights * cross[:, 0]).sum(1)

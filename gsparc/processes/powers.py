@@ -53,7 +53,7 @@ class PowerRows:
         """Rows (n,) bool of which a level is known, not a power."""
         return self.side != 0
 
-    def subset(self, chosen: np.ndarray) -> Self:
+    def subset(self, chosen: np.ndarray | slice) -> Self:
         """Return the rows `chosen`."""
         return type(self)(*(part[chosen] for part in vars(self).values()))
 

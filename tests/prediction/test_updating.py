@@ -105,6 +105,20 @@ def test_no_factor_of_all_rows_is_made(predictor, monkeypatch):
     assert sizes and max(sizes) < 100 < len(PLACES)
 
 
+def test_a_refit_finds_that_a_change_is_small(predictor):
+    """A screen of 3 m in a room of 20 m: at lengths as they are, it was smoothed over 5 m."""
+    narrow = lambda at: np.linalg.norm(at[:, :2] - 5, axis=1) < 1.5  # noqa: E731
+    near, asked, misses = changed(60)["rx"], changed(400, 9)["rx"], []
+    told = levels(near, 5) - 12 * narrow(near)
+    for refit in (False, True):
+        predictor.update(rx=near, rssi=told, refit=refit)
+        error = predictor.rssi(rx=asked)[:, 0] - truth(asked) + 12 * narrow(asked)
+        misses.append(np.sqrt(np.mean(error**2)))
+        assert ("lengths of changes at" in predictor.journal[-1]) == refit
+        predictor.undo()
+    assert misses[1] < 0.95 * misses[0], misses
+
+
 def test_misuse_is_said(predictor):
     refused("rx= and rssi= are needed", predictor.update, rx=SCREENED)
     refused("4 places and 1 stations", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))

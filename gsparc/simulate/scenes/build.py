@@ -19,8 +19,10 @@ from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
+from gsparc.simulate.scenes.moved import PLACE, move_solids, read_moves
 from gsparc.simulate.scenes.osm import Town, read_town
 from gsparc.simulate.scenes.receivers import Ground, Layout, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.solid import box
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.survey import Survey, TracingEngine
@@ -29,7 +31,6 @@ log = logging.getLogger(__name__)
 
 BUILDERS = {"conference_room": conference_room}
 SOURCES = ("builder", "builtin", "xml", "file", "room")
-PLACE = limits.Limit("three finite numbers [m]", lambda value: limits.finite_array(value).shape == (3,))
 SEVERAL = limits.Limit("a list of one transmitter or more", bool)
 MIN_RECEIVERS = 20
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
@@ -63,6 +64,8 @@ class SceneSettings(Checked):
         open_sky: receivers stand where nothing is above them; None: where the scene has no ceiling.
         scattering: scattering coefficient of all materials without one; None: by material.
         seed: of the procedure and of the receivers.
+        moved: settings of `moved.Move` each: the scene at a later time, with the same receivers but for those
+            that something would now stand on.
     """
 
     name: str
@@ -85,6 +88,7 @@ class SceneSettings(Checked):
     open_sky: bool | None = False
     scattering: float | None = None
     seed: int = 0
+    moved: Sequence[Mapping[str, Any]] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,7 +132,8 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
     """
     if scene.room is not None:
         return _shoebox(scene)
-    tracer, town, allowed = _load(scene, sampling)
+    # Receivers are those of the scene before: what stands there now would shift all draws.
+    tracer, town, allowed = _load(replace(scene, moved=()), sampling)
     for note in () if town is None else town.notes:
         log.info("%s: %s", scene.file, note)
     area = _area(scene, tracer.bounding_box()[:, :2] if town is None else town.box)
@@ -137,6 +142,10 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
     # Heights of masts count from the highest surface, a roof where there is one.
     masts = _stated(scene, tracer.surface_height, georeference) or [_in_the_middle(tracer, ground, area)]
     placed = place_receivers(scene, area, ground, town)
+    if scene.moved:
+        tracer, _, allowed = _load(scene, sampling)
+        assert allowed is not None
+        placed = placed.subset(allowed(placed.places))
     # Copies that share the scene, which is loaded once.
     engines = [tracer.with_transmitter(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
@@ -200,14 +209,19 @@ def _shoebox(scene: SceneSettings) -> Survey:
     stated = from_settings(RoomSettings, scene.room or {}, "scene.room")
     SIZE.check("scene.room.size_m", stated.size_m)
     size, reflection = np.array(stated.size_m, float), np.array(stated.reflection, complex)
-    room = Room.from_size(size, reflection, occluders=stated.boxes)
-    area = _area(scene, np.stack([room.lower, room.upper])[:, :2])
-    middle = np.append(area.mean(0), CEILING * room.upper[2])
+    boxes = [box(f"box{k}", "", *corners) for k, corners in enumerate(stated.boxes)]
+    before, after = (
+        Room.from_size(size, reflection, occluders=np.array([one.keep_out for one in each]).reshape(-1, 2, 3))
+        for each in (boxes, move_solids(boxes, read_moves(scene.moved))[0])
+    )
+    area = _area(scene, np.stack([before.lower, before.upper])[:, :2])
+    middle = np.append(area.mean(0), CEILING * before.upper[2])
     masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
     if any(mast.antenna.pattern != "iso" for mast in masts):
         raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
-    engines: list[TracingEngine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
-    placed = place_receivers(scene, area, Ground(room.contains))
+    engines: list[TracingEngine] = [ShoeboxEngine(after, mast.position, scene.carrier_hz) for mast in masts]
+    placed = place_receivers(scene, area, Ground(before.contains))
+    placed = placed.subset(after.contains(placed.places))
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
 
 
@@ -216,7 +230,7 @@ def _load(
 ) -> tuple[RayTracer, Town | None, Callable[[np.ndarray], np.ndarray] | None]:
     """The ray tracer, what a map holds, and a test of free places where objects know where nobody stands."""
     source: Any = scene.builtin if scene.builtin is not None else Path(str(scene.xml))
-    town, allowed = None, None
+    town, allowed, moves = None, None, read_moves(scene.moved)
     if scene.file is not None:
         town = read_town(scene.file, scene.carrier_hz)
         source = town.solids
@@ -224,6 +238,13 @@ def _load(
         source = BUILDERS[scene.builder](scene.seed)
         # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
         allowed = stands_clear_of(source)
+    if moves:
+        if isinstance(source, str | Path):
+            raise ValueError(
+                "moved: objects of scenes that come as a file stand as they are; of our own they move"
+            )
+        source, changed = move_solids(source, moves)
+        allowed = stands_clear_of(changed)
     # At the origin for the time being: `with_transmitter` puts a copy at each transmitter.
     return RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering), town, allowed
 

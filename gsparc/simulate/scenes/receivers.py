@@ -63,6 +63,10 @@ class Placed(NamedTuple):
     places: np.ndarray
     time_s: np.ndarray | None = None
 
+    def subset(self, free: np.ndarray) -> Placed:
+        """Return the receivers where `free` (R,) is True."""
+        return Placed(self.places[free], None if self.time_s is None else self.time_s[free])
+
 
 def place_receivers(
     scene: SceneSettings, area: np.ndarray, ground: Ground, town: Town | None = None
@@ -108,7 +112,7 @@ def place_receivers(
         log.warning("%s: left out", inside)
     if free.sum() < 2:
         raise ValueError("scene.receivers: fewer than two places are free; is the area inside a building?")
-    return Placed(points[free], None if time_s is None else time_s[free])
+    return Placed(points, time_s).subset(free)
 
 
 def _along(how: Layout, area: np.ndarray, streets: Sequence[np.ndarray]) -> np.ndarray:
