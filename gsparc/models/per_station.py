@@ -31,7 +31,7 @@ from gsparc.models import checkpoint, fitting
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import AddsCarriers, HasJoint, Method, MethodFactory, Prediction, Reconditions
-from gsparc.models.powers.own_terms import combine_stations
+from gsparc.models.powers.own_terms import pool_station_weights
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
@@ -173,7 +173,7 @@ class PerStation(Method):
             here = 0.0 if uses_other_processes() else took_cpu_s
             watch.charge(max(report.seconds - took_s, 0.0), max(report.cpu_s - here, 0.0))
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
-        learned = combine_stations([note for one in heard for note in one.notes])
+        learned = pool_station_weights([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
         lost = [t for t in range(len(data.site.stations or ())) if not {t, UNHEARD} & {*numbers}]
         if who := list_first([self._station_name(number) for number in lost]):

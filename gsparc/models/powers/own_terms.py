@@ -203,7 +203,7 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     ]
 
 
-def combine_stations(notes: Sequence[str]) -> dict[str, str]:
+def pool_station_weights(notes: Sequence[str]) -> dict[str, str]:
     """Return, for what stations say of each term, one sentence: all of them together, and how they differ.
 
     Rows of stations are independent given the weight (random effects: R. DerSimonian, N. Laird, Controlled

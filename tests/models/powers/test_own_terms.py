@@ -95,12 +95,12 @@ def test_stations_say_one_weight_of_all():
     told = rng.normal(-3.0, np.hypot(0.5, 1.0), 12)  # 1 dB between stations beside what each is unsure of
     numbers = [np.array([[weight], [0.5], [0.0], [5.0]]) for weight in told]
     alone = [own_terms.LearnedWeights.from_numbers("Wood", one) for one in numbers]
-    (line,) = set(own_terms.combine_stations(["a law", *alone]).values())
+    (line,) = set(own_terms.pool_station_weights(["a law", *alone]).values())
     mean, error = line.numbers[:2, 0]
     assert abs(mean + 3.0) < 3 * error and 0.2 < error < 0.5
     said = r"Wood: -\S+ \+- \S+ \(of 12 stations, which differ by \d\S+; prior_db=\[.*\] tells .*\)"
     assert re.fullmatch(said, line)
-    assert own_terms.combine_stations(alone[:1])[alone[0]] == alone[0]
+    assert own_terms.pool_station_weights(alone[:1])[alone[0]] == alone[0]
 
 
 def test_a_prior_in_decibels_is_a_setting_of_the_term(trees):
