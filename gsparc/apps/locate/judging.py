@@ -152,8 +152,8 @@ def locate_by_model(
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:
-            learned = {"trust": asdict(trust), "how": how, "count": count}
-            checkpoint.update_extra(config.ckpt, {locating.KEY: learned})
+            stored = {"trust": asdict(trust), "how": how, "count": count}
+            checkpoint.update_extra(config.ckpt, {locating.KEY: stored})
     elif config.calibrate:
         log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
 
