@@ -152,8 +152,8 @@ def locate_by_model(
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
         locator = replace(locator, trust=trust)
         if config.store:
-            stored = {"trust": asdict(trust), "how": how, "count": count}
-            checkpoint.update_extra(config.ckpt, {locating.KEY: stored})
+            entry = {"trust": asdict(trust), "how": how, "count": count}
+            checkpoint.update_extra(config.ckpt, {locating.KEY: entry})
     elif config.calibrate:
         log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
 
