@@ -32,7 +32,7 @@ from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import AddsCarriers, HasJoint, Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.powers.own_terms import pool_station_weights
-from gsparc.models.reduced import View
+from gsparc.models.station_views import AllStationsView, OneStationView
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -344,43 +344,6 @@ class PerStation(Method):
 
     def __iter__(self) -> Iterator[tuple[int, Method]]:
         return iter(self._copies.items())
-
-
-class OneStationView(View):
-    """A method that knows all stations, asked about one: several may stand at one place."""
-
-    def __init__(self, inner: Method, number: int) -> None:
-        super().__init__(inner)
-        self.number = number
-
-    def joint_method(self) -> HasJoint | None:
-        """See `Method.joint_method`."""
-        method = getattr(self.inner, "member", None)
-        return method if isinstance(method, HasJoint) else None
-
-    def gradient_problem(self) -> str | None:
-        """Return that of all stations."""
-        return self.inner.gradient_problem()
-
-    def predict(self, query: Query) -> Prediction:
-        """See `Method.predict`."""
-        return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
-
-
-class AllStationsView(OneStationView):
-    """A method that knows all stations of powers, asked about each of them at every place."""
-
-    def __init__(self, inner: Method, count: int) -> None:
-        super().__init__(inner, UNHEARD)
-        self.count = count
-
-    def predict(self, query: Query) -> Prediction:
-        """Return the mean and variance (B, T); the ends that stand are not read."""
-        rows = torch.arange(len(query)).repeat_interleave(self.count)
-        station = torch.arange(self.count).repeat(len(query))
-        said = self.inner.predict(replace(query.rows(rows), station=station))
-        variance = None if said.variance is None else said.variance.view(-1, self.count)
-        return Prediction(said.mean.view(-1, self.count), variance)
 
 
 def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:

@@ -9,7 +9,7 @@ import torch
 
 from gsparc.data.schema import Site
 from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
-from gsparc.models.per_station import OneStationView
+from gsparc.models.station_views import OneStationView
 from gsparc.prediction.query import Queries
 
 TOGETHER, UNREAD = 64, 1e12  # places at a time; variance of what is not measured [dB^2]

@@ -1,0 +1,49 @@
+"""Views of a method that knows all stations: asked about one of them, or about all at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from gsparc.data.ends import NOBODY
+from gsparc.data.query import Query
+from gsparc.models.method import HasJoint, Method, Prediction
+from gsparc.models.reduced import View
+
+
+class OneStationView(View):
+    """A method that knows all stations, asked about one: several may stand at one place."""
+
+    def __init__(self, inner: Method, number: int) -> None:
+        super().__init__(inner)
+        self.number = number
+
+    def joint_method(self) -> HasJoint | None:
+        """See `Method.joint_method`."""
+        method = getattr(self.inner, "member", None)
+        return method if isinstance(method, HasJoint) else None
+
+    def gradient_problem(self) -> str | None:
+        """Return that of all stations."""
+        return self.inner.gradient_problem()
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
+
+
+class AllStationsView(OneStationView):
+    """A method that knows all stations of powers, asked about each of them at every place."""
+
+    def __init__(self, inner: Method, count: int) -> None:
+        super().__init__(inner, NOBODY)
+        self.count = count
+
+    def predict(self, query: Query) -> Prediction:
+        """Return the mean and variance (B, T); the ends that stand are not read."""
+        rows = torch.arange(len(query)).repeat_interleave(self.count)
+        station = torch.arange(self.count).repeat(len(query))
+        said = self.inner.predict(replace(query.rows(rows), station=station))
+        variance = None if said.variance is None else said.variance.view(-1, self.count)
+        return Prediction(said.mean.view(-1, self.count), variance)
