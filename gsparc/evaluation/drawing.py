@@ -77,12 +77,14 @@ METHODS = {
 }  # fmt: skip
 OTHERS = "<>8H"  # marks of methods without an entry
 TOGETHER = "_together"  # ends the name of a method that serves all stations at once
+PUBLISHED = "published_"  # begins the name of one at its published size
 
 
 def style_of(method: str) -> MethodStyle:
     """Return how a method is drawn; one without an entry by its name."""
-    if method.endswith(TOGETHER):
-        return style_of(method.removesuffix(TOGETHER))._replace(second=True)
+    own = method.removesuffix(TOGETHER).removeprefix(PUBLISHED)
+    if own != method:
+        return style_of(own)._replace(second=True)
     number = zlib.crc32(method.encode())
     mark = OTHERS[number // len(PALETTE) % len(OTHERS)]
     return METHODS.get(method, MethodStyle(PALETTE[number % len(PALETTE)], mark, True))
