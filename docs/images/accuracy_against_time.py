@@ -3,8 +3,7 @@
 python docs/images/accuracy_against_time.py
 
 Reads the RFID release's random split of `docs/results/table.csv` (docs/table.md says which command); a line
-joins efforts. The paper's recipe to its end, of one seed, is of `docs/results/paper/runs.csv`: its query was
-timed in another run, and is not drawn.
+joins efforts. Queries of what ran for hours were not timed in turns with the others, and are not drawn.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
 
 HERE = Path(__file__).parent
 TABLE = HERE.parent / "results" / "table.csv"
-PAPER = HERE.parent / "results" / "paper" / "runs.csv"
 # Per method: its name in the literature, and the label's offset from the point [points] in the left and the
 # right panel.
 METHODS: dict[str, tuple[str, tuple[int, int], tuple[int, int]]] = {
@@ -42,9 +40,6 @@ def main() -> None:
     with TABLE.open(encoding="utf-8") as file:
         every = csv.DictReader(file)
         rows = [row for row in every if (row["dataset"], row["split"]) == ("rfid", "random")]
-    with PAPER.open(encoding="utf-8") as file:
-        ended = next(r for r in csv.DictReader(file) if r["run"] == "text")  # of the same rows
-    rows.append({"method": "paper", "score_db": ended["psnr_db"], "train_cpu_s": ended["train_cpu_s"]})
     unknown = {r["method"] for r in rows} - METHODS.keys()
     if unknown:
         raise ValueError(f"{TABLE}: no place for the label of {', '.join(sorted(unknown))} in METHODS")

@@ -18,7 +18,7 @@ EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`)"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here
     "name", "transmitter_m", "area_m", "height_m", "num_receivers", "carrier_hz", "bandwidth_hz",
     "subcarriers", "test_share", "builder", "builtin", "xml", "open_sky", "scattering", "seed", "file",
-    "transmitters", "receivers", "over",
+    "transmitters", "receivers", "over", "moved",
 }  # fmt: skip
 FLAT_M = 0.01  # [m], of corners from their plane
 SMALLEST_M2 = 1e-6  # [m^2], of faces that are read
