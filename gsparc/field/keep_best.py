@@ -68,7 +68,7 @@ class KeepBest(L.Callback):
         taken = trainer.global_step
         if module.solved and len(self.start):
             log.info(
-                "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; with "
+                "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; "
                 "experiment=field starts at random: there another loss or callback makes a difference",
                 self.step, len(self.start), float(self.start.mean()), self.error,
             )  # fmt: skip

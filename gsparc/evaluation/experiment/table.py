@@ -211,7 +211,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         lines.append(f"given more than places: {given}")
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
-        lines.append(f"measured with another program (at commit): {old}")
+        lines.append(f"measured with another commit of this program: {old}")
     lines += [GIVEN_HEARD] * bool(block.outage.notna().any())
     return lines + busy_machine(block.load[block.effort.notna()].dropna().tolist())
 
@@ -232,7 +232,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (not draws, Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
-    mark = np.where(_published(block), " (published)", np.where(block.method == ours, " (ours)", ""))
+    mark = np.where(_published(block), " (from beside=)", np.where(block.method == ours, " (ours)", ""))
     rows = block.assign(named=block.method + block.label + mark).to_dict("records")
     shown = [column for there, column in columns if there]
     lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None

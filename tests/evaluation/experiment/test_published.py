@@ -32,7 +32,7 @@ def test_rows_of_the_same_test_rows_stand_beside_a_new_method(file):
         ("gp", 29.0),
         ("gsrf", 20.5),
     ]
-    assert "| gsrf (published) |" in markdown([effort], "mine")
+    assert "| gsrf (from beside=) |" in markdown([effort], "mine")
     assert len(beside_published(averages([filled("mine", 31.0, split="other")]), read_published(file))) == 1
 
 

@@ -100,7 +100,7 @@ def test_what_an_earlier_program_measured_is_said():
     old = filled("gsrf", 29.0, 0, 1.0, earlier="0123abcd")
     found = split_by_problem(averages([*FOUND[:1], old]))[0]
     assert list(found.earlier) == ["", "0123abcd"]
-    assert "another program (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
+    assert "another commit of this program: gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
 
 
 def test_how_a_method_approximates_stands_behind_its_name():
