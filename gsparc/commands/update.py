@@ -7,6 +7,7 @@ import io
 import logging
 from typing import Any
 
+import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.commands.shared.output import begin_run, finish_run
@@ -14,6 +15,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
 from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, switch, whole
 from gsparc.evaluation.open_runs import read_like_stored
+from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
@@ -27,7 +29,7 @@ LIMITS = {
     "window": whole(1), "fade_db": number(0), "undo": whole(0), "false_alarm": POSITIVE,
     "batch": or_null(whole(1)), "refit": switch(),
 }  # fmt: skip
-COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")
+COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")  # and degrees where they are known
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -56,7 +58,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
     table = alarm_rows(predictor)
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(table)
     write_whole(run_dir / "changes.csv", text.getvalue())
@@ -74,12 +76,13 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:
     """Return alarms as rows of `changes.csv`: names of stations, places in world coordinates."""
-    origin, rows = predictor.site.origin, []
+    rows = []
     for one in predictor.alarms:
         name = "all" if one.station < 0 else (predictor.stations or ["the station"])[one.station]
-        x, y = (round(float(a + b), 2) for a, b in zip(one.place, origin[:2], strict=True))
-        told = name, one.kind, one.since, one.at, round(one.change_db, 2), x, y
-        rows.append(dict(zip(COLUMNS, told, strict=True)))
+        where = coordinates(np.array([[*one.place, 0.0]]), predictor)
+        place = {axis: float(value[0].round(7)) for axis, value in where.items() if axis != "z"}
+        told = name, one.kind, one.since, one.at, round(one.change_db, 2)
+        rows.append({**dict(zip(COLUMNS, told, strict=False)), **place})
     return rows
 
 

@@ -28,9 +28,13 @@ class OneStationView(View):
         """Return that of all stations."""
         return self.inner.gradient_problem()
 
+    def of_station(self, query: Query) -> Query:
+        """Return a query as the inner method is asked."""
+        return replace(query, station=torch.full((len(query),), self.number))
+
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        return self.inner.predict(replace(query, station=torch.full((len(query),), self.number)))
+        return self.inner.predict(self.of_station(query))
 
 
 class AllStationsView(OneStationView):

@@ -19,6 +19,7 @@ from gsparc.data.units import PowerUnit
 from gsparc.models.device_offsets import without_devices
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
+from gsparc.models.station_views import OneStationView
 from gsparc.models.updated import STORED, Changes, Level, Updated, map_level, stored_changes, with_changes
 from gsparc.prediction.drift import ROWS, Alarm, Watch
 from gsparc.prediction.query import Queries, read_places
@@ -152,7 +153,7 @@ class UpdateMixin:
             changes, belief=belief, next_number=first + len(numbers), next_batch=changes.next_batch + 1
         )
         self._add_version(stations, said, changes, watch)
-        return Found(numbers, deviations, alarms, skipped)
+        return Found(numbers, deviations, self._in_world(alarms), skipped)
 
     def forget(self, rows: Any) -> None:
         """Forget later rows by their numbers (see `measured`); what the map was learned from stays.
@@ -199,10 +200,12 @@ class UpdateMixin:
         >>> bool(change < 0), predictor.undo()
         (True, None)
         """
-        query = self.queries.query(tx, rx).query
-        if not isinstance(self.method, Updated):
+        method, query = self.method, self.queries.query(tx, rx).query
+        if isinstance(method, OneStationView):
+            method, query = method.inner, method.of_station(query)
+        if not isinstance(method, Updated):
             return np.zeros(len(query)), np.zeros(len(query))
-        mean, variance = self.method.change(query)
+        mean, variance = method.change(query)
         return mean.numpy(), variance.sqrt().numpy()
 
     @property
@@ -232,8 +235,12 @@ class UpdateMixin:
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """Changes that were noticed, in their order."""
-        return self._current.watch.alarms
+        """Changes that were noticed, in their order; places in world coordinates [m]."""
+        return self._in_world(self._current.watch.alarms)
+
+    def _in_world(self, alarms: Sequence[Alarm]) -> tuple[Alarm, ...]:
+        x, y = self.site.origin[:2].tolist()
+        return tuple(replace(one, place=(one.place[0] + x, one.place[1] + y)) for one in alarms)
 
     @property
     def journal(self) -> tuple[str, ...]:

@@ -23,10 +23,12 @@ def add_changes(field: FieldMap, predictor: Predictor) -> FieldMap:
     if not predictor.versions or not len(predictor.rows):
         return field
     layers = np.full((2, field.best_server.size), np.nan, np.float32)
+    stations = predictor.site.stations
     for row, number in enumerate(field.number):
         cells = np.flatnonzero(field.best_server.reshape(-1) == row)
         if len(cells):
-            own = predictor if predictor.site.stations is None else predictor.select_station(int(number))
+            # By name: a number that is no name is a cell of its own where names are numbers.
+            own = predictor if stations is None else predictor.select_station(stations.name[int(number)])
             layers[:, cells] = own.change(**{own.site.moving_end: field.grid.places(cells)})
     change, deviation = layers.reshape(2, *field.best_server.shape)
     return replace(field, extra={**field.extra, CHANGE: change, DEVIATION: deviation})
