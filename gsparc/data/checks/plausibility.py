@@ -76,7 +76,8 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     low, high = float(values.min()), float(values.max())
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
-        return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?"]
+        why = "a sign lost, or a kilowatt received?"
+        return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: {why}"]
     if np.median(values) < LOWEST_DBM:
         return [f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?"]
     whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision

@@ -88,7 +88,8 @@ def _position_hints(positions: np.ndarray) -> list[str]:
 
 def _group_hints(positions: np.ndarray) -> list[str]:
     """A warning of two groups of positions (n, 3) far apart."""
-    said = "lost digits, zones of a projection (give degrees), or two sites (a file for each)?"
+    said = "lost digits, latitude and longitude exchanged in some rows, zones of a projection (give "
+    said += "degrees), or two sites (a file for each)?"
     groups = find_gap(positions[:, :2])
     return [] if groups is None else [f"two groups of places {groups[1] / 1e3:.4g} km apart: {said}"]
 
