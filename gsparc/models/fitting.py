@@ -81,7 +81,9 @@ def fit_or_resume(
     aligning = watch.seconds if ordered.site.freedom != "none" else 0.0
     if left is not None:  # what was read then is not known
         heeded.count_reads("*")
-    if left is not None and left.is_dir():
+    if left is not None and not left.exists():  # the interrupted run had not begun this part
+        context = replace(context, resume=None)
+    elif left is not None and left.is_dir():
         if (left / checkpoint.MODEL).exists():
             whole = replace(data, site=ordered.site)
             return _restore_fit(factory, whole, fold, context, left / checkpoint.MODEL)

@@ -20,6 +20,7 @@ from gsparc.evaluation.experiment.folds import build_callbacks
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint
+from gsparc.models.fitting import fit_or_resume
 from gsparc.models.method import HasGaussians
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
@@ -95,6 +96,16 @@ def test_peers_had_loops_of_their_own(tmp_path):
         assert torch.equal(value, goes_on.fitted().state_dict()[name]), name
     other = Fold(fold.train[1:], fold.val, fold.test)
     refused("was trained with other rows", brief("nerf2").fit, data, other, FitContext(tmp_path, resume=last))
+
+
+def test_a_station_that_an_interrupted_run_had_not_begun_was_refused(tmp_path):
+    """Of ten carriers eight were trained before a kill: the ninth had no folder, `no such checkpoint`."""
+    data, fold = lobes(tmp_path)
+    context = FitContext(
+        tmp_path / "station8", resume=tmp_path / "station8", trainer=partial(DEFAULTS, max_steps=2)
+    )
+    method, _ = fit_or_resume(brief("nerf2"), data, fold, context)
+    assert method.steps == 2
 
 
 def test_a_published_method_may_watch_validation_rows(tmp_path):
