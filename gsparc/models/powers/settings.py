@@ -47,7 +47,8 @@ MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
-COMPARED_ON = 300  # of them, constant and distance law; with little effort
+COMPARED_ON = 500  # of them, constant and distance law; with little effort
+MIXED_ON = 300  # the same of processes that are averaged: an error of one weighs less
 WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 MAP_COST = 3.0  # nats that rows must say for a map that was there before
@@ -132,12 +133,13 @@ def candidate_priors(
     ]
     if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
-    found = sorted((choose_candidate(rows, [one], seed, max_rows) for one in trends), key=lambda c: -c.score)
+    found = [choose_candidate(rows, [one], seed, max_rows, MIXED_ON) for one in trends]
+    found.sort(key=lambda one: -one.score)
     if rows.silent.any():
         return found
     # One row of a place: levels that repeat there to the digit would speak for no noise.
     once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
-    few = rows.subset(once).draw_subset(COMPARED_ON, seed)
+    few = rows.subset(once).draw_subset(MIXED_ON, seed)
     squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
     gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
     return [*found, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
@@ -194,10 +196,15 @@ def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
     return residual[posterior.extra == 0, 0].numpy()
 
 
-def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> KernelCandidate:
-    """Return the best of mean laws (each with its cost and notes), with its kernel."""
+def choose_candidate(
+    rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int, compared_on: int = COMPARED_ON
+) -> KernelCandidate:
+    """Return the best of mean laws (each with its cost and notes), with its kernel.
+
+    `compared_on`: rows that laws and kernels are compared on, of `max_rows` that the kernel is chosen on.
+    """
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
-    best = _choose_on_part(rows, trends, seed, min(max_rows, COMPARED_ON) if many else max_rows)
+    best = _choose_on_part(rows, trends, seed, min(max_rows, compared_on) if many else max_rows, compared_on)
     if not many:
         return best
     if not best.kernel.is_isotropic:  # none are nearest by which it could be chosen
@@ -207,10 +214,12 @@ def choose_candidate(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
-def _choose_on_part(rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int) -> KernelCandidate:
+def _choose_on_part(
+    rows: PowerRows, trends: list[MeanLaw], seed: int, max_rows: int, compared_on: int
+) -> KernelCandidate:
     """Mean, lengths and noise, chosen on a part of many rows."""
     loud = rows.heard_rows.draw_subset(max_rows, seed)
-    few = loud.draw_subset(COMPARED_ON, seed)
+    few = loud.draw_subset(compared_on, seed)
     weighed = rows.draw_subset(min(WEIGHED_ON, max_rows), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_fit_one_length(few, *law) for law in trends]
