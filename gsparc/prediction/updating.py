@@ -200,9 +200,10 @@ class UpdateMixin:
         >>> bool(change < 0), predictor.undo()
         (True, None)
         """
-        method, query = self.method, self.queries.query(tx, rx).query
+        query, method = self.queries.query(tx, rx).query, self.method
         if isinstance(method, OneStationView):
-            method, query = method.inner, method.of_station(query)
+            query = method.of_station(query)
+            method = method.inner
         if not isinstance(method, Updated):
             return np.zeros(len(query)), np.zeros(len(query))
         mean, variance = method.change(query)
