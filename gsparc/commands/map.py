@@ -73,7 +73,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "buildings": config.buildings, "indoor_db": settings["indoor_db"],
     }  # fmt: skip
     # Refuses what cannot be before any evidence is gathered.
-    first = add_changes(predict_map(predictor, dry=True, **query), predictor)
+    first = add_changes(predict_map(predictor, dry=True, **query), predictor, dry=True)
     wanted = _pictures(config, first)
     # Refused before evidence is gathered, which takes minutes.
     tiff = check_geotiff(config.geotiff)

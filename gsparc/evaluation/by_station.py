@@ -97,7 +97,9 @@ def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
     held, listed, later = np.isfinite(before.level)[pairs], np.isfinite(now.level), near[pairs]
     known = np.isfinite(before.level).any(0)
     fresh = np.flatnonzero(listed.any(0) & ~known)
-    rank = np.argsort(np.argsort(-np.nan_to_num(now.level, nan=-np.inf), 1), 1)[later]
+    # Equal levels keep the order of the stations, on any processor.
+    order = np.argsort(np.where(listed, -now.level, np.inf), 1, kind="stable")
+    rank = np.argsort(order, 1)[later]
     links = pd.DataFrame({"rank": rank[:, known][listed[later][:, known]]})
     links["held"] = held[:, known][listed[later][:, known]]
     again = links.groupby("rank").held.mean().reindex(range(listed.shape[1])).fillna(0.0).to_numpy()

@@ -15,16 +15,16 @@ CHANGE, DEVIATION = "change_db", "change_deviation_db"
 SURE, LEAST = 2.0, 1.0  # deviations that a change is said to be sure from; least end of the colours [dB]
 
 
-def add_changes(field: FieldMap, predictor: Predictor) -> FieldMap:
+def add_changes(field: FieldMap, predictor: Predictor, dry: bool = False) -> FieldMap:
     """Return a map with two further layers (ny, nx) [dB]: the mean of what changed, and its deviation.
 
-    Of a model that no later rows were told to it is returned as it is.
+    Of a model that no later rows were told to it is returned as it is. `dry`: the layers without values.
     """
     if not predictor.versions or not len(predictor.rows):
         return field
     layers = np.full((2, field.best_server.size), np.nan, np.float32)
     stations = predictor.site.stations
-    for row, number in enumerate(field.number):
+    for row, number in enumerate([] if dry else field.number):
         cells = np.flatnonzero(field.best_server.reshape(-1) == row)
         if len(cells):
             # By name: a number that is no name is a cell of its own where names are numbers.
