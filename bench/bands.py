@@ -216,7 +216,10 @@ def main() -> None:
             judged += [ceiling(root / "paths.npz", data, fold)] if held_out == "places" else []
             rows += [{"room": root.name, "held_out": held_out, **one} for one in judged]
     by = ["room", "held_out", "method"]
-    mean = pd.DataFrame(rows).groupby(by, sort=False).mean().round(4)
+    draws = pd.DataFrame(rows).groupby(by, sort=False)
+    mean = draws.mean()
+    mean.insert(1, "ssim_error", draws["ssim_gauss"].sem())  # over draws, or carriers
+    mean = mean.round(4)
     mean.to_csv(OUT, mode="a", header=not OUT.exists())
     sys.stdout.write(f"{mean.groupby(by[1:], sort=False).mean().to_string()}\n")
 
