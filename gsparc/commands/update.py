@@ -67,8 +67,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - known,
         "update/versions": len(predictor.versions), "time/update_s": seconds,
     }  # fmt: skip
-    said = f"{told} rows, {skipped} skipped, as they tell nothing, {len(table) - known} alarms"
-    said = f"{config.undo} versions back" if config.undo else said
+    silent = f", {skipped} others tell nothing" if skipped else ""
+    said = f"{told} rows added{silent}, {len(table) - known} alarm(s)"
+    said = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else said
     said += f", {seconds:.2g} s"
     before = f"update: {said}; model in {out}; summary "
     return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)

@@ -219,7 +219,7 @@ def test_networks_with_names_of_their_own_were_no_levels(tmp_path):
     path.write_text(text("X,Y,Office WiFi,printer,noise floor", *ROOM.T[:2], *LEVEL.T, [-96] * COUNT))
     reading = read_any(path)
     assert_levels(reading, ("Office WiFi", "printer"))
-    assert any("by their values, as no head says so" in note for note in reading.notes)
+    assert any("by their values: no head says so" in note for note in reading.notes)
 
 
 def test_rows_between_two_fixes_were_refused_one_by_one(tmp_path):

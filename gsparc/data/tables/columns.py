@@ -220,7 +220,7 @@ def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
     if alike and "station" not in chosen:
         chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
         note = _note(chosen["rssi_db"])
-        sheet.notes.append(note if named else Caution(f"{note}: by their values, as no head says so"))
+        sheet.notes.append(note if named else Caution(f"{note}, by their values: no head says so"))
 
 
 def _may_be_levels(sheet: Sheet, head: str) -> bool:
@@ -421,7 +421,7 @@ def _note(columns: tuple[Column, ...]) -> str:
         labels = [column.label for column in columns]
         of = "frequencies" if first.role in (*CHANNELS, *POLAR) else "stations"
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
-        what += "; if they are dBm: unit=dBm of map" if unit == " [dB]" else ""
+        what += " (maps in dBm: unit=dBm)" if unit == " [dB]" else ""
     turned = first.unit is not None and first.unit.changes
     return what + (f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else "")
 
