@@ -32,7 +32,8 @@ from gsparc.prediction.updating import versions_extra
 from gsparc.processes.changes import AWAY, ERRORS, KINDS, LEAST, NEAR, TINY, WHOLE, LaterRows, correct, learn
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
-from gsparc.simulate.scenes.build import SceneSettings, build_survey
+from gsparc.simulate.scenes.build import build_survey
+from gsparc.simulate.scenes.settings import SceneSettings
 
 MEASURED = Path(__file__).parents[2] / "shared/data/change"
 OUT = Path(__file__).parents[1] / "docs/results/changes.csv"

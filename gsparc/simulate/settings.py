@@ -10,7 +10,7 @@ from gsparc.data.limits import Checked, choice, setting, whole
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
-from gsparc.simulate.scenes.build import SceneSettings
+from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsparc.data.walls import SIMULATED, polygon_area, read_walls
-from gsparc.simulate.scenes.build import SceneSettings
+from gsparc.simulate.scenes.settings import SceneSettings
 
 SCENES = Path(__file__).parents[2] / "conf" / "scene"
 

@@ -76,7 +76,7 @@ def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
 def small_campaign(rows: int):
     """`rows` receivers in a box, four to a shard; spectra of 18 x 36."""
     from gsparc.simulate.effects import Effects
-    from gsparc.simulate.scenes.build import SceneSettings
+    from gsparc.simulate.scenes.settings import SceneSettings
     from gsparc.simulate.settings import CampaignSettings
     from gsparc.simulate.spectrum import SpectrumSettings
 

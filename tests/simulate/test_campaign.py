@@ -29,7 +29,8 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.report import choice_table, describe_choice, summary_facts
-from gsparc.simulate.scenes.build import SceneSettings, build_survey
+from gsparc.simulate.scenes.build import build_survey
+from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace_room
 from gsparc.simulate.spectrum import ArraySettings

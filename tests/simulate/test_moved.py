@@ -6,9 +6,10 @@ from refusals import refused
 
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
-from gsparc.simulate.scenes.build import SceneSettings, build_survey
+from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.moved import Move, move_solids
+from gsparc.simulate.scenes.settings import SceneSettings
 
 FACTS = {
     "name": "room", "num_receivers": 200, "carrier_hz": 2.4e9, "bandwidth_hz": 0.0, "subcarriers": 1,

@@ -10,12 +10,12 @@ from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import polygon_area, read_walls
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.receivers import (
-    Layout,
     draw_places,
     farthest_points,
     nearest_rows,
     place_receivers,
 )
+from gsparc.simulate.scenes.settings import Layout
 from gsparc.simulate.scenes.solid import box, write_walls
 from gsparc.simulate.scenes.transmitters import place_transmitters
 

@@ -16,9 +16,10 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import BITS, Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.build import SceneSettings, build_survey, from_config
+from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.receivers import draw_places, stands_clear_of
+from gsparc.simulate.scenes.settings import SceneSettings, from_config
 from gsparc.simulate.scenes.shipped import shipped_scene_settings
 from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.spectrum import SpectrumSettings

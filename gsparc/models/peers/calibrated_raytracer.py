@@ -34,7 +34,8 @@ from gsparc.simulate.calibration import (
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.build import from_config, known_scene, load_tracer
+from gsparc.simulate.scenes.build import known_scene, load_tracer
+from gsparc.simulate.scenes.settings import from_config
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 

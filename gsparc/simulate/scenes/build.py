@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsparc.data import limits
 from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import Checked, choice, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.moved import PLACE, move_solids, read_moves
+from gsparc.simulate.scenes.moved import move_solids, read_moves
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.receivers import Ground, Layout, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.receivers import Ground, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.settings import BUILDERS, MIN_RECEIVERS, SceneSettings, from_config
 from gsparc.simulate.scenes.solid import box
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
@@ -29,98 +27,10 @@ from gsparc.simulate.survey import Survey, TracingEngine
 
 log = logging.getLogger(__name__)
 
-BUILDERS = {"conference_room": conference_room}
-SOURCES = ("builder", "builtin", "xml", "file", "room")
-SEVERAL = limits.Limit("a list of one transmitter or more", bool)
-MIN_RECEIVERS = 20
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
 WIDEST_M = 400.0  # of an area that nobody states
 MAST_M = 10.0  # height of a transmitter that nobody states, above what stands in the middle
 CEILING = 0.85  # and its share of the height of a closed room
-
-
-@dataclass(frozen=True)
-class SceneSettings(Checked):
-    """One scene, chosen by exactly one of `SOURCES`.
-
-    Attributes:
-        name: of the dataset.
-        num_receivers: how many, over an area.
-        carrier_hz, bandwidth_hz, subcarriers: the band; subcarriers from end to end [Hz].
-        transmitter_m: (3,) of the only one [m]; None, without `transmitters`: in the middle, which is said.
-        transmitters: settings of `transmitters.Mast` each, in place of `transmitter_m`.
-        area_m: [[x, y], [x, y]] lower and upper corner of where receivers are [m]; None: the middle, at most
-            400 m wide, which is said.
-        height_m: lowest and highest height of a receiver [m].
-        over: what heights count from: the world's `zero`, the `ground` (what stands there is kept off) or
-            `roofs` (the highest surface, whatever it is).
-        receivers: settings of `receivers.Layout`; None: drawn over the area.
-        test_share: of the places held out for testing, drawn at random.
-        builder: a procedure of ours (`conference_room`).
-        builtin: a scene that comes with Sionna.
-        xml: a Mitsuba or Sionna scene file.
-        file: an extract of OpenStreetMap.
-        room: of the shoebox engine: size_m, reflection (one number or six), boxes_m.
-        open_sky: receivers stand where nothing is above them; None: where the scene has no ceiling.
-        scattering: scattering coefficient of all materials without one; None: by material.
-        seed: of the procedure and of the receivers.
-        moved: settings of `moved.Move` each: the scene at a later time, with the same receivers but for those
-            that something would now stand on.
-    """
-
-    name: str
-    num_receivers: int
-    carrier_hz: float = setting(MISSING, limits.POSITIVE)
-    bandwidth_hz: float = setting(MISSING, limits.number(0))
-    subcarriers: int = setting(MISSING, whole(1))
-    transmitter_m: tuple[float, float, float] | None = setting(None, or_null(PLACE))
-    transmitters: Sequence[Mapping[str, Any]] | None = setting(None, or_null(SEVERAL))
-    area_m: tuple[tuple[float, float], tuple[float, float]] | None = None
-    height_m: tuple[float, float] = (1.2, 1.8)
-    over: str = setting("zero", choice("zero", "ground", "roofs"))
-    receivers: Mapping[str, Any] | None = None
-    test_share: float = setting(0.3, limits.SHARE)
-    builder: str | None = setting(None, or_null(choice(*BUILDERS)))
-    builtin: str | None = None
-    xml: str | None = None
-    file: str | None = None
-    room: Mapping[str, Any] | None = None
-    open_sky: bool | None = False
-    scattering: float | None = None
-    seed: int = 0
-    moved: Sequence[Mapping[str, Any]] = ()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        sources = [k for k in SOURCES if getattr(self, k) is not None]
-        if len(sources) != 1:
-            names = ", ".join(sources) or "none"
-            raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {names}")
-        if self.transmitter_m is not None and self.transmitters is not None:
-            raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
-        if self.layout.kind == "area" and self.num_receivers < MIN_RECEIVERS:
-            raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
-
-    @property
-    def layout(self) -> Layout:
-        """Where receivers are."""
-        return from_settings(Layout, self.receivers or {}, "scene.receivers")
-
-    @property
-    def frequency_hz(self) -> np.ndarray:
-        """Subcarriers (K,) [Hz], about the carrier."""
-        if self.subcarriers == 1:
-            return np.array([self.carrier_hz])
-        return self.carrier_hz + np.linspace(-0.5, 0.5, self.subcarriers) * self.bandwidth_hz
-
-
-def from_config(config: Mapping[str, Any]) -> SceneSettings:
-    """Return settings from the config group `scene`.
-
-    Raises:
-        ValueError: a setting that does not exist or cannot be.
-    """
-    return from_settings(SceneSettings, config, "scene")
 
 
 def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:

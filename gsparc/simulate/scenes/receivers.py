@@ -11,12 +11,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting
 from gsparc.data.query_places import read_query_places, read_times
+from gsparc.simulate.scenes.settings import Layout, SceneSettings
 from gsparc.simulate.scenes.solid import Solid
 
 if TYPE_CHECKING:
-    from gsparc.simulate.scenes.build import SceneSettings
     from gsparc.simulate.scenes.osm import Town
 
 log = logging.getLogger(__name__)
@@ -37,24 +36,6 @@ class Ground:
     allowed: Callable[[np.ndarray], np.ndarray]
     lift: Callable[[np.ndarray], np.ndarray] = lambda points: points
     open_sky: bool = False
-
-
-@dataclass(frozen=True)
-class Layout(Checked):
-    """The settings `scene.receivers`.
-
-    Attributes:
-        kind: `area` (drawn at random), `grid`, `streets` (of a map) or `file`.
-        spacing_m: of a grid, and along streets [m].
-        file: a table with x, y and z, or latitude, longitude and height, and perhaps `time_s`.
-        inside: places in or on something that stands there are left out (`drop`) or an error (`refuse`);
-            None: an error out of a file, else left out.
-    """
-
-    kind: str = setting("area", choice("area", "grid", "streets", "file"))
-    spacing_m: float = setting(5.0, POSITIVE)
-    file: str | None = None
-    inside: str | None = setting(None, or_null(choice("drop", "refuse")))
 
 
 class Placed(NamedTuple):

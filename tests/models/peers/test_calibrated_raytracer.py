@@ -23,7 +23,8 @@ from gsparc.simulate.calibration import (
 )
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.build import SceneSettings, has_known_scene, known_scene
+from gsparc.simulate.scenes.build import has_known_scene, known_scene
+from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.training.context import FitContext
 
 STATION = np.array([-2.5, 0.0, 3.0])
