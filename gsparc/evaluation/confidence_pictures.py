@@ -13,11 +13,11 @@ from gsparc.evaluation.drawing import GREY, PALETTE, numbered_style, panels, sav
 from gsparc.evaluation.metric_formats import OF_KIND, axis_of, lower_is_better
 from gsparc.evaluation.results import own_rows
 from gsparc.evaluation.table import Row
+from gsparc.field.losses import weigh_losses
 from gsparc.prediction.risk import bounded_loss
 from gsparc.processes.uncertainty import rank_correlation
 
 PAPER_TAU = 0.59  # of confidences between their least and largest over the test rows
-SSIM_WEIGHT = 0.2  # of 1 - SSIM in the loss of a spectrum, the rest absolute error (the paper)
 BRACKET_DB = 5.0
 OUTER = 0.02, 0.98  # quantiles of the rows: brackets beyond them are those of these
 WIDE, TALL = 3.6, 3.2  # inches of a panel
@@ -53,7 +53,7 @@ def _loss(row: Row) -> np.ndarray:
     if "error_power" in own:
         return bounded_loss(own["error_power"] / np.maximum(own["target_power"], 1e-300))
     # Images smaller than the window have no SSIM: the absolute error alone tells.
-    return (1 - SSIM_WEIGHT) * own["mae"] + SSIM_WEIGHT * (1 - np.nan_to_num(own["ssim_gauss"], nan=1.0))
+    return weigh_losses(own["mae"], np.nan_to_num(own["ssim_gauss"], nan=1.0))
 
 
 def _draw_over_loss(runs: list[Row]) -> Figure:

@@ -18,8 +18,7 @@ from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_basel
 from gsparc.evaluation.by_station import describe_never_listed, describe_new, station_columns
 from gsparc.evaluation.examples import FILE, Examples
 from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import judged_by
-from gsparc.evaluation.metrics import paired_values
+from gsparc.evaluation.metric_formats import judged_by, paired_values
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unseen_runs
 from gsparc.evaluation.summary import write_samples

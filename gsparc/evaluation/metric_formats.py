@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from gsparc.data.schema import Scored
 from gsparc.evaluation.metrics import (
     AlignedChannelMetrics,
@@ -26,12 +28,14 @@ class Figure:
         form: format of its numbers.
         better: which values are better; a `ratio` of powers is compared in decibels, smaller is better.
         of_sample: the column of `per_sample.csv` that it is made of; empty: its own name.
+        root: whether it is the root of the mean square of that column, not its mean.
     """
 
     heading: str
     form: str = ".4f"
     better: Literal["larger", "smaller", "ratio"] = "larger"
     of_sample: str = ""
+    root: bool = False
 
 
 # SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default; the first also of
@@ -49,8 +53,8 @@ FIGURES = {
     "nmse_scalar": Figure("NMSE up to a scalar", ".3g", "ratio"),
     "snr_db": Figure("SNR dB", ".2f"),
     "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
-    "rmse_db": Figure("RMSE dB", ".2f", "smaller", "error_db"),
-    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller", "error_db_with_silent"),
+    "rmse_db": Figure("RMSE dB", ".2f", "smaller", "error_db", root=True),
+    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller", "error_db_with_silent", root=True),
     "mae_db": Figure("MAE dB", ".2f", "smaller"),
     "error_db": Figure("error dB", ".2f", "smaller"),
     "best_server": Figure("strongest told", ".1%"),
@@ -115,12 +119,42 @@ OF_KIND: dict[Scored, KindFigures] = {
     ),
 }  # fmt: skip
 DECIDING: dict[Scored, str] = {kind: figures.columns[0] for kind, figures in OF_KIND.items()}
+PARTS = {figure.of_sample for figure in FIGURES.values()}  # columns that are no figures by themselves
+
+
+def scored_kind(facts: Mapping[str, Any]) -> Scored:
+    """Return the kind of measurement that a summary is of; spectra where an old one does not say.
+
+    Raises:
+        ValueError: a kind that has no figures.
+    """
+    kind = facts.get("dataset/kind") or "spectrum"
+    if kind not in OF_KIND:
+        raise ValueError(f"a summary is of {kind!r}; figures are known of {', '.join(OF_KIND)}")
+    return kind
+
+
+def paired_values(samples: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return per-sample values whose means are the flat figures, so that their differences can be paired.
+
+    `nmse` is each sample's share, |e|^2 / mean |h|^2: its mean is the global NMSE.
+
+    >>> error, power = np.array([1.0, 3.0]), np.array([10.0, 30.0])
+    >>> float(paired_values({"error_power": error, "target_power": power, "mse": error})["nmse"].mean())
+    0.1
+    """
+    values = {name: column for name, column in samples.items() if name in FIGURES and name not in PARTS}
+    if "error_db" in samples:
+        values["mae_db"] = np.abs(samples["error_db"])
+    error, power = samples.get("error_power", samples["mse"]), samples["target_power"]
+    if np.nansum(power) > 0:
+        values["nmse"] = error / np.nanmean(power)
+    return values
 
 
 def main_figure(facts: Mapping[str, Any], prefix: str = "test") -> str:
     """Return the figure that methods are compared by; where rows were silent, these count too."""
-    kind: Scored = facts["dataset/kind"] if facts.get("dataset/kind") in DECIDING else "spectrum"
-    return deciding_figure({WITH_SILENT: facts.get(f"{prefix}/{WITH_SILENT}")}, kind)
+    return deciding_figure({WITH_SILENT: facts.get(f"{prefix}/{WITH_SILENT}")}, scored_kind(facts))
 
 
 def judged_by(facts: Mapping[str, Any], prefix: str = "test") -> dict[str, str]:
@@ -163,6 +197,11 @@ def score_heading(name: str) -> str:
 def sample_column(name: str) -> str:
     """Return the column of `per_sample.csv` that a figure is made of."""
     return _look_up(name).of_sample or name
+
+
+def is_root(name: str) -> bool:
+    """Return whether a figure is the root of a mean square of `sample_column`."""
+    return _look_up(name).root
 
 
 def is_ratio(name: str) -> bool:

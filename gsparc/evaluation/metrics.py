@@ -233,34 +233,13 @@ class PowerMetrics(SampleMetric):
 
 
 def power_errors(p: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Return `error_db`, `error_power`, `target_power`, `mse` (S,) of predictions and targets (S,),
-    linear.
-    """
+    """Return errors (S,) of linear predictions and targets (S,), in decibels and of the linear values."""
     positive = t > 0
     # A power of 0 or less has no decibels: it counts as the weakest that was measured.
     floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
     error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
     error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
     return {"error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
-
-
-def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return per-sample values whose means are the flat figures, so that their differences can be paired.
-
-    `nmse` is each sample's share, |e|^2 / mean |h|^2: its mean is the global NMSE.
-
-    >>> error, power = np.array([1.0, 3.0]), np.array([10.0, 30.0])
-    >>> float(paired_values({"error_power": error, "target_power": power, "mse": error})["nmse"].mean())
-    0.1
-    """
-    direct = ("ssim", "ssim_gauss", "ssim_padded", "psnr_db", "snr_db", "mse")
-    values: dict[str, np.ndarray] = {name: samples[name] for name in direct if name in samples}
-    if "error_db" in samples:
-        values["mae_db"] = np.abs(samples["error_db"])
-    error, power = samples.get("error_power", samples["mse"]), samples["target_power"]
-    if np.nansum(power) > 0:
-        values["nmse"] = error / np.nanmean(power)
-    return values
 
 
 def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, window: int) -> float:

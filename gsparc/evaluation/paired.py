@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import sample_column
+from gsparc.evaluation.metric_formats import is_ratio, is_root, lower_is_better, sample_column
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.table import Row
 from gsparc.processes.uncertainty import half_width, standard_error
@@ -113,15 +113,15 @@ def gains_of_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str)
     a, b = a + 0 * b, b + 0 * a  # NaN in one is NaN in both: the means are of the same rows
     if np.isfinite(a).sum() < 2:
         return None
-    if column == "psnr_db":
-        return a - b
-    if column == "error_power":
+    if is_ratio(figure):
         # The difference of logarithms, and to first order what each row adds to it.
         low, high = (max(float(np.nanmean(x)), np.finfo(float).tiny) for x in (a, b))
         return 10 / np.log(10) * (np.log(high / low) + b / high - a / low)
-    # a^2 - b^2 = (a - b) (a + b)
-    roots = sum(float(np.nanmean(x**2)) ** 0.5 for x in (a, b))
-    return (b**2 - a**2) / max(roots, np.finfo(float).tiny)
+    if is_root(figure):
+        # a^2 - b^2 = (a - b) (a + b)
+        roots = sum(float(np.nanmean(x**2)) ** 0.5 for x in (a, b))
+        return (b**2 - a**2) / max(roots, np.finfo(float).tiny)
+    return b - a if lower_is_better(figure) else a - b
 
 
 def lead_over_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str) -> Lead | None:

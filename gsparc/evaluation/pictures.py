@@ -159,7 +159,7 @@ def draw_calibration(
     left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
     left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
     left.set_title(title)
-    for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
+    for trial, colour in zip(trials, PALETTE, strict=False):
         broken = trial.summarise()["broken_of_all"]
         label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
         right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)

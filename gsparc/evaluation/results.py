@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.data.files import SUMMARY, load_yaml
-from gsparc.evaluation.metric_formats import DECIDING, main_figure, score_of
+from gsparc.evaluation.metric_formats import main_figure, score_of, scored_kind
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import dotted_settings
 from gsparc.models.registry import plain_methods
@@ -257,7 +257,7 @@ def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
     # Test rows alone: a seed may move those of validation only. Older summaries have one hash of all.
     shared["draw"] = str(facts.get("split/test_sha256", facts.get("split/sha256")))[:8]
-    shared["kind"] = shared["kind"] if shared["kind"] in DECIDING else "spectrum"
+    shared["kind"] = scored_kind(facts)
     shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts, prefix), "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}
     own = {name: facts.get(key) for name, key in OF_MODEL.items()}

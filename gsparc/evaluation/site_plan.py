@@ -21,7 +21,7 @@ from gsparc.data.checks.plausibility import find_outlier_rows
 from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
-from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.from_above import (
     OUTLINE,
     annotate,
@@ -60,9 +60,7 @@ class Spots:
 
 
 def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
-    """Return places of the moving end (of the receiver where both move),
-    the levels there and what looks wrong.
-    """
+    """Return places of the moving end, levels there and what looks wrong; of the receiver where both move."""
     site = data.site
     of_row = data.moving[:, -3:]
     # np.unique sorts by coordinate; `first` leads back to the order of measuring.
@@ -168,7 +166,7 @@ def _draw_map(
         axis.scatter(*tx.T, s=10, c="0.55", marker="s", linewidths=0, label="transmitter")
     name = "receiver" if site.moving_end == "rx" else "transmitter"
     if places.level_db is None or not np.isfinite(places.level_db[inside]).any():
-        axis.scatter(*places.place[inside].T, s=size, c="tab:blue", linewidths=0, label=name)
+        axis.scatter(*places.place[inside].T, s=size, c=PALETTE[0], linewidths=0, label=name)
     else:
         known = inside & np.isfinite(places.level_db)
         if (inside & ~known).any():
@@ -293,7 +291,7 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     for number, box in enumerate(objects.boxes + origin):
         label = f"boxes found ({len(objects.boxes)})" if not number else None
         axis.add_patch(
-            Rectangle(box[0, :2], *(box[1] - box[0])[:2], fill=False, hatch="///", ec="tab:blue", label=label)
+            Rectangle(box[0, :2], *(box[1] - box[0])[:2], fill=False, hatch="///", ec=PALETTE[0], label=label)
         )
     level = _draw_planes(axis, objects.planes, origin, low, high)
     if len(ends):

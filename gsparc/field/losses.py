@@ -13,10 +13,12 @@ from torch import Tensor
 
 from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
+from gsparc.data.target import Target, Values
 from gsparc.field.initial import Snapshot
 from gsparc.ops.similarity import has_similarity_kernel, similarity_op
 from gsparc.ops.transforms import carries_tangent
 
+SSIM_WEIGHT = 0.2  # of 1 - SSIM in the loss of a spectrum, the rest absolute error (the paper)
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
 
@@ -35,7 +37,7 @@ class LossSettings(Checked):
             not look at it.
     """
 
-    ssim_weight: float = setting(0.2, number(0, 1))
+    ssim_weight: float = setting(SSIM_WEIGHT, number(0, 1))
     snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
@@ -117,7 +119,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     return (_Kernel.apply if kernel else _ssim_by_convolution)(prediction, target)
 
 
-def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = SSIM_WEIGHT) -> Tensor:
     """Return (1 - l) L1 + l (1 - SSIM) per image (paper, eq. 6): (B, H, W) twice -> (B,).
 
     L1 alone for images smaller than SSIM's window, which have no SSIM.
@@ -125,21 +127,26 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
     absolute = (prediction - target).abs().mean(dim=(-2, -1))
     if ssim_weight == 0 or not fits_ssim_window(prediction):
         return absolute
-    return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
+    return weigh_losses(absolute, ssim(prediction, target), ssim_weight)
 
 
-def task_loss(prediction: Tensor, batch: Batch, settings: LossSettings) -> Tensor:
+def weigh_losses(absolute: Values, alike: Values, ssim_weight: float = SSIM_WEIGHT) -> Values:
+    """Return (1 - l) L1 + l (1 - SSIM) of both (B,)."""
+    return (1 - ssim_weight) * absolute + ssim_weight * (1 - alike)
+
+
+def task_loss(prediction: Tensor, batch: Batch, settings: LossSettings, of: Target) -> Tensor:
     """Return the loss (B,) of spectra, channels or powers; what was not measured counts as met.
 
     Args:
         prediction: like the targets of `batch`.
         batch: with targets and mask.
         settings: read as far as these targets need: what is not read has no effect, and is said.
+        of: facts of the targets.
     """
-    if prediction.is_complex():
-        return channel_loss(prediction, batch.target, batch.mask, settings.snapshot)
-    if prediction.dim() == 2:
-        return channel_loss(prediction, batch.target, batch.mask)
+    if not of.is_image:
+        snapshot = settings.snapshot if prediction.is_complex() else "none"
+        return channel_loss(prediction, batch.target, batch.mask, snapshot)
     if batch.mask is not None:
         prediction = torch.where(batch.mask, prediction, batch.target)
     return spectrum_loss(prediction, batch.target, settings.ssim_weight)

@@ -222,7 +222,7 @@ class GaussianModule(NetworkModule):
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Return the loss per sample (B,) before confidence; what was not measured counts as met."""
-        return task_loss(prediction, batch, self.loss)
+        return task_loss(prediction, batch, self.loss, self.site.target)
 
     def _render(self, batch: Batch) -> Rendered:
         try:

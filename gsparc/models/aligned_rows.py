@@ -32,7 +32,7 @@ from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import neighbour_weights
-from gsparc.processes.neighbourhood import median_spacing
+from gsparc.processes.neighbourhood import median_spacing, rows_with_nearest
 
 log = logging.getLogger(__name__)
 
@@ -218,10 +218,7 @@ class _Rows:
 
     def _neighbour_weights(self, kernel: Kernel) -> csr_array:
         """Weights (n, n) of the neighbours of each row in what the others say of it."""
-        index = cKDTree(self.places).query(self.places, k=min(NEIGHBOURS + 1, len(self.places)))[1]
-        mine = index == np.arange(len(index))[:, None]
-        mine[~mine.any(1), -1] = True  # of many rows at one place, itself is not among the nearest
-        near = index[~mine].reshape(len(index), -1)
+        near = rows_with_nearest(self.places, np.arange(len(self.places)), NEIGHBOURS)[:, 1:]
         weight = np.empty(near.shape)
         for part in np.array_split(np.arange(len(near)), -(-len(near) // AT_ONCE)):
             at, around = torch.from_numpy(self.places[part]), torch.from_numpy(self.places[near[part]])

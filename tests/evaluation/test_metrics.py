@@ -15,6 +15,7 @@ from gsparc.evaluation.metric_formats import (
     FIGURES,
     OF_KIND,
     lower_is_better,
+    paired_values,
     score_heading,
     score_of,
 )
@@ -22,7 +23,6 @@ from gsparc.evaluation.metrics import (
     ChannelMetrics,
     PowerMetrics,
     SpectrumMetrics,
-    paired_values,
 )
 
 

@@ -25,7 +25,7 @@ from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Scans, group_snapshots
 from gsparc.data.errors import DataError
 from gsparc.evaluation.console import to_dict
-from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Column, Table
@@ -226,7 +226,7 @@ def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np
         shade = np.maximum(density[order], density.max() - 12)
         axis.add_collection(PatchCollection(boxes, cmap="Blues", linewidth=0, array=shade))
         axis.plot(*known[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
-        axis.plot(*one.place[:2], "x", color="#D55E00", label="located")
+        axis.plot(*one.place[:2], "x", color=PALETTE[1], label="located")
         if true is not None:
             axis.plot(*true[number, :2], "o", markerfacecolor="none", color="black", label="heard at")
         axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

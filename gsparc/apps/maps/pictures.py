@@ -25,7 +25,7 @@ from gsparc.evaluation.drawing import panels, save
 from gsparc.prediction.predictor import Predictor
 
 MOST_OVERLAP = 5.0  # stations that the colours end with
-GREY = "#AAAAAA"  # of values that are not known
+UNKNOWN = "#AAAAAA"  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
 MOST_COLOURS = 10
@@ -48,7 +48,7 @@ class Legend:
         """Return colours (..., 3) uint8 of values (...); grey where they are not finite."""
         # Masked: what is infinite is grey, too, instead of the colour of an end.
         share = Normalize(self.low, self.high, clip=True)(np.ma.masked_invalid(values))
-        return colormaps[self.colours].with_extremes(bad=GREY)(share, bytes=True)[..., :3]
+        return colormaps[self.colours].with_extremes(bad=UNKNOWN)(share, bytes=True)[..., :3]
 
     @classmethod
     def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format
+from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format, sample_column
 from gsparc.evaluation.paired import Lead, lead_over_runs
 from gsparc.evaluation.results import average, distinct_baselines, own_rows
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table, figure_column
@@ -57,7 +57,7 @@ def interval_of_figure(row: Row, figure: str) -> Interval | None:
 def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
     """Per-sample numbers whose (weighted) mean is the figure."""
     # The ratio of sums, not a mean of ratios, which one silent row would decide.
-    if figure == "nmse" and "error_power" in own and "target_power" in own:
+    if sample_column(figure) == "error_power" and "error_power" in own and "target_power" in own:
         known = np.isfinite(own["error_power"])
         return own["error_power"][known], own["target_power"][known]
     values = own.get(figure)

@@ -51,7 +51,7 @@ def choose_kernel(
     vectors: np.ndarray, positions: np.ndarray, images: np.ndarray, matrix: np.ndarray, wavelength: float,
     partner: np.ndarray | None, seed: int = 0,
 ) -> ChosenKernel:  # fmt: skip
-    """Choose a kernel.
+    """Choose the kernel of the least mean logarithm of errors at rows left out; return these errors, too.
 
     Args:
         vectors: (n, M) complex, phases and twins unknown.

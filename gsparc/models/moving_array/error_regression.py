@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.models.relative_error import LEAST_ERROR, RelativeErrorRegression
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import Kernel, matern32
+from gsparc.processes.neighbourhood import rows_with_nearest
 from gsparc.processes.stored import Stored
 
 NEIGHBOURS = 16  # whose leave-one-out errors are averaged, and on which variances are conditioned
@@ -99,10 +99,9 @@ def fit_errors(
     `kernel`, `reach` and `prior` are `ImageErrors`'s.
     """
     errors = relative_error.clamp_min(LEAST_ERROR).log()
-    looked_at = np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1)
-    distance, rows = map(torch.from_numpy, cKDTree(places).query(places, k=looked_at))
-    distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
-    near, known = rows[:, :NEIGHBOURS], torch.from_numpy(places)
+    rows = torch.from_numpy(rows_with_nearest(places, np.arange(len(places)), NEIGHBOURS))
+    others, near, known = rows[:, 1:], rows[:, :NEIGHBOURS], torch.from_numpy(places)
+    distance = (known[others] - known[:, None]).norm(dim=2).float()
     columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
     regression = RelativeErrorRegression.from_rows(columns, relative_error)
     precision, farthest = (_precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M))

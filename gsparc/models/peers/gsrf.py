@@ -89,7 +89,7 @@ class ComplexGaussians(GaussianNetwork):
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the base's, and for spectra the mean squared distance of the two-dimensional transforms."""
         seen = self(batch)
-        plain = task_loss(seen, batch, self.losses).mean()
+        plain = task_loss(seen, batch, self.losses, self.scene.site.target).mean()
         # A transform mixes all pixels, those that were not measured among them.
         if self.response is not None or batch.mask is not None or not self.fourier_weight:
             return plain

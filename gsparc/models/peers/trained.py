@@ -79,7 +79,7 @@ class Network(nn.Module):
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the training loss () of a batch; `generator` for whatever is drawn at random."""
-        return task_loss(self(batch), batch, self.losses).mean()
+        return task_loss(self(batch), batch, self.losses, self.scene.site.target).mean()
 
     @torch.no_grad()
     def rendered(self, query: Query) -> Tensor:

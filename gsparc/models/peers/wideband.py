@@ -109,7 +109,8 @@ class FrequencyEmbedded(GaussianNetwork):
         """Return the base's, and the pull of all changes towards none."""
         changes = self._changes_at(batch)
         pull = torch.stack([change.square().mean() for change in changes]).sum()
-        return task_loss(self._render(batch, changes), batch, self.losses).mean() + PULL * pull
+        plain = task_loss(self._render(batch, changes), batch, self.losses, self.scene.site.target)
+        return plain.mean() + PULL * pull
 
 
 @dataclass(eq=False, kw_only=True)

@@ -14,6 +14,7 @@ from gsparc.evaluation.experiment.table import (
     split_by_problem,
     title_of,
 )
+from gsparc.evaluation.metric_formats import is_root, main_figure, sample_column, score_of
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.plots import draw_efforts
 
@@ -142,15 +143,22 @@ def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
     assert "; 2.00 ± 0.41 dB before idw (standard error over the same 4 test rows): they are told" in said
 
 
-@pytest.mark.parametrize(("figure", "column"), [("nmse", "error_power"), ("rmse_db", "error_db")])
-def test_gains_of_rows_have_the_difference_of_scores_as_their_mean(figure, column):
+@pytest.mark.parametrize("figure", ["psnr_db", "ssim", "mse", "mae", "nmse", "rmse_db"])
+def test_gains_of_rows_have_the_difference_of_scores_as_their_mean(figure):
+    # Figures but three were taken for roots of mean squares: a higher SSIM was a loss.
+    column, power = sample_column(figure), 2 if is_root(figure) else 1
     one, other = (
         pd.DataFrame({column: np.random.default_rng(seed).exponential(seed, 50)}) for seed in (1, 2)
     )
-    means = [(frame[column] ** (2 if figure == "rmse_db" else 1)).mean() for frame in (one, other)]
-    score = (lambda x: -(x**0.5)) if figure == "rmse_db" else (lambda x: -10 * np.log10(x))
+    means = [(frame[column] ** power).mean() ** (1 / power) for frame in (one, other)]
     lead = lead_over_rows(one, other, figure)
-    assert lead.ahead_db == pytest.approx(score(means[0]) - score(means[1])) and lead.error_db > 0
+    assert lead.ahead_db == pytest.approx(score_of(figure, means[0]) - score_of(figure, means[1]))
+    assert lead.error_db > 0
+
+
+def test_a_summary_of_an_unknown_kind_is_no_spectrum():
+    with pytest.raises(ValueError, match="a summary is of 'delay'; figures are known of spectrum"):
+        main_figure({"dataset/kind": "delay"})
 
 
 def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, monkeypatch):
