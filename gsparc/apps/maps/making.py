@@ -11,11 +11,12 @@ import torch
 
 from gsparc.apps.maps import field_map
 from gsparc.apps.maps.area import Grid, lay_grid
-from gsparc.apps.maps.field_map import FieldMap, best_server, server_chance, sinr
+from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import sample_adaptively
+from gsparc.apps.maps.scoring import Scoring
 from gsparc.data import limits
 from gsparc.data.errors import DataError
 from gsparc.data.executor import run_each
@@ -96,81 +97,83 @@ def predict_map(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
-    # Of what was not heard the level that it lies below; to whole decibels, as next to nothing lies between.
-    lowest = -np.inf if promise is None else float(promise.evidence.level_db.min())
-    if threshold_db <= np.ceil(lowest):
-        said = f"threshold_db={threshold_db + level.raised_db:g} is at or below what was measured"
-        notes.append(f"{said} (lowest {lowest + level.raised_db:.4g}): it says nothing of weaker places")
-    highest = np.inf if promise is None else float(promise.evidence.level_db.max())
-    if threshold_db > highest:
-        said = f"threshold_db={threshold_db + level.raised_db:g} is above all that was measured"
-        notes.append(f"{said} (highest {highest + level.raised_db:.4g}): hardly any place can reach it")
+    notes += _notes_of_threshold(threshold_db, promise, level)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
-    every, computed, stride = np.flatnonzero(grid.inside), 0, 1
+    every, stride = np.flatnonzero(grid.inside), 1
     if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
         # Cells asked about everywhere are no farther apart than what was measured.
         stride = max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
-    joint = joint_levels(predictor, grid.places(every[:1]), numbers) is not None
-    alike = np.zeros_like(values["power_db"])
-    size = len(names) if joint else 1  # stations that are asked about at once
-    for row in range(0, len(names), size):
-        chosen = slice(row, row + size)  # the model's own deviations, until the promise scales them
-        ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
-        parts, count = sample_adaptively(ask, grid.inside, stride, tolerance_db)
-        parts = parts.reshape(-1, size, *grid.inside.shape)
-        values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
-        alike[chosen] = parts[2] if joint else 0.0
-        computed += count * size
+    alike, computed = _fill_levels(values, predictor, grid, other_end, names, numbers, stride, tolerance_db)
     if computed < len(names) * len(every):
         most = f"{computed} of {len(names) * len(every)} levels were predicted"
         notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
-    floor = _hearing_floors(promise, numbers, noise_db)
+    scoring = Scoring(
+        calibration, numbers, load_of, carrier, _hearing_floors(promise, numbers, noise_db), threshold_db,
+        noise_db, loss,
+    )  # fmt: skip
+    values["overlap"] = np.full(grid.inside.shape, np.nan, np.float32)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
-    overlap, errors_alike = np.full(grid.inside.size, np.nan, np.float32), alike.reshape(len(names), -1)
     for cells in _chunks(every, BANDS):
         mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
         far = np.zeros(mean.shape)
         if promise is not None:
             local = to_local(site, grid.places(cells), other_end)
             far = np.stack([promise.distance(local, number) for number in numbers])
-        half, error = calibration.half_and_error(spread, far, numbers[:, None])
-        related = errors_alike[:, cells]
-        if loss is not None and grid.indoors is not None:
-            lost, doubt = np.outer(loss, grid.indoors.reshape(-1)[cells])
-            wider, strongest = np.hypot(error, doubt), (mean.argmax(0), np.arange(len(cells)))
-            # What is not known of the loss is one error of all stations.
-            related = (related * error * error[strongest] + doubt**2) / (wider * wider[strongest])
-            mean, half, error = mean - lost, np.hypot(half, half_width(share) * doubt), wider
-        # The strongest before anything is refused, to which `alike` is the correlation.
-        first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
-        error = np.where(np.isfinite(mean), error, np.nan)
-        # To float32 before comparing: what is stored decides the best server.
-        power, error = mean.astype(np.float32), error.astype(np.float32)
-        best = best_server(power)
-        strongest = np.maximum(best, 0), np.arange(len(best))
-        below = calibration.probability_below(threshold_db, power[strongest], error[strongest])
-        alike_here = np.where(first == best, np.nan_to_num(related), 0.0)
-        part = {
-            "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
-            "best_server": best, "sinr_db": sinr(power, load_of, noise_db, carrier),
-            "server_chance": server_chance(power, error, floor, alike_here),
-            "outage": field_map.outage_probability(power, error, threshold_db, alike_here, below),
-        }  # fmt: skip
-        for name, layer in part.items():
+        indoors = None if grid.indoors is None else grid.indoors.reshape(-1)[cells]
+        related = alike.reshape(len(names), -1)[:, cells]
+        for name, layer in scoring.layers(mean, spread, related, far, indoors).items():
             flat[name][..., cells] = layer
-        overlap[cells] = field_map.count_overlap(power, carrier)
     if promise is not None and not np.isfinite(values["power_db"]).any():
         fault = f"every square lies more than {calibration.reach:.3g} m from what was measured"
         raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
-    extra = {} if len(names) == 1 else {"overlap": overlap.reshape(grid.inside.shape)}
+    overlap = values.pop("overlap")
+    extra = {} if len(names) == 1 else {"overlap": overlap}
     known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
         grid, **values, share=share, calibrated=promise is not None,
         threshold_db=threshold_db, extra=extra, places=np.unique(known, axis=0), notes=tuple(notes),
         unit=site.level_unit, **about,
     ).to_unit(level.raised_db, level.name)  # fmt: skip
+
+
+def _notes_of_threshold(threshold_db: float, promise: Promise | None, level: PowerUnit) -> list[str]:
+    """Say where a threshold [dB] lies outside of what was measured; levels are named in the map's unit."""
+    if promise is None:
+        return []
+    measured, threshold = promise.evidence.level_db + level.raised_db, threshold_db + level.raised_db
+    # Of what was not heard the level that it lies below; to whole decibels, as next to nothing lies between.
+    if threshold_db <= np.ceil(measured.min() - level.raised_db):
+        at = f"threshold_db={threshold:g} is at or below what was measured (lowest {measured.min():.4g})"
+        return [f"{at}: it says nothing of weaker places"]
+    if threshold > measured.max():
+        at = f"threshold_db={threshold:g} is above all that was measured (highest {measured.max():.4g})"
+        return [f"{at}: hardly any place can reach it"]
+    return []
+
+
+def _fill_levels(
+    values: dict[str, np.ndarray], predictor: Predictor, grid: Grid, other_end: Sequence[float] | None,
+    names: Sequence[str], numbers: np.ndarray, stride: int, tolerance_db: float,
+) -> tuple[np.ndarray, int]:  # fmt: skip
+    """Write levels and the model's own deviations to `values`.
+
+    Return the correlation (T, ny, nx) of errors with the strongest's, and how many levels were predicted.
+    """
+    first, computed = grid.places(np.flatnonzero(grid.inside)[:1]), 0
+    joint = joint_levels(predictor, first, numbers) is not None
+    alike = np.zeros_like(values["power_db"])
+    size = len(names) if joint else 1  # stations that are asked about at once
+    for row in range(0, len(names), size):
+        chosen = slice(row, row + size)
+        ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
+        parts, count = sample_adaptively(ask, grid.inside, stride, tolerance_db)
+        parts = parts.reshape(-1, size, *grid.inside.shape)
+        values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
+        alike[chosen] = parts[2] if joint else 0.0
+        computed += count * size
+    return alike, computed
 
 
 def uncalibrated(share: float) -> IntervalScales:
