@@ -1,7 +1,7 @@
 """Maps that are told of later rows, beside what else could be done: docs/results/changes.csv.
 
-    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [priors]
-                            [seconds] [updates] [kills]
+    python bench/changes.py [rooms] [networks] [detections] [months] [rounds] [campaigns] [priors]
+                            [cells] [seconds] [updates] [kills]
 
 Room and network are simulated here; months of a library and rounds of a garage are looked for in
 ../shared/data/change. Errors are of places that nobody told of, rmse [dB].
@@ -16,8 +16,10 @@ import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
+import rasterio
 import torch
 from scipy.spatial import cKDTree
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -35,10 +37,15 @@ from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.settings import SceneSettings
 
+sys.path.append(str(Path(__file__).parents[1] / "tests/helpers"))
+import networks as simulated
+
 MEASURED = Path(__file__).parents[2] / "shared/data/change"
 OUT = Path(__file__).parents[1] / "docs/results/changes.csv"
 SIDE, STATIONS, KEPT = 40.0, 30, 80
 DRAWS, READINGS, BEGINS = 200, 1000, 300
+SILENCE = 1e-12  # power of what is heard where nothing arrives [mW]
+LISTED, SHADOWING = 6, ("COMMON_DB", "OWN_DB")  # cells in a list; deviations of `simulated`
 UPDATES, EACH, KILLS = 100_000, 1000, 20
 
 
@@ -84,8 +91,11 @@ def rmse(predicted, truth):
     return round(float(np.sqrt(np.nanmean((predicted - truth) ** 2))), 3)
 
 
-def judge(name, model, places, levels, told):
-    """Rows of results of one later survey: told of some places, asked about the others."""
+def judge(name, model, places, levels, told, alone=None):
+    """Rows of results of one later survey: told of some places, asked about the others.
+
+    `alone`: other arguments of a model of the places told alone, beside it; None: there is none.
+    """
     at, which = np.unique(places, axis=0, return_inverse=True)
     which, static = which.reshape(-1), model.rssi(rx=places)
     miss, order = np.ma.masked_invalid(levels - static), np.random.default_rng(0).permutation(len(at))
@@ -99,6 +109,9 @@ def judge(name, model, places, levels, told):
             "one constant each, of the places told": static + miss[new].mean(0).filled(0),
             "one constant each, of all later rows": static + miss.mean(0).filled(0),
         }  # fmt: skip
+        if alone is not None:
+            trained = gsparc.fit(rx=places[new], rssi=levels[new], **alone)
+            ways["trained on the places told"] = trained.rssi(rx=places)
         for way, said in ways.items():
             spent = round(seconds, 3) if way == "updated" else ""
             yield name, f"{count} places", way, rmse(said[~new], levels[~new]), spent
@@ -116,32 +129,54 @@ def networks():
         yield from judge(f"office {seed}, as before", model, later, network(later, seed, False), (5, 20))
 
 
+def was_and_is(level, *places):
+    """Of each places (n, 3): them, and levels (n,) before and later."""
+    return [(at, level(at, False), level(at)) for at in places]
+
+
 def disc():
     """A smooth field, then a screen of 12 dB in a disc of 4 m; rows are in and around it."""
     asked, near = draw(3000, 11, 20.0), draw(4000, 6, 20.0)
-
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6]
-    return "room", [9.0, 9.0, 2.6], draw(300, 0, 20.0), near, asked, screened
+    return "room", [9.0, 9.0, 2.6], *was_and_is(screened, draw(300, 0, 20.0), near, asked)
 
 
-def cabinet():
-    """A shoebox of 14 x 10 m, simulated, whose cabinet is moved; rows are where that changes 3 dB."""
-    post, moves = [2.0, 5.0, 2.6], [{"name": "box0", "by_m": [0.0, 4.0, 0.0]}]
-    room = {"size_m": [14.0, 10.0, 3.0], "boxes_m": [[[8.0, 2.0, 0.0], [9.0, 4.0, 2.5]]], "reflection": -0.5}
-    facts = {"name": "cabinet", "carrier_hz": 2.44e9, "bandwidth_hz": 0.0, "subcarriers": 1, "room": room}
-    facts |= {"transmitter_m": post, "area_m": [[0.3, 0.3], [13.7, 9.7]]}
+def traced(name, moved, effects, counts, apart_m, **facts):
+    """A simulated change; rows are nearer than `apart_m` to where it changes 3 dB.
+
+    `counts`: of places asked and of those that rows are drawn from.
+    """
+    facts |= {"name": name, "carrier_hz": 2.44e9, "bandwidth_hz": 0.0, "subcarriers": 1}
     before, asked, near = (
-        build_survey(SceneSettings(num_receivers=count, seed=seed, moved=moved, **facts), Sampling())
-        for count, seed, moved in ((300, 0, []), (3000, 11, moves), (1000, 6, moves))
+        build_survey(SceneSettings(num_receivers=count, seed=seed, moved=later, **facts), Sampling())
+        for count, seed, later in zip((300, *counts), (0, 11, 6), ([], moved, moved), strict=True)
     )
 
     def level(places, later=True):
-        paths = (asked if later else before).engine.trace(places, Effects())
-        return 10 * np.log10(paths.received_power())
+        paths = (asked if later else before).engine.trace(places, effects)
+        return 10 * np.log10(paths.received_power() + SILENCE)
 
-    changed = np.abs(level(near.places) - level(near.places, False)) > 3
-    apart = cKDTree(near.places[changed]).query(near.places)[0]
-    return "cabinet", post, before.places, near.places[apart < 0.5], asked.places, level
+    told = was_and_is(level, before.places, near.places, asked.places)
+    places, was, now = told[1]
+    there = cKDTree(places[np.abs(now - was) > 3]).query(places)[0] < apart_m
+    told[1] = places[there], was[there], now[there]
+    return name, before.engine.transmitter, *told
+
+
+def cabinet():
+    """A shoebox of 14 x 10 m, whose cabinet is moved."""
+    room = {"size_m": [14.0, 10.0, 3.0], "boxes_m": [[[8.0, 2.0, 0.0], [9.0, 4.0, 2.5]]], "reflection": -0.5}
+    where = {"transmitter_m": [2.0, 5.0, 2.6], "area_m": [[0.3, 0.3], [13.7, 9.7]], "room": room}
+    moved = [{"name": "box0", "by_m": [0.0, 4.0, 0.0]}]
+    return traced("cabinet", moved, Effects(), (3000, 1000), 0.5, **where)
+
+
+def building():
+    """A town of 180 x 190 m with a mast on a roof, and a building of 37 x 23 x 20 m that is new."""
+    where = {"file": str(OUT.parents[2] / "examples/town.osm"), "over": "ground", "open_sky": True}
+    mast, area = {"name": "roof", "position_m": [20, 45], "height_m": 3}, [[-90.0, -75.0], [90.0, 115.0]]
+    moved, less = [{"box_m": [[33, 74, 0], [70, 97, 20]]}], Effects(diffuse=False)
+    return traced("town", moved, less, (700, 700), 5.0, transmitters=[mast], area_m=area, **where)
 
 
 def space_time(before, heard, new, told, asked):
@@ -157,12 +192,10 @@ def space_time(before, heard, new, told, asked):
 
 def rooms():
     """One transmitter, 300 rows with 1 dB of noise; then something is moved, and rows in and around tell."""
-    for name, post, before, near, asked, level in (disc(), cabinet()):
-        heard = level(before, False) + np.random.default_rng(2).normal(size=len(before))
-        told = level(near) + np.random.default_rng(3).normal(size=len(near))
-        truth, changed, right = (
-            level(asked), *(np.abs(level(at) - level(at, False)) > 3 for at in (asked, before))
-        )  # fmt: skip
+    for name, post, (before, was, now), (near, _, told), (asked, static, truth) in (one() for one in ROOMS):
+        heard = was + np.random.default_rng(2).normal(size=len(before))
+        told = told + np.random.default_rng(3).normal(size=len(near))
+        changed, right = np.abs(truth - static) > 3, np.abs(now - was) > 3
         fixed = {"tx": post, "model": "gp"}
         model = gsparc.fit(rx=before, rssi=heard, **fixed)
         for count in (5, 10, 20, 50):
@@ -257,40 +290,92 @@ def measured(file, epoch):
         yield from judge(f"{epoch} {number}", model, places[own], levels[own], (5, fifth))
 
 
+def campaigns():
+    """Powers of a robot at every fourth antenna of a ceiling: a campaign learns, the next one tells."""
+    data = np.load(MEASURED.parent / "real/techtile-csi-920mhz.npz")
+    levels = 20 * np.log10(np.abs(np.where(data["mask"], data["csi"], np.nan))[:, ::4])
+    places, later = data["tx_position"], data["run"] == "EXP006"
+    fixed = {"station_position": data["rx_antenna_position"][::4], "model": "gp"}
+    model = gsparc.fit(rx=places[~later], rssi=levels[~later], **fixed)
+    yield from judge("EXP005 then EXP006", model, places[later], levels[later], (5, 20, 50, 119), fixed)
+
+
+def judge_maps(axis, cases):
+    """Rows of results of maps from before any row, means over towns.
+
+    Args:
+        axis: (n,) centres of squares, both ways [m].
+        cases: of each town the rows that are known, places and levels (Q, T) that are asked, names of
+            stations, and levels (n * n, T) of each map.
+    """
+    squares, errors, spent = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2), [], 0.0
+    step = axis[1] - axis[0]
+    how = {"width": len(axis), "height": len(axis), "dtype": "float64", "driver": "GTiff"}
+    how["transform"] = rasterio.transform.from_origin(axis[0] - step / 2, axis[-1] + step / 2, step, step)
+    for known, asked, truth, names, maps in cases:
+        row = {"no map": rmse(gsparc.fit(**known).rssi(rx=asked), truth)}
+        for name, levels in maps.items():
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / "map.tif"
+                with rasterio.open(file, "w", count=len(names), **how) as raster:
+                    raster.write(levels.T.reshape(-1, len(axis), len(axis))[:, ::-1])
+                    raster.descriptions = [f"power_db {one}".strip() for one in names]
+                began = time.monotonic()
+                found = gsparc.fit(**known, settings={"prior": file})
+                spent = max(spent, time.monotonic() - began)
+            row[name] = rmse(found.rssi(rx=asked), truth)
+            row[f"{name}, alone"] = rmse(levels[cKDTree(squares).query(asked[:, :2])[1]], truth)
+        errors.append(row)
+    for name in errors[0]:
+        ratio = [row[name] / row["no map"] for row in errors]
+        yield name, "mean", round(float(np.mean([row[name] for row in errors])), 3), round(spent, 2)
+        yield name, "most of no map's", round(max(ratio), 3), round(spent, 2)
+
+
 def priors():
     """Towns whose planned map misses shadowing, has 6 dB too little, lies 30 m off, or is another town's."""
     axis = np.arange(5.0, 700, 10)
     squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
 
+    def case(town, count):
+        places = draw(count + 400, 100 + town, 600.0) + np.array([50, 50, 0])
+        level = planned(places, town) + 0.75 * field(places, town + 20, 30.0)
+        level += np.random.default_rng(town).normal(0, 1, len(places))
+        known = {"rx": places[:count], "tx": [0.0, 0, 20], "rssi": level[:count]}
+        maps = {
+            "misses shadowing": planned(squares, town), "6 dB too low": planned(squares, town) - 6,
+            "30 m off": planned(squares - [30, 0], town), "another town's": planned(squares, town + 50),
+        }  # fmt: skip
+        return known, places[count:], level[count:, None], [""], {n: one[:, None] for n, one in maps.items()}
+
     for count in (5, 10, 20, 50, 100):
-        errors, spent = [], 0.0
-        for town in range(1, 7):
-            places = draw(count + 400, 100 + town, 600.0) + np.array([50, 50, 0])
-            level = planned(places, town) + 0.75 * field(places, town + 20, 30.0)
-            level += np.random.default_rng(town).normal(0, 1, len(places))
-            known, truth = {"rx": places[:count], "tx": [0.0, 0, 20], "rssi": level[:count]}, level[count:]
-            maps = {
-                "misses shadowing": planned(squares, town), "6 dB too low": planned(squares, town) - 6,
-                "30 m off": planned(squares - [30, 0], town), "another town's": planned(squares, town + 50),
-            }  # fmt: skip
-            row = {"no map": rmse(gsparc.fit(**known).rssi(rx=places[count:])[:, 0], truth)}
-            for name, levels in maps.items():
-                with tempfile.TemporaryDirectory() as folder:
-                    file = Path(folder) / "map.npz"
-                    at = np.c_[squares, np.full(len(squares), 1.5)]
-                    np.savez(file, rx_position=at, tx_position=[0.0, 0, 20], rssi_db=levels)
-                    began = time.monotonic()
-                    found = gsparc.fit(**known, settings={"prior": file})
-                    spent = max(spent, time.monotonic() - began)
-                row[name] = rmse(found.rssi(rx=places[count:])[:, 0], truth)
-                near = cKDTree(squares).query(places[count:, :2])[1]
-                row[f"{name}, alone"] = rmse(levels[near], truth)
-            errors.append(row)
-        for name in errors[0]:
-            ratio = [row[name] / row["no map"] for row in errors]
-            mean = round(float(np.mean([row[name] for row in errors])), 3)
-            yield f"six towns, {name}", f"{count} rows", "mean", mean, round(spent, 2)
-            yield f"six towns, {name}", f"{count} rows", "most of no map's", round(max(ratio), 3), ""
+        for name, *figures in judge_maps(axis, (case(town, count) for town in range(1, 7))):
+            yield f"six towns, {name}", f"{count} rows", *figures
+
+
+def cells():
+    """Networks with a map of each cell, that misses shadowing, has 6 dB too little, or is another town's."""
+    axis = np.arange(25.0, simulated.SIDE_M, 50)
+    squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+
+    def town(seed, shadows):
+        asked = np.r_[squares, np.random.default_rng(seed).uniform(0, simulated.SIDE_M, (250, 2))]
+        with patch.multiple(simulated, **{one: shadows * getattr(simulated, one) for one in SHADOWING}):
+            return simulated.draw_network(seed, 0, 300, asked)
+
+    def case(seed, count):
+        one, flat, other = town(seed, 1), town(seed, 0), town(seed + 50, 0)
+        known = one.arrays(LISTED)
+        heard = np.random.default_rng(seed).permutation(len(one.moment))[: count // LISTED]
+        rows = np.isin(np.nonzero(one.listed(LISTED))[0], heard)
+        known |= {name: known[name][rows] for name in ("rx_position", "station", "rssi_db")}
+        maps = {"misses shadowing": flat.truth, "6 dB too low": flat.truth - 6, "another town's": other.truth}
+        maps = {name: level[: len(squares)] for name, level in maps.items()}
+        return known, one.asked[len(squares) :], one.truth[len(squares) :], known["station_name"], maps
+
+    for count in (48, 198, 996):
+        for name, *figures in judge_maps(axis, (case(seed, count) for seed in range(1, 5))):
+            yield f"four networks, {name}", f"{count} rows", *figures
 
 
 def world():
@@ -416,26 +501,18 @@ def kills():
                 len(after.rows) in (done, done + 1) and (after.rssi(rx=asked) == known[len(after.rows)]).all()
             )
         left = len(list(Path(folder).iterdir())) - 1
-    yield (
-        "killed at random",
-        f"{KILLS} kills, {writes} writes",
-        "the state before, or after, bit for bit",
-        int(whole),
-        "",
-    )
-    yield (
-        "killed at random",
-        f"{KILLS} kills, {writes} writes",
-        "updates lost that were said to be stored",
-        lost,
-        "",
-    )
-    yield "killed at random", f"{KILLS} kills, {writes} writes", "partial files left", left, ""
+    figures = {
+        "the state before, or after, bit for bit": int(whole),
+        "updates lost that were said to be stored": lost, "partial files left": left,
+    }  # fmt: skip
+    for way, figure in figures.items():
+        yield "killed at random", f"{KILLS} kills, {writes} writes", way, figure, ""
 
 
+ROOMS = disc, cabinet, building
 PARTS = {
-    "networks": networks, "rooms": rooms, "detections": detections, "priors": priors,
-    "seconds": seconds, "updates": updates, "kills": kills,
+    "networks": networks, "rooms": rooms, "detections": detections, "priors": priors, "cells": cells,
+    "campaigns": campaigns, "seconds": seconds, "updates": updates, "kills": kills,
     "months": lambda: measured("library-months.npz", "month"),
     "rounds": lambda: measured("garage-rounds.npz", "round"),
 }  # fmt: skip

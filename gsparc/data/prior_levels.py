@@ -14,7 +14,7 @@ from gsparc.data.schema import Measurements
 
 BAND = "power_db"  # of the strongest station, as `gsparc map` writes; with a name behind it of one of several
 MOST = 4_000_000  # levels: they are kept with a model
-ABOUT_M = 100.0  # least distance from the rows' box that levels are kept within [m]
+ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
 
 
 def read_prior_levels(
@@ -49,9 +49,10 @@ def read_prior_levels(
             f"x {a:.0f} to {b:.0f}, y {c:.0f} to {d:.0f} m" for (a, b), (c, d) in map(_extent, (points, at))
         )
         raise DataError(f"model.prior={path}: it is of {box}, and all rows lie elsewhere: {rows}")
-    # Of a whole country only what lies about the rows is kept.
-    margin = max(float(np.ptp(at, axis=0).max()), ABOUT_M)
-    near = ((points >= at.min(0) - margin) & (points <= at.max(0) + margin)).all(1)
+    # Of a whole country only what lies about rows and stations is kept.
+    margin, still = max(float(np.ptp(at, axis=0).max()), ABOUT_M), data.site.still_places[:, :2]
+    ends = np.r_[at, still[np.isfinite(still).all(1)] + data.site.origin[:2]]
+    near = ((points >= ends.min(0) - margin) & (points <= ends.max(0) + margin)).all(1)
     if near.sum() > MOST:
         raise DataError(
             f"model.prior={path}: {near.sum():,} levels about the rows; {MOST:,} at most are kept"

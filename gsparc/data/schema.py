@@ -225,6 +225,11 @@ class Site:
         return tx if self.static_end == "rx" else place
 
     @property
+    def has_several_stations(self) -> bool:
+        """Whether rows are of two stations or more."""
+        return self.stations is not None and len(self.stations) > 1
+
+    @property
     def still_places(self) -> np.ndarray:
         """Local places (T, 3) float64 [m] of the static ends, NaN where unknown; (1, 3) where both move."""
         if self.stations is not None:

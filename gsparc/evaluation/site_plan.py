@@ -83,7 +83,7 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
 
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
     """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
-    several = data.site.stations is not None and len(data.site.stations) > 1
+    several = data.site.has_several_stations
     if data.site.target.is_image:
         return None, ""
     power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)

@@ -49,7 +49,7 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
     Raises:
         ValueError: both ends move, and the method knows one that does.
     """
-    if data.site.stations is not None and len(data.site.stations) > 1:
+    if data.site.has_several_stations:
         return PerStation(factory)
     if data.site.static_end is None and not factory.both_ends:
         raise ValueError(f"{factory.name}: both ends move here; it needs one that stands still")

@@ -39,7 +39,7 @@ ALIKE, COUNTS = (
     2,
 )  # prior variance of what all stations of a place miss alike [dB^2]; places it counts as
 WHOLE = 4  # power of the share of the place that rows lie in: whether a lone station was moved
-AWAY = 1 / 4  # length over which rows of a moved station tell against the map, as a share of the site
+AWAY = 1 / 10  # length over which rows of a lone station that seems moved void the map: a local change's
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
 TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes

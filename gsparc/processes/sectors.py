@@ -86,7 +86,11 @@ class Sectors(Trend):
 
     def mean(self, places: Tensor) -> Tensor:
         """See `Trend`."""
-        return self.powers_at(places, self.shared, self.levels)
+        return self.powers_at(places, self.shared, self.levels) + self.known_mean(places)
+
+    def known_mean(self, places: Tensor) -> Tensor:
+        """Return what `more` terms have as their mean (n,) [dB]."""
+        return sum((one.mean(places) for one in self.more), places.new_zeros(len(places)))
 
     def powers_at(  # type: ignore[override]
         self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None
@@ -150,7 +154,9 @@ class Sectors(Trend):
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
         own = (self.indicators[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
-        return mean, torch.cat([own, self.shared_columns(places, slopes) @ self.doubt], 1) / self.unit
+        return mean + self.known_mean(places), torch.cat(
+            [own, self.shared_columns(places, slopes) @ self.doubt], 1
+        ) / self.unit
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 from rooms_later import draw, later_rows
 
 from gsparc.processes import changes
-from gsparc.processes.changes import KINDS, LaterRows, correct, innovations, learn
+from gsparc.processes.changes import KINDS, Belief, LaterRows, correct, innovations, learn
 from gsparc.processes.factor import Factor
 
 EXTENT = 28.0
@@ -66,6 +66,16 @@ def test_a_common_offset_is_not_believed_where_places_differ():
     alike = [replace(one, missed=one.missed - 3) for one in rows]
     assert abs(learn(dict(enumerate(turned)), EXTENT).common) < 0.6 * 2.5
     assert learn(dict(enumerate(alike)), EXTENT).common == pytest.approx(-3, abs=0.8)
+
+
+def test_a_lone_station_that_seems_moved_voided_a_quarter_of_the_map():
+    """Rows about a cabinet that was moved look like those of a station that was."""
+    rows = later_rows(10, 1, offset=-15.0)
+    rows = replace(rows, places=rows.places / 10)  # in 2 m of a room of 20 m
+    moved = torch.tensor([[float(kind.name == "moved") for kind in KINDS]]).double()
+    belief = Belief(EXTENT, weight=moved, names=(0,))
+    near, far = asked(belief, rows, np.array([[1.0, 1.0, 0.15], [7.0, 7.0, 0.15]])).mean
+    assert near < -72 and far > -62
 
 
 def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -31,6 +32,15 @@ def find_station(wanted: str | int, stations: Stations) -> int | None:
     known = stations.name, stations.label or (), stations.shown, numbers
     named = (list(names).index(str(wanted)) for names in known if list(names).count(str(wanted)) == 1)
     return next(named, None)
+
+
+def site_name(name: str) -> str:
+    """Return what the names of a site's stations have in common: all but the last part of one.
+
+    >>> site_name("town-3-1"), site_name("roof")
+    ('town-3', 'roof')
+    """
+    return re.sub(r"(.)[-_ /.:][^-_ /.:]*$", r"\1", name)
 
 
 def all_names(stations: Stations) -> list[str]:

@@ -31,6 +31,14 @@ class LearnsTogether(MethodFactory):
         waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
         return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
 
+    def why_each(self, data: Measurements) -> str | None:
+        """Return why several stations cannot be learned together; None where they can."""
+        own = self.own_terms
+        if own.terms:
+            return "model.terms are of one station's model"
+        unaimed = own.prior is not None and find_sectors(data) is None
+        return "model.prior is of one station's model, or of a network with azimuths" if unaimed else None
+
     def choose_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
@@ -38,8 +46,8 @@ class LearnsTogether(MethodFactory):
 
         Channels share waves and where their stations really stand, powers a law that few rows of one tell.
         """
-        if self.own_terms.said:
-            return "each", "model.terms and model.prior are of one station"
+        if (why := self.why_each(data)) is not None:
+            return "each", why
         if not self.learns_jointly(data.site) or self.init.name == "scene":
             return "each", ""
         if data.site.kind == "spectrum":

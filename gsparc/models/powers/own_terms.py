@@ -15,7 +15,7 @@ from torch import Tensor
 from gsparc.data import heeded
 from gsparc.data.prior_levels import read_prior_levels
 from gsparc.data.schema import OF_STATION, Measurements, Site
-from gsparc.models.powers.prior_map import PriorMap
+from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerRows
@@ -61,12 +61,14 @@ class OwnTerms:
         return [f"model.{name} {verb}" for name, verb in verbs.items() if getattr(self, name)]
 
     def columns(self, data: Measurements) -> tuple[Columns, ...]:
-        """Return all as columns for measurements of one station, and count what is used as heeded."""
+        """Return all as columns for measurements of a station or a network; count what is used as heeded."""
         # A tuple is not noted when it is read, nor what the class that makes a method was given.
         heeded.count_reads(*["model.terms"] * bool(self.terms))
         if self.prior is None or data.site.static_end is None:  # a map is about one end that moves
             return self.terms
         heeded.count_reads("model.prior")
+        if data.site.has_several_stations:
+            return (*self.terms, NetworkMaps.from_file(self.prior, data))
         station = data.site.name.rpartition(OF_STATION)[2]
         return (*self.terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
 

@@ -8,8 +8,9 @@ lacks. Laws without the map stand beside it, and the likelihood of rows left out
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -17,11 +18,18 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.errors import DataError
+from gsparc.data.links.stations import site_name
+from gsparc.data.prior_levels import read_prior_levels
+from gsparc.data.schema import Measurements
+from gsparc.processes.places import moving_end, other_end
+from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
 from gsparc.processes.term import Columns
 
 SHARE = (1.0, 0.3)  # mean and deviation of the weight of a map's levels
 NEAR = 4  # points of the map that tell of a place
 CLOSE = 1e-3  # [m]
+ALONG = 0.9  # of a map's levels, less a law of distance, that lie below those along the beam
 
 
 @dataclass(frozen=True)
@@ -55,3 +63,68 @@ class PriorMap(Columns):
         near = torch.from_numpy(near.reshape(len(at), -1))
         weight = 1 / ((self.points[near] - at[:, None]).square().sum(2) + CLOSE**2)
         return ((weight * self.level[near]).sum(1) / weight.sum(1))[:, None].to(places.dtype)
+
+
+def usual_loss(way: Tensor) -> Tensor:
+    """Return what the law of distance of a network takes off before any row (n,) [dB], of ways (n, D) [m]."""
+    return 5 * SHARED[0] * way.square().sum(1).clamp_min(1.0).log10()
+
+
+@dataclass(frozen=True)
+class NetworkMaps(Columns):
+    """Maps of a network's stations as a mean, less the law of distance that a network has before any row.
+
+    Attributes:
+        maps: of stations that have one: number, whether it has the station's pattern, as that of a whole site
+            has none, and the map.
+        level: of them along beams, less which stations with and without a map are alike [dB].
+    """
+
+    maps: tuple[tuple[int, bool, PriorMap], ...]
+    level: float = 0.0
+
+    @classmethod
+    def from_file(cls, path: str | Path, data: Measurements) -> Self:
+        """Read the map of each station, or of its site; `DataError` where there is none, see there."""
+        assert data.site.stations is not None
+        found, said = list[tuple[int, bool, PriorMap]](), DataError("")
+        for number, name in enumerate(data.site.stations.shown):
+            for named in dict.fromkeys((name, site_name(name))):
+                try:
+                    world, levels = read_prior_levels(path, data, named)
+                except DataError as error:
+                    said = error
+                    continue
+                points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
+                before = found[-1][2].points if found else points
+                # Squares of one raster are stored once.
+                points = before if torch.equal(points, before) else points
+                found.append((number, named == name, PriorMap(points, level)))
+                break
+        if not found:
+            raise said
+        return cls(tuple(found))
+
+    def put_under(self, network: Sectors, places: np.ndarray) -> Sectors:
+        """Return a network about these maps, whose stations at (T, 3) have no other pattern and power."""
+        table, aimed = network.table.clone(), [number for number, own, _ in self.maps if own]
+        table[aimed] = ROUND.double()
+        still = torch.from_numpy(places[:, :2])
+        levels = [one.level + usual_loss(one.points - still[number]) for number, _, one in self.maps]
+        level = float(np.quantile(torch.cat(levels).numpy(), ALONG))
+        return replace(network, table=table, more=(replace(self, level=level),))
+
+    def columns(self, places: Tensor) -> Tensor:
+        """None: what maps miss is what a network has without them."""
+        return places.new_zeros(len(places), 0)
+
+    def mean(self, places: Tensor) -> Tensor:
+        """See `Columns`; of places of sectors (n, 7), 0 of one without a map."""
+        result = places.new_zeros(len(places))
+        for number, _, one in self.maps:
+            own = (sector_of(places) == number).nonzero()[:, 0]
+            if len(own):
+                at = places[own]
+                level = one.columns(at)[:, 0] + usual_loss(moving_end(at) - other_end(at)) - self.level
+                result = result.index_add(0, own, level.to(result))
+        return result

@@ -4,14 +4,18 @@ import numpy as np
 import pytest
 import rasterio
 import torch
+from networks import draw_network
 from rasterio.transform import from_origin
 from refusals import refused
 
 import gsparc
 from gsparc.data.own import from_arrays
 from gsparc.data.prior_levels import read_prior_levels
+from gsparc.models.mixture.methods import Powers
 from gsparc.models.powers import prior_map
-from gsparc.models.powers.prior_map import PriorMap
+from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
+from gsparc.models.powers.together.network import find_sectors
+from gsparc.processes.sectors import NO_AZIMUTH
 
 POST = [0.0, 0.0, 20.0]
 AXIS = np.arange(5.0, 700, 10)  # centres of squares
@@ -136,3 +140,60 @@ def test_a_map_of_one_end_means_nothing_where_both_move(rasters, caplog):
     fit(rows, rasters / "right.tif", tx=draw(30, 9))
     assert "noise" in caplog.text  # settings are told of
     assert "a share of the map" not in caplog.text
+
+
+def network_rasters(path, level, names):
+    """A raster of each cell of a network."""
+    side = round(len(level) ** 0.5)
+    how = {"width": side, "height": side, "dtype": "float64", "driver": "GTiff", "count": len(names)}
+    with rasterio.open(path, "w", transform=from_origin(0, 2500, 125, 125), **how) as file:
+        file.write(level[:, : len(names)].T.reshape(-1, side, side)[:, ::-1])
+        file.descriptions = [f"power_db {name}" for name in names]
+    return path
+
+
+NET_AXIS = np.arange(62.5, 2500, 125)
+NET_SQUARES = np.stack(np.meshgrid(NET_AXIS, NET_AXIS), -1).reshape(-1, 2)
+
+
+def test_a_network_has_a_map_of_a_cell_or_of_a_site(tmp_path):
+    one = draw_network(1, 0, 60, NET_SQUARES)
+    data, path = one.data(6), network_rasters(tmp_path / "two.tif", one.truth, ["0-0", "1"])
+    found = NetworkMaps.from_file(path, data)
+    assert [one[:2] for one in found.maps] == [(0, True), (3, False), (4, False), (5, False)]
+    assert found.maps[0][2].points is found.maps[3][2].points
+    network = find_sectors(data)
+    under = found.put_under(network, data.site.stations.position)
+    assert under.table[0, 0] == NO_AZIMUTH and torch.equal(under.table[1:], network.table[1:])
+    at = torch.tensor([[1000.0, 900, 1.5]]) - torch.from_numpy(data.site.origin)
+    still = torch.from_numpy(data.site.stations.position)
+    places = [torch.cat([at[0], still[t], torch.tensor([float(t)])])[None].double() for t in range(4)]
+    known = [float(under.known_mean(place)) for place in places]
+    far = [float((place[0, :3] - place[0, 3:6]).norm()) for place in places]
+    level = float(found.maps[1][2].columns(at)[0, 0])
+    assert known[1] == known[2] == 0  # of cells without a map
+    assert known[3] + under.more[0].level - 35 * np.log10(far[3]) == pytest.approx(level)
+    named = network_rasters(tmp_path / "none.tif", one.truth, ["x", "y"])
+    refused("of x, y, not of", NetworkMaps.from_file, named, data)
+    assert Powers(prior=path).why_not(data) is None
+    both = {"rx_position": draw(4, 1), "station_position": [POST, POST], "rssi_db": np.full((4, 2), -60.0)}
+    assert "say stations=each" in Powers(prior=path).why_not(from_arrays(both))
+
+
+@pytest.mark.slow
+def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path):
+    asked = np.random.default_rng(0).uniform(0, 2500, (100, 2))
+    one, path = draw_network(1, 0, 60, np.r_[NET_SQUARES, asked]), tmp_path / "model.ckpt"
+    names = [f"{t // 3}-{t % 3}" for t in range(30)]
+    other = draw_network(8, 0, 60, NET_SQUARES)
+    right, wrong = (
+        network_rasters(tmp_path / f"{name}.tif", level[: len(NET_SQUARES)], names)
+        for name, level in (("right", one.truth), ("wrong", other.truth))
+    )
+    asked, truth = one.asked[len(NET_SQUARES) :], one.truth[len(NET_SQUARES) :]
+    settings = {"settings": {"prior": right}, "save": path}, {"settings": {"prior": wrong}}
+    found = [gsparc.fit(**one.arrays(6), **more) for more in ({}, *settings)]
+    error = [np.sqrt(np.mean((model.rssi(rx=asked) - truth) ** 2)) for model in found]
+    assert error[1] < 0.95 * error[0] and error[2] < 1.02 * error[0], error
+    right.unlink()
+    np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), found[1].rssi(rx=asked), atol=1e-3)

@@ -8,6 +8,7 @@ left out want it. Either end may be the station.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -24,6 +25,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import JointLevels, Prediction
+from gsparc.models.powers.prior_map import NetworkMaps
 from gsparc.models.powers.together.learning import (
     LEAST_STATIONS,
     TRIED_EACH,
@@ -57,6 +59,7 @@ class JointPowerField(ClosedForm):
     Args:
         shared: whether they share more than the law.
         seed: of rows and places that are drawn.
+        maps: of a network, from before any row.
     """
 
     name = "process of many stations' powers"
@@ -66,8 +69,8 @@ class JointPowerField(ClosedForm):
     heard: SharedTerms  # shared terms for stations that have rows
     unheard: SharedTerms  # those for all others
 
-    def __init__(self, shared: bool = True, seed: int = 0) -> None:
-        self.shared, self.seed = shared, seed
+    def __init__(self, shared: bool = True, seed: int = 0, maps: Sequence[NetworkMaps] = ()) -> None:
+        self.shared, self.seed, self.maps = shared, seed, maps
         self.inflation = 1.0  # of variances of stations never heard
         self.posterior: SharedTermsPosterior | None = None
         self.elsewhere: SharedTermsPosterior | None = None
@@ -101,7 +104,14 @@ class JointPowerField(ClosedForm):
             self.own, remarks = learn_station_priors(used, self.seed)
         else:
             used = relabel_by_site(used, network)
-            prior, remarks = learn_network(used, network, data.site.stations.shown, self.seed)
+            names = data.site.stations.shown
+            evidence, prior, remarks = learn_network(used, network, names, self.seed)
+            for maps in self.maps:
+                known, own, said = learn_network(used, maps.put_under(network, self.places), names, self.seed)
+                if used_maps := known > evidence:
+                    prior, remarks = own, said
+                of = f"maps of {len(maps.maps)} sectors are {'used' if used_maps else 'left out'}"
+                remarks.append(f"{of}: the log evidence of rows gains {known - evidence:.3g} by them")
             self.own = StationPriors(prior, {})
         self.asks_visibility = network is None and len(used.stations) >= LEAST_STATIONS
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())

@@ -8,7 +8,6 @@ rows that are only below a level count by expectation propagation.
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import replace
 from typing import cast
 
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from gsparc.data.checks.plausibility import find_noise
 from gsparc.data.errors import Caution, list_first
+from gsparc.data.links.stations import site_name
 from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows, places_and_notes, rows_of_stations
@@ -101,7 +101,7 @@ def number_sites(stations: Stations, places: np.ndarray) -> np.ndarray:
     array([0, 0, 1])
     """
     apart = np.linalg.norm(horizontal(places[:, None] - places), axis=-1)
-    stem = np.array([re.sub(r"(.)[-_ /.:][^-_ /.:]*$", r"\1", name) for name in stations.name])
+    stem = np.array([site_name(name) for name in stations.name])
     near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
     if stations.sector is not None:
         site = stations.sector[:, len(USUAL)]  # as a column of the list says
@@ -130,8 +130,8 @@ def check_azimuths(data: Measurements, seed: int = 0) -> list[str]:
 
 def learn_network(
     rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
-) -> tuple[Prior, list[str]]:
-    """Return the prior of every site of a network, and what must be said of it.
+) -> tuple[float, Prior, list[str]]:
+    """Return the log evidence and the prior of every site of a network, and what must be said of it.
 
     Args:
         rows: by sites, see `relabel_by_site`.
@@ -139,8 +139,10 @@ def learn_network(
         names: (T,) of the stations.
         seed: of rows drawn.
     """
-    rough, gains, scale, notes = _fit_azimuths(rows, network, names, seed)
-    trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
+    known, more = network.known_mean(torch.from_numpy(rows.places)), network.more
+    rows = replace(rows, decibels=rows.decibels - known.numpy())
+    rough, gains, scale, notes = _fit_azimuths(rows, replace(network, more=()), names, seed)
+    evidence, trend, kernel = _fit_by_evidence(rows, rough, gains, scale, seed)
     shadowing = cast(SectorShadowing, kernel.terms[0])
     variances = (kernel.amplitude * float(part) for part in (*shadowing.shares, kernel.noise))
     (site, own, bearing, gain, noise), (wide, near) = map(math.sqrt, variances), shadowing.lengths
@@ -156,7 +158,7 @@ def learn_network(
         f"usual, floor {floor:.3g} dB, tilts {tilt:+.2g} deg"
     )
     aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
-    return Prior(kernel, trend), [law_note, *aimed, *notes]
+    return evidence, Prior(kernel, replace(trend, more=more)), [law_note, *aimed, *notes]
 
 
 def _fit_azimuths(
@@ -286,8 +288,8 @@ def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[s
 
 def _fit_by_evidence(
     rows: StationRows, rough: Sectors, gains: Tensor, scale: float, seed: int
-) -> tuple[Sectors, Kernel]:
-    """All settings of largest evidence of some rows of each site."""
+) -> tuple[float, Sectors, Kernel]:
+    """The log evidence of some rows of each site, and all settings of the largest."""
     rows, bands = rows.select_complete_places(), len(rough.levels)
     parts = [rows.select_station(number).draw_stretches(LEARNED_ON, seed) for number in rows.stations]
     places = [torch.from_numpy(part.places) for part in parts]
@@ -312,7 +314,7 @@ def _fit_by_evidence(
     *bounds, noise = start.terms[0].bounds(middle)
     bounds = [*_shared_bounds(), *[(-math.inf, math.inf)] * bands, *bounds, noise, noise]
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
-    best, _ = minimise(negative_log_evidence, [begin], bounds, settled=SETTLED / count)
+    best, value = minimise(negative_log_evidence, [begin], bounds, settled=SETTLED / count)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
     learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.with_values(logs)
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
@@ -323,7 +325,8 @@ def _fit_by_evidence(
         columns = Factor.from_gram(gram, "raise").whiten(learned.shared_columns(at_))
         precision += columns.T @ columns
     doubt, kernel = Factor.from_gram(precision, "raise").root.T, _to_unit_amplitude(kernel)
-    return replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude)), kernel
+    learned = replace(learned, doubt=doubt.contiguous(), unit=math.sqrt(kernel.amplitude))
+    return -count * value, learned, kernel
 
 
 def _usual_kernel(trend: Sectors, middle: float, variance: float, level: float) -> Kernel:
