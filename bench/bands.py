@@ -220,7 +220,9 @@ def main() -> None:
     mean = draws.mean()
     mean.insert(1, "ssim_error", draws["ssim_gauss"].sem())  # over draws, or carriers
     mean = mean.round(4)
-    mean.to_csv(OUT, mode="a", header=not OUT.exists())
+    before = [pd.read_csv(OUT).set_index(by)] if OUT.exists() else []
+    every = pd.concat([*before, mean])
+    every[~every.index.duplicated(keep="last")].to_csv(OUT)
     sys.stdout.write(f"{mean.groupby(by[1:], sort=False).mean().to_string()}\n")
 
 
