@@ -52,7 +52,6 @@ LOOSE = 1.5  # deviation of logarithms of kernels' numbers from usual
 LITTLE = 0.1  # usual noise and deviations by bearing, of the variance; usual lengths, of that between places
 BOUND = 5.0  # deviations of what sectors share, beyond which it is not looked for
 CONTRADICTED_DEG, ROUND_DEG = 30.0, 360.0
-UNSEEN_DEG = 60.0  # errors of an azimuth, and larger ones, that rows must tell or it counts as not tested
 LEAST_TESTED = 20  # rows of a file, whose azimuths are asked
 # At .1 nats a row 6 of 16 azimuths that were 60 degrees off passed; at .03 too many right ones do not.
 SURE = 10.0, 0.05  # nats, and nats a row, by which another azimuth must be likelier
@@ -266,14 +265,15 @@ def _correct_azimuths(rows: StationRows, trend: Sectors, gains: Tensor, scale: f
 def _note_untested(
     rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
 ) -> list[str]:
-    """A note on azimuths that may be wrong by `UNSEEN_DEG` without any row that tells."""
+    """A note on azimuths that rows do not tell to `CONTRADICTED_DEG`, and to how many degrees they do."""
     misfit, sure = _misfits_of_turns(rows, trend, gains, scale)
-    far = (TURNS.abs() >= UNSEEN_DEG).nonzero()[:, 0]
-    told = misfit[:, far].amin(1) - misfit[:, len(TURNS) // 2] > sure
-    blind = ((trend.table[:, 0] != NO_AZIMUTH) & ~told).nonzero()[:, 0].tolist()
-    said = f"{len(blind)} of {len(names)} sectors: {list_first([names[t] for t in blind], 30)}"
-    every = f"azimuths not tested, as no rows tell them from {UNSEEN_DEG:g} degrees more, of {said}"
-    return [every] if blind else []
+    alike = misfit - misfit[:, len(TURNS) // 2, None] <= sure[:, None]
+    farthest = torch.where(alike & (trend.table[:, :1] != NO_AZIMUTH), TURNS.abs(), 0.0).amax(1)
+    blind = [t for t in farthest.argsort(descending=True, stable=True) if farthest[t] >= CONTRADICTED_DEG]
+    each = [f"{names[t]} ({min(float(farthest[t] + TURNS.diff()[0]), 180):.0f})" for t in blind]
+    said = f"of {len(blind)} of {len(names)} sectors: {list_first(each, 30)}"
+    told = f"to {CONTRADICTED_DEG:g} degrees, as rows tell them to those in brackets only"
+    return [f"azimuths not tested {told}, {said}"] if blind else []
 
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
