@@ -63,7 +63,9 @@ def _section(name: str, rows: pd.DataFrame) -> str:
         CPU, P50, Column("Gaussians", ".0f", of=lambda row: row["gaussians"] or None),
     ]  # fmt: skip
     columns = [one for one in columns if one.of != "given" or rows.given.any()]
-    made = f"{rows.seeds.max()} draws (± standard error)" if draws else "one split, one seed"
+    several = f"one split; ± deviation over {rows.seeds.max()} seeds, others one seed"
+    alone = several if rows.seeds.max() > 1 else "one split, one seed"
+    made = f"{rows.seeds.max()} draws (± standard error)" if draws else alone
     load = f"load {rows.load.min():.1f} to {rows.load.max():.1f} a core"
     said = f"{made}; {', '.join(sorted(set(rows.cpu)))}, one thread, {load}; {_dates(rows)}."
     table = Table.from_rows(f"{name}: {WHAT[name]}", columns, rows.to_dict("records"))  # type: ignore[arg-type]
