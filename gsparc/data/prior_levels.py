@@ -102,10 +102,9 @@ def _read_raster(path: Path, data: Measurements, station: str | None) -> tuple[n
 def _read_rows(path: Path, data: Measurements, station: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Places and levels of a table or an npz."""
     rows = interpret(read_own(path), path).data
-    if rows.site.kind != "rssi" or rows.site.static_end is None:
+    if not rows.site.maps_levels:
         raise DataError(f"model.prior={path}: no powers of one end that moves")
-    names = [] if rows.site.stations is None else rows.site.stations.shown
-    kept = rows.stations_of() == (_number(names, station, path) if names else 0)
+    kept = rows.stations_of() == _number(rows.site.every_station.shown, station, path)
     points = (rows.moving + rows.site.origin)[kept, :2]
     theirs, ours = rows.site.georeference, data.site.georeference
     if theirs is not None and ours is not None:

@@ -74,13 +74,12 @@ class Query:
             places: local, in the precision of the query.
             station: (B,) int64, of several stations; None of one.
         """
-        several, count = site.stations, len(places)
-        still = np.full(3, np.nan) if station is None and several is not None else site.still_places[0]
+        every, count = site.every_station, len(places)
+        still = np.full(3, np.nan) if site.several else every.position[0]
         turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-        if several is not None and station is not None:
-            still = several.position[station.numpy()]
-            if site.static_end == "rx" and several.rotation is not None:
-                turned = several.rotation[station.numpy()]
+        if station is not None:
+            still = every.position[station.numpy()]
+            turned = turned if every.rotation is None else every.rotation[station.numpy()]
         end, turn = (torch.from_numpy(value).to(places.dtype) for value in (still, turned))
         if site.static_end == "rx" and end.ndim == 1:
             return Query(places, Pose(end, turn), station)

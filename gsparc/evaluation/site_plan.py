@@ -85,7 +85,7 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
 
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
     """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
-    several = data.site.stations is not None and len(data.site.stations) > 1
+    several = data.site.several
     if data.site.target.is_image:
         return None, ""
     power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)
@@ -95,9 +95,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     in_decibels, value = data.site.target.in_decibels, power[row, entry]
     # Powers of channels are averaged linearly, levels of a station in decibels.
     value = 10 * np.log10(value) if in_decibels else value
-    each = [which[row]]
-    if in_decibels and data.station is not None:
-        each.append(data.station[row])
+    each = [which[row], data.stations_of(row) if in_decibels else which[row]]
     level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
     if in_decibels:
         of = " of the strongest station" if several else ""
@@ -150,12 +148,8 @@ def _title(data: Measurements, places: Spots) -> str:
 
 def static_positions(data: Measurements) -> np.ndarray:
     """Return world x and y (T, 2) of the ends that stand still, where that is known."""
-    site = data.site
-    if site.stations is not None:
-        place = site.stations.position
-    else:
-        place = np.zeros((0, 3)) if site.static_position is None else site.static_position[None]
-    return place[:, :2] + site.origin[:2]
+    place = data.site.every_station.position[:, :2] + data.site.origin[:2]
+    return place if np.isfinite(place).any() else place[:0]
 
 
 def _draw_map(

@@ -27,8 +27,8 @@ from gsparc.training.context import FitContext
 
 def carriers_obstacle(site: Site) -> str | None:
     """Return why spectra of this site are not those of one array at several carriers; None where they are."""
-    stations = site.stations
-    if site.kind != "spectrum" or stations is None or stations.carrier_hz is None:
+    stations = site.every_station
+    if site.kind != "spectrum" or stations.carrier_hz is None:
         return "targets are no spectra at several carriers"
     if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE_M:
         return "receivers at several places"
@@ -43,9 +43,9 @@ def carriers_obstacle(site: Site) -> str | None:
 
 def _arrays(site: Site) -> np.ndarray:
     """Elements (T, M, 3) [m] of the array at each carrier."""
-    assert site.stations is not None and site.array is not None
-    own = site.stations.array
-    return np.repeat(site.array[None], len(site.stations), axis=0) if own is None else own
+    assert site.array is not None
+    own = site.every_station.array
+    return np.repeat(site.array[None], len(site.every_station), axis=0) if own is None else own
 
 
 class OneArray(Method):
@@ -115,9 +115,7 @@ class OneArray(Method):
 
     @property
     def _stations(self) -> Stations:
-        stations = self.fitted_site.stations
-        assert stations is not None
-        return stations
+        return self.fitted_site.every_station
 
     def pose(self) -> tuple[Tensor, Tensor]:
         """Return place (3,) float64 [m] and rotation (3, 3) of the receiver."""

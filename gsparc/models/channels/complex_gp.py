@@ -74,9 +74,7 @@ class ComplexGP(ClosedForm):
     @classmethod
     def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
         """See `MethodFactory.stands_beside`: carrier and all stations must be known."""
-        site = data.site
-        carriers = (site.carrier_hz, None if site.stations is None else site.stations.carrier_hz)
-        if not super().stands_beside(data, fold) or all(one is None for one in carriers):
+        if not super().stands_beside(data, fold) or not np.isfinite(data.site.carriers).all():
             return False
         return data.station is None or not stations_of_fold(cls(), data, fold).only_tested.any()
 
@@ -93,7 +91,7 @@ class ComplexGP(ClosedForm):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
         started = Stopwatch()
-        if data.site.kind != "csi" or data.site.wavelength is None:
+        if not data.site.has_waves:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = fold.learned()
         self.site, self.shape = data.site, tuple(data.target.shape[1:])

@@ -87,12 +87,11 @@ class Powers(Mixture):
         """See `Mixture`; `init=scene` is the process of one station that knows walls."""
         if self.init.name == "scene":
             return {"scene": CANDIDATES["powers"]}
-        several = data.site.stations is not None and len(data.site.stations) > 1
-        return _candidates("joint_powers" if several else "powers")
+        return _candidates("joint_powers" if data.site.several else "powers")
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        if self.own_terms.said and data.site.stations is not None and len(data.site.stations) > 1:
+        if self.own_terms.said and data.site.several:
             return "model.terms and model.prior are of one station's model; say stations=each"
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 

@@ -104,7 +104,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         self._lags, self._steps = None, round(context.effort * self.search.steps)
         report = super().fit(data, fold, context)
         # The rows of `super().fit` in its order: `left_out` names its images by them.
-        self.rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
+        self.rows = heard_rows(data, fold.learned())
         return report
 
     @property

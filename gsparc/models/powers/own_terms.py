@@ -92,7 +92,8 @@ class UserTerm(Columns):
     @classmethod
     def from_site(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
-        origin, still = map(torch.from_numpy, (site.origin.astype(np.float64), site.still_places[0]))
+        ends = site.origin.astype(np.float64), site.every_station.position[0]
+        origin, still = map(torch.from_numpy, ends)
         return cls(term, origin, still)
 
     @property
