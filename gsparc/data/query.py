@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
-    from gsparc.data.schema import Site
+    from gsparc.data.schema import End, Site
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,12 @@ class Query:
     def places(self, site: Site) -> Tensor:
         """Return where the moving end is, (B, 3) float64 [m] on the CPU; (B, 6) of both where both move."""
         return site.moving(self.tx, self.rx).expand(len(self), -1).cpu().double()
+
+    def with_ends(self, places: Mapping[End, Tensor]) -> Self:
+        """Return the same with ends at other places (B, 3) [m], all in their precision."""
+        ends, dtype = {"tx": self.tx, "rx": self.rx.position, **places}, next(iter(places.values())).dtype
+        tx, rx, turned = (one.to(dtype) for one in (ends["tx"], ends["rx"], self.rx.rotation))
+        return replace(self, tx=tx, rx=Pose(rx, turned))
 
     @staticmethod
     def from_places(site: Site, places: Tensor, station: Tensor | None = None) -> Query:

@@ -220,10 +220,15 @@ class Site:
             raise ValueError(f"{what}: channels are known up to {describe_freedom(self.freedom)} of each row")
 
     @property
-    def moving_end(self) -> Literal["rx", "tx"]:
+    def moving_end(self) -> End:
         """The end whose position is the query; the receiver where both move."""
         # Both may move: the receiver is then the one that single-ended code asks about.
-        return OTHER.get(self.static_end or "", "rx")
+        return OTHER[self.still_end]
+
+    @property
+    def still_end(self) -> End:
+        """The other end: the one that stands still; the transmitter where both move."""
+        return self.static_end or "tx"
 
     def world_ends(self, places: np.ndarray) -> dict[End, np.ndarray]:
         """Return world places (..., 3) [m] by end of local ones (..., 3) or (..., 6), see `moving`."""
@@ -398,6 +403,11 @@ class Measurements:
         """Positions (S, 3) [m] by end."""
         return {"tx": self.tx, "rx": self.rx_position}
 
+    def with_ends(self, places: Mapping[End, np.ndarray]) -> Measurements:
+        """Return the same with ends at other places (S, 3) [m]."""
+        ends = {**self.ends, **places}
+        return replace(self, tx=ends["tx"], rx_position=ends["rx"])
+
     @property
     def moving(self) -> np.ndarray:
         """Positions of what moves, (S, 3) or of both ends (S, 6), float64 [m]: the query of every method."""
@@ -409,6 +419,11 @@ class Measurements:
         """Carrier (S,) [Hz] of each row where stations are told apart by theirs, else None."""
         carriers = self.site.every_station.carrier_hz
         return None if carriers is None else carriers[self.stations_of()]
+
+    def powers(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return powers (n, D) float64 of the entries of rows (n,), in physical units."""
+        target, stored = self.site.target, self.target.reshape(len(self), -1)[rows]
+        return target.power(stored) * self.site.target_scale**target.exponent
 
     def censored_side(self, rows: Chosen = slice(None)) -> np.ndarray:
         """Return `censored` of rows (n,), (n,) int8; 0 of each where nothing is."""

@@ -47,7 +47,7 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
         told = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
         return {BEST_SERVER: float(told.mean())}
     # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
-    most = np.where(data.censored_side(row) < 0, data.target[row, 0] * data.site.target_scale, np.nan)
+    most = np.where(data.censored_side(row) < 0, data.powers(row)[:, 0], np.nan)
     told = scores.samples.get("served", scores.samples["prediction"])
     every = pd.DataFrame({
         "fold": scores.fold, "place": place[row], "station": data.station[row],

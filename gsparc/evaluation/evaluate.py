@@ -264,7 +264,7 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     of_row = data.stations_of(scores.row)
     columns |= {head: np.array(names)[of_row] for head, names in data.site.every_station.named.items()}
-    if len(data.site.moving_ends) > 1:
-        other = data.tx[scores.row] + data.site.origin
-        columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
+    for end in data.site.moving_ends[:-1]:
+        other = data.ends[end][scores.row] + data.site.origin
+        columns |= {f"{end}_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
     return columns

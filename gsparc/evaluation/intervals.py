@@ -32,7 +32,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         return {}
     mean_db, spread_db = power_in_decibels(mean[known], variance[known])
     row = scores.row[known]
-    power = data.target[row, 0].astype(np.float64) * data.site.target_scale
+    power = data.powers(row)[:, 0]
     silent = data.censored_side(row) > 0
     heard = (data.censored_side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}

@@ -14,7 +14,7 @@ from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.errors import DataError
 from gsparc.data.limits import finite_array
 from gsparc.data.query import Query
-from gsparc.data.schema import OTHER, End, Site
+from gsparc.data.schema import End, Site
 from gsparc.ops import Pose
 from gsparc.ops.transforms import to_numpy
 
@@ -52,7 +52,7 @@ class Queries:
         places = {
             end: read_places(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
         }
-        moving, static = self.site.moving_end, OTHER[self.site.moving_end]
+        moving, static = self.site.moving_end, self.site.still_end
         for needed in sorted(self.site.moving_ends):  # the receiver first
             if needed not in places:
                 raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
@@ -229,7 +229,7 @@ def query_ends(
     Raises:
         DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
     """
-    moving, other = site.moving_end, OTHER[site.moving_end]
+    moving, other = site.moving_end, site.still_end
     if len(site.moving_ends) == 1:
         if other_end is not None:
             raise DataError(f"other_end: the {other} stood still; leave it out")

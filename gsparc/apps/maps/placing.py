@@ -275,7 +275,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
 def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Any:
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and not draws_shapes(sites):
-        site, end = predictor.site, predictor.site.static_end or "tx"
+        site, end = predictor.site, predictor.site.still_end
         asked = read_query_places(sites, (end,))
         where = asked.ends[end]
         above = np.full(len(asked), height) if where.height is None else where.height

@@ -60,7 +60,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
     count = len(stations)
     with np.errstate(divide="ignore"):
-        level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
+        level = 10 * np.log10(data.powers()[:, 0])
     link, called = which.reshape(-1) * count + station, data.row_names
     side = data.censored_side()
     rows = np.flatnonzero(side <= 0)

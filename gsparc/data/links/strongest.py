@@ -197,4 +197,4 @@ def strongest_lists(data: Measurements) -> StrongestLists | None:
 
 def levels_db(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return levels (n,) [dB] of rows of powers."""
-    return 10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale)
+    return 10 * np.log10(data.powers(rows)[:, 0])

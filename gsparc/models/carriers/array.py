@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from gsparc.models.target_rows import training_targets
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.lags import SpectrumLags, pixel_exponent
 from gsparc.processes.left_out import rows_of_groups
-from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext
 
 
@@ -96,16 +95,6 @@ class OneArray(Method):
         grid = self.fitted_site.grid
         assert grid is not None
         return images.clamp(0, 1).unflatten(1, (grid.height, grid.width)).to(query.tx.dtype)
-
-    def state(self) -> dict[str, Any]:
-        """Return what was learned."""
-        return {name: to_plain(getattr(self, name)) for name in self.stored}
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        self.site, self._spectra = site, None
-        for name, value in state.items():
-            setattr(self, name, from_plain(value))
 
     def add_carrier(self, frequency_hz: float) -> Self:
         """See `AddsCarriers`."""

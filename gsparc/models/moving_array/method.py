@@ -296,8 +296,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         self._lags = self._query = None
         self.basis = Separable(**state["basis"])
 
-    def _stored_state(self) -> dict[str, Any]:
-        return {**super()._stored_state(), "basis": vars(self.basis)}
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        return {**super().state(), "basis": vars(self.basis)}
 
 
 def _spread_rows(count: int, limit: int) -> np.ndarray:

@@ -12,7 +12,6 @@ from gsparc.apps.export.compiled.channels import compile_sources
 from gsparc.apps.export.compiled.powers import compile_powers
 from gsparc.apps.export.compiled.spectra import compile_array, compile_view
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
@@ -28,7 +27,6 @@ from gsparc.models.splat.image_process import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
-from gsparc.training.context import FitContext
 
 ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made from
 
@@ -161,10 +159,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     data = sample_model(predictor, places)
     if sources is not None:
         return _sources_given(sources, data)
-    every = np.arange(len(data))
     # All rows are learned from: a model's answers have no noise that validation would guard against.
     process = GaussianProcess()
-    process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
+    process.condition(data, np.arange(len(data)))
     form = compile_exactly(process, site)
     assert form is not None
     return replace(form, predictor=Predictor(process, site))
