@@ -231,7 +231,12 @@ class Site:
         return self.static_end or "tx"
 
     def world_ends(self, places: np.ndarray) -> dict[End, np.ndarray]:
-        """Return world places (..., 3) [m] by end of local ones (..., 3) or (..., 6), see `moving`."""
+        """Return world places (..., 3) [m] by end of local ones (..., 3) or (..., 6), see `moving`.
+
+        >>> site = predictor.site
+        >>> bool(np.allclose(site.local_places(site.world_ends(site.box)), site.box))
+        True
+        """
         parts = np.split(np.asarray(places, np.float64), len(self.moving_ends), axis=-1)
         return {end: part + self.origin for end, part in zip(self.moving_ends, parts, strict=True)}
 
@@ -249,7 +254,11 @@ class Site:
 
     @property
     def every_station(self) -> Stations:
-        """The static ends; where there are no `stations` one without a name, at NaN where that is unknown."""
+        """The static ends; where there are no `stations` one without a name, at NaN where that is unknown.
+
+        >>> predictor.site.every_station.name, len(gsparc.load("city.ckpt").site.every_station)
+        (('',), 2)
+        """
         if self.stations is not None:
             return self.stations
         place = np.full(3, np.nan) if self.static_position is None else self.static_position

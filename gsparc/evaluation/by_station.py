@@ -40,8 +40,6 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     see `strongest_told`. Of k stations tied as predicted strongest a right one counts 1 / k. Empty without
     such places.
     """
-    if data.station is None:
-        return {}
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
     if "strongest_told" in scores.samples:
         told = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
@@ -50,7 +48,7 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     most = np.where(data.censored_side(row) < 0, data.powers(row)[:, 0], np.nan)
     told = scores.samples.get("served", scores.samples["prediction"])
     every = pd.DataFrame({
-        "fold": scores.fold, "place": place[row], "station": data.station[row],
+        "fold": scores.fold, "place": place[row], "station": data.stations_of(row),
         "predicted": told, "measured": np.fmax(scores.samples["target"], most),
     })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.

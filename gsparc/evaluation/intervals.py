@@ -92,6 +92,6 @@ def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, 
         figures |= reduced_chi_squared(scores, data)
     else:
         figures |= rmse_with_silent(scores, data) | power_intervals(scores, data) | best_server(scores, data)
-        if split.name == "stations" and data.station is not None:
-            figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.station)
+        if split.name == "stations":
+            figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.stations_of())
     return figures

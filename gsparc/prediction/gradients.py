@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.schema import End
 from gsparc.models.method import Method, Prediction, suitable_threads
 from gsparc.ops import Pose
 from gsparc.ops.transforms import carries_tangent, has_vmap_axis, transform_is_active
@@ -39,7 +40,8 @@ def predict_with_gradients(
     problem, site = method.gradient_problem(), queries.site
     if problem is not None:
         raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
-    ends, fixed = {"tx": tx, "rx": rx}, []
+    ends: dict[End, Any] = {"tx": tx, "rx": rx}
+    fixed = []
     if isinstance(rx, Pose):
         # Gradients are by the position of a pose; its rotation must not ask for one.
         ends["rx"], fixed = rx.position, [rx.rotation]

@@ -63,7 +63,7 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
     prediction = predictor.predict_linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
     mean = prediction.mean[0].numpy()
     known = site.every_station.position[0] + site.origin
-    still = {} if np.isnan(known).any() else {site.still_end: known}
+    still: dict[str, np.ndarray] = {} if np.isnan(known).any() else {site.still_end: known}
     level = spread = None
     if kind != "spectrum":
         level, spread = (float(value[0]) for value in predicted_levels(prediction, kind))
