@@ -59,8 +59,8 @@ def check(
     topics += [("note", note) for note in notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):
         topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]
-    stations, heights = reading.data.site.stations, reading.data.moving[:, 2::3]
-    if stations is not None and stations.sector is not None and (abs(stations.sector[:, 1]) > 0).any():
+    stations, heights = reading.data.site.every_station, reading.data.moving[:, 2::3]
+    if (abs(stations.beams[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
     doubts = group_warnings(warnings)

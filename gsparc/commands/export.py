@@ -40,7 +40,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     # The files of an export belong together: none is written beside those of another one.
     if out.exists():
         raise SettingError(f"out={out}: is there already; remove it or name another folder")
-    predictor = load(path) if config.station is None else load(path).select_station(config.station)
+    predictor = load(path).select_station(config.station)
     # The folder appears by renaming: an export that fails leaves nothing behind.
     with whole_folder(out) as folder:
         facts, lines = WRITERS[config.to](predictor, config, folder, out)

@@ -55,8 +55,7 @@ def task(config: DictConfig) -> None:
     if 0 <= allowed < needed:
         files = f"{needed} open files may be needed, {allowed} are allowed"
         raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
-    predictor = load(config.ckpt, unit=config.unit)
-    predictor = predictor if config.station is None else predictor.select_station(config.station)
+    predictor = load(config.ckpt, unit=config.unit).select_station(config.station)
     site, powers = predictor.site, predictor.site.target.in_decibels
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if site.static_end is None or (site.stations and not powers):

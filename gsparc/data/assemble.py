@@ -91,7 +91,7 @@ def centre_positions(data: Measurements) -> Measurements:
             `origin`, the boxes, `sha256`, `static_position` and `rx_rotation` are set here.
     """
     site, tx, rx = data.site, data.tx, data.rx_position
-    stations, static = site.stations, site.static_end
+    stations, static = site.every_station, site.static_end
     # A place far outside would put the middle there, where float32 has lost centimetres.
     usual = ~too_far(tx if static == "rx" else rx)
     ends = np.concatenate([tx[usual], rx[usual]])
@@ -104,17 +104,16 @@ def centre_positions(data: Measurements) -> Measurements:
     hashed = {name: getattr(data, name) for name in of_rows} | {
         "rx": rx, "array": site.array, "subcarriers_hz": site.subcarriers_hz,
         "target_scale": site.target_scale, "carrier_hz": site.carrier_hz,
-        "carriers_hz": None if stations is None else stations.carrier_hz,
-        "arrays": None if stations is None else stations.array,
+        "carriers_hz": stations.carrier_hz, "arrays": stations.array,
     }  # fmt: skip
     still = None
-    if static is not None and (stations is None or len(stations) == 1):
+    if static is not None and not site.several:
         still = (rx if static == "rx" else tx)[0] - origin
         still = still if np.isfinite(still).all() else None
     site = replace(
         site, origin=origin, box=np.stack([ends.min(axis=0) - origin, ends.max(axis=0) - origin]),
         moving_box=np.stack([moving.min(axis=0), moving.max(axis=0)]), sha256=content_hash(hashed),
         static_position=still, rx_rotation=np.array(data.rx_rotation[0], dtype=np.float64),
-        stations=None if stations is None else replace(stations, position=stations.position - origin),
+        stations=site.stations and replace(stations, position=stations.position - origin),
     )  # fmt: skip
     return replace(moved, site=site)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
 from gsparc.data.errors import DataError
 from gsparc.data.limits import choice
-from gsparc.data.schema import LIGHT, OTHER, Measurements
+from gsparc.data.schema import LIGHT, OTHER, End, Measurements
 from gsparc.data.units import UNITS
 from gsparc.ops import SphereGrid
 
@@ -83,14 +83,13 @@ def _places(change: Callable[[np.ndarray], np.ndarray], *which: str) -> Change:
     """Positions of ends, `tx`, `rx`, `static` or `moving`, changed about the origin of the file."""
 
     def moved(data: Measurements) -> Measurements:
-        origin, stations, still = data.site.origin, data.site.stations, data.site.static_end or "tx"
-        ends = {{"static": still, "moving": OTHER[still]}.get(end, end) for end in which}
-        names = {"tx": "tx", "rx": "rx_position"}
-        places = {names[end]: change(getattr(data, names[end]) + origin) - origin for end in ends}
-        if stations is not None and data.site.static_end in ends:
+        origin, stations, still = data.site.origin, data.site.stations, data.site.still_end
+        called: dict[str, End] = {"tx": "tx", "rx": "rx", "static": still, "moving": OTHER[still]}
+        ends = {called[end] for end in which}
+        if stations is not None and still in ends:
             there = replace(stations, position=change(stations.position + origin) - origin)
-            places["site"] = replace(data.site, stations=there)
-        return replace(data, **places)
+            data = replace(data, site=replace(data.site, stations=there))
+        return data.with_ends({end: change(data.ends[end] + origin) - origin for end in ends})
 
     return moved
 

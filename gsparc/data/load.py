@@ -118,9 +118,9 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
         learned: what was learned from, and its folds, where it is other data with the same stations.
     """
     own, before = learned or (data, split)
-    if data.site.stations is None or data.station is None or own.station is None:
+    if data.station is None or own.station is None:
         return split
-    places, folds = data.site.stations.position, list[splits.Fold]()
+    places, folds = data.site.every_station.position, list[splits.Fold]()
     for fold, old in zip(split.folds, before.folds, strict=True):
         heard = old.train[own.censored_side(old.train) <= 0]
         told, asked = (np.bincount(own.station[rows], minlength=len(places)) for rows in (heard, old.test))
@@ -131,7 +131,7 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
     left = np.concatenate([np.setdiff1d(old.test, new.test) for old, new in pairs])
     if len(left):
         new, rows = np.unique(data.station[left[data.censored_side(left) <= 0]], return_counts=True)
-        names = [f"{data.site.stations.shown[t]} (in {n} rows)" for t, n in zip(new, rows, strict=True)]
+        names = [f"{data.site.every_station.shown[t]} (in {n} rows)" for t, n in zip(new, rows, strict=True)]
         said = "split: %d test rows are left out, of stations with under %d training rows%s"
         heard_now = f"; heard now: {list_first(names, 12)}" * bool(names)
         log.warning(said, len(left), splits.LEAST_ROWS, heard_now)

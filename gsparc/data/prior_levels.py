@@ -50,7 +50,7 @@ def read_prior_levels(
         )
         raise DataError(f"model.prior={path}: it is of {box}, and all rows lie elsewhere: {rows}")
     # Of a whole country only what lies about rows and stations is kept.
-    margin, still = max(float(np.ptp(at, axis=0).max()), ABOUT_M), data.site.still_places[:, :2]
+    margin, still = max(float(np.ptp(at, axis=0).max()), ABOUT_M), data.site.every_station.position[:, :2]
     ends = np.r_[at, still[np.isfinite(still).all(1)] + data.site.origin[:2]]
     near = ((points >= ends.min(0) - margin) & (points <= ends.max(0) + margin)).all(1)
     if near.sum() > MOST:
@@ -103,10 +103,9 @@ def _read_raster(path: Path, data: Measurements, station: str | None) -> tuple[n
 def _read_rows(path: Path, data: Measurements, station: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Places and levels of a table or an npz."""
     rows = interpret(read_own(path), path).data
-    if rows.site.kind != "rssi" or rows.site.static_end is None:
+    if not rows.site.maps_levels:
         raise DataError(f"model.prior={path}: no powers of one end that moves")
-    names = [] if rows.site.stations is None else rows.site.stations.shown
-    kept = rows.stations_of() == (_number(names, station, path) if names else 0)
+    kept = rows.stations_of() == _number(rows.site.every_station.shown, station, path)
     points = (rows.moving + rows.site.origin)[kept, :2]
     theirs, ours = rows.site.georeference, data.site.georeference
     if theirs is not None and ours is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
-    from gsparc.data.schema import Site
+    from gsparc.data.schema import End, Site
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,12 @@ class Query:
         """Return where the moving end is, (B, 3) float64 [m] on the CPU; (B, 6) of both where both move."""
         return site.moving(self.tx, self.rx).expand(len(self), -1).cpu().double()
 
+    def with_ends(self, places: Mapping[End, Tensor]) -> Self:
+        """Return the same with ends at other places (B, 3) [m], all in their precision."""
+        ends, dtype = {"tx": self.tx, "rx": self.rx.position, **places}, next(iter(places.values())).dtype
+        tx, rx, turned = (one.to(dtype) for one in (ends["tx"], ends["rx"], self.rx.rotation))
+        return replace(self, tx=tx, rx=Pose(rx, turned))
+
     @staticmethod
     def from_places(site: Site, places: Tensor, station: Tensor | None = None) -> Query:
         """Return what is asked of the moving end at places (B, 3) [m], with the static end where it stood.
@@ -74,13 +80,12 @@ class Query:
             places: local, in the precision of the query.
             station: (B,) int64, of several stations; None of one.
         """
-        several, count = site.stations, len(places)
-        still = np.full(3, np.nan) if station is None and several is not None else site.still_places[0]
+        every, count = site.every_station, len(places)
+        still = np.full(3, np.nan) if site.several else every.position[0]
         turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
-        if several is not None and station is not None:
-            still = several.position[station.numpy()]
-            if site.static_end == "rx" and several.rotation is not None:
-                turned = several.rotation[station.numpy()]
+        if station is not None:
+            still = every.position[station.numpy()]
+            turned = turned if every.rotation is None else every.rotation[station.numpy()]
         end, turn = (torch.from_numpy(value).to(places.dtype) for value in (still, turned))
         if site.static_end == "rx" and end.ndim == 1:
             return Query(places, Pose(end, turn), station)

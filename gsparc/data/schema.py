@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,10 +26,12 @@ if TYPE_CHECKING:
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
 End = Literal["rx", "tx"]
 Chosen = np.ndarray | slice  # of rows
+ENDS_OF_PLACES: tuple[End, ...] = ("tx", "rx")  # in the order of six columns
 ENDS: dict[str, str] = {"rx": "receiver", "tx": "transmitter"}  # in words
 OTHER: dict[str, End] = {"rx": "tx", "tx": "rx"}
 LIGHT = 299_792_458.0  # [m/s]
 OF_STATION = ", station "  # before its name, in that of a site as one of several stations sees it
+ALONE = ("",)  # names of the one static end of a site without stations
 TrainTest = tuple[np.ndarray, np.ndarray]  # rows (n,) to train and to test on
 
 
@@ -74,7 +76,14 @@ class Stations:
     @property
     def named(self) -> dict[str, Sequence[str]]:
         """(T,) names as columns of tables have them: `station`, and `cell` of a list of cells."""
+        if self.name == ALONE:
+            return {}
         return {"station": self.name} | ({} if self.label is None else {"cell": self.label})
+
+    @property
+    def beams(self) -> np.ndarray:
+        """`sector` (T, 6), NaN where nothing of it is known."""
+        return np.full((len(self), 6), np.nan) if self.sector is None else self.sector
 
     def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
@@ -211,36 +220,80 @@ class Site:
             raise ValueError(f"{what}: channels are known up to {describe_freedom(self.freedom)} of each row")
 
     @property
-    def moving_end(self) -> Literal["rx", "tx"]:
+    def moving_end(self) -> End:
         """The end whose position is the query; the receiver where both move."""
         # Both may move: the receiver is then the one that single-ended code asks about.
-        return OTHER.get(self.static_end or "", "rx")
+        return OTHER[self.still_end]
+
+    @property
+    def still_end(self) -> End:
+        """The other end: the one that stands still; the transmitter where both move."""
+        return self.static_end or "tx"
+
+    def world_ends(self, places: np.ndarray) -> dict[End, np.ndarray]:
+        """Return world places (..., 3) [m] by end of local ones (..., 3) or (..., 6), see `moving`.
+
+        >>> site = predictor.site
+        >>> bool(np.allclose(site.local_places(site.world_ends(site.box)), site.box))
+        True
+        """
+        parts = np.split(np.asarray(places, np.float64), len(self.moving_ends), axis=-1)
+        return {end: part + self.origin for end, part in zip(self.moving_ends, parts, strict=True)}
+
+    def local_places(self, world: Mapping[End, np.ndarray]) -> np.ndarray:
+        """Return local places (n, 3) or (n, 6) [m] of world ones by end: what `world_ends` takes."""
+        return np.hstack([world[end] - self.origin for end in self.moving_ends])
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Return positions [m] of what moves: (B, 3) of one end (or one for all), or (B, 6) of both."""
         # A static receiver's pose has no leading axis, a batch of poses has one.
         place = rx.position.reshape(-1, 3)
-        if self.static_end is None:
+        if len(self.moving_ends) > 1:
             return torch.cat([tx, place.expand(len(tx), 3)], dim=1)
-        return tx if self.static_end == "rx" else place
+        return tx if self.moving_end == "tx" else place
 
     @property
-    def has_several_stations(self) -> bool:
-        """Whether rows are of two stations or more."""
-        return self.stations is not None and len(self.stations) > 1
+    def every_station(self) -> Stations:
+        """The static ends; where there are no `stations` one without a name, at NaN where that is unknown.
 
-    @property
-    def still_places(self) -> np.ndarray:
-        """Local places (T, 3) float64 [m] of the static ends, NaN where unknown; (1, 3) where both move."""
+        >>> predictor.site.every_station.name, len(gsparc.load("city.ckpt").site.every_station)
+        (('',), 2)
+        """
         if self.stations is not None:
-            return np.asarray(self.stations.position, np.float64)
+            return self.stations
         place = np.full(3, np.nan) if self.static_position is None else self.static_position
-        return np.asarray(place, np.float64)[None]
+        return Stations(np.asarray(place, np.float64)[None], ALONE)
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several stations."""
+        return len(self.every_station) > 1
+
+    @property
+    def carriers(self) -> np.ndarray:
+        """(T,) float64 [Hz] of every station; NaN where unknown."""
+        own, shared = self.every_station.carrier_hz, np.nan if self.carrier_hz is None else self.carrier_hz
+        return np.full(len(self.every_station), shared, np.float64) if own is None else own
+
+    @property
+    def maps_levels(self) -> bool:
+        """Whether these are powers of one end that moves: levels over its places."""
+        return self.kind == "rssi" and len(self.moving_ends) == 1
+
+    @property
+    def has_waves(self) -> bool:
+        """Whether these are complex channels at a known carrier."""
+        return self.kind == "csi" and self.carrier_hz is not None
+
+    @property
+    def moving_ends(self) -> tuple[End, ...]:
+        """The ends that move, in the order of `Measurements.moving`."""
+        return tuple(end for end in ENDS_OF_PLACES if end != self.static_end)
 
     @property
     def query_box(self) -> np.ndarray:
         """The box for each end that moves, (2, 3) or (2, 6) [m]: of what `moving` gives."""
-        return np.tile(self.box, 1 if self.static_end is not None else 2)
+        return np.tile(self.box, len(self.moving_ends))
 
     @property
     def wavelength(self) -> float | None:
@@ -355,17 +408,31 @@ class Measurements:
         return len(self.target)
 
     @property
+    def ends(self) -> dict[End, np.ndarray]:
+        """Positions (S, 3) [m] by end."""
+        return {"tx": self.tx, "rx": self.rx_position}
+
+    def with_ends(self, places: Mapping[End, np.ndarray]) -> Measurements:
+        """Return the same with ends at other places (S, 3) [m]."""
+        ends = {**self.ends, **places}
+        return replace(self, tx=ends["tx"], rx_position=ends["rx"])
+
+    @property
     def moving(self) -> np.ndarray:
         """Positions of what moves, (S, 3) or of both ends (S, 6), float64 [m]: the query of every method."""
-        if self.site.static_end is None:
-            return np.hstack([self.tx, self.rx_position])
-        return self.tx if self.site.moving_end == "tx" else self.rx_position
+        moving = [self.ends[end] for end in self.site.moving_ends]
+        return np.hstack(moving) if len(moving) > 1 else moving[0]
 
     @property
     def carrier_hz(self) -> np.ndarray | None:
         """Carrier (S,) [Hz] of each row where stations are told apart by theirs, else None."""
-        carriers = None if self.site.stations is None else self.site.stations.carrier_hz
-        return None if carriers is None or self.station is None else carriers[self.station]
+        carriers = self.site.every_station.carrier_hz
+        return None if carriers is None else carriers[self.stations_of()]
+
+    def powers(self, rows: Chosen = slice(None)) -> np.ndarray:
+        """Return powers (n, D) float64 of the entries of rows (n,), in physical units."""
+        target, stored = self.site.target, self.target.reshape(len(self), -1)[rows]
+        return target.power(stored) * self.site.target_scale**target.exponent
 
     def censored_side(self, rows: Chosen = slice(None)) -> np.ndarray:
         """Return `censored` of rows (n,), (n,) int8; 0 of each where nothing is."""
@@ -402,7 +469,7 @@ class Measurements:
         """Return the given rows as one batch."""
         rows = np.asarray(index)
         # One pose for the whole batch: kernels then plan the view once.
-        one = self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1)
+        one = self.site.static_end == "rx" and not self.site.several
         seen = rows[0] if one else rows
         rx = Pose(self._f32(self.rx_position[seen]), self._f32(self.rx_rotation[seen]))
         optional = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))

@@ -39,6 +39,11 @@ class Fold:
         """Return rows that are learned from: all but test rows, and without `val` where `val` is scored."""
         return self.train if eval_on == "val" else np.concatenate([self.train, self.val])
 
+    @classmethod
+    def of_all(cls, rows: np.ndarray) -> Fold:
+        """Return rows that are all learned from: none is validated or tested on."""
+        return cls(rows, rows[:0], rows[:0])
+
     def map(self, change: Callable[[np.ndarray], np.ndarray]) -> Fold:
         """Return the three parts changed alike."""
         return Fold(*map(change, (self.train, self.val, self.test)))

@@ -114,13 +114,12 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
         log.warning("%s: %d of %d rows are left out", told, (~known).sum(), len(known))
         data = data.subset(np.flatnonzero(known))
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
-    end = "tx" if facts.static_end == "tx" else "rx_position"
+    end = facts.still_end
     station = number[data.stations_of()]
     there = (theirs.position - shift)[station]
     # Of a place that one of both does not know, all is as the model learned it.
-    both = np.isfinite(there + getattr(data, end))
-    still = np.where(both, getattr(data, end), there)
-    return replace(data, station=station, site=facts, **{end: still})
+    still = np.where(np.isfinite(there + data.ends[end]), data.ends[end], there)
+    return replace(data.with_ends({end: still}), station=station, site=facts)
 
 
 def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.ndarray) -> str:

@@ -90,8 +90,7 @@ def predict_file(
     """
     site, places = predictor.site, Path(places)
     path = output_path(None if out is None else str(out), places, overwrite)
-    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
-    queries = fill_heights(read_query_places(places, moving, columns or {}), site)
+    queries = fill_heights(read_query_places(places, site.moving_ends, columns or {}), site)
     for note in _notes(queries, site):
         log.info("%s: %s", places, note)
     world = to_world(queries, site)
@@ -109,8 +108,8 @@ def predict_file(
         )  # fmt: skip
     power = site.power_unit(predictor.unit) if site.target.in_decibels else None
     if tested is not None and power is not None and predictions.said.variance is not None:
-        local = np.hstack([world[end] - site.origin for end in ("tx", "rx") if end in world])
-        predictions = _with_tested(predictions, local[predictions.place], power, tested)
+        local = site.local_places(world)[predictions.place]
+        predictions = _with_tested(predictions, local, power, tested)
         if refused := predictions.count_refused():
             what = f"{refused} of {len(predictions)} predictions are refused (column refused)"
             log.warning("%s: %s: too far from what was measured", places, what)
@@ -181,14 +180,14 @@ def predict_places(
         DataError: a station that was asked for had too few training rows, or none has a model.
     """
     row, number = rows_and_stations(queries, predictor.site, station)
-    stations, named = predictor.site.stations, station is not None or queries.station is not None
+    named = station is not None or queries.station is not None
     blocks: list[tuple[Predictor, np.ndarray]] = []
     silent: list[str] = []
     # By station: each may have a model of its own, whose matrices are then read once a block.
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
-            own = predictor if stations is None else predictor.select_station(stations.name[one])
+            own = predictor.ask_station(int(one))
         except ValueError as error:
             if named:
                 raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
@@ -218,8 +217,8 @@ def predict_places(
     # Blocks are of stations, answers are wanted in the order of places.
     said = Prediction.joined([*parts.values()], torch.from_numpy(np.argsort(rows, kind="stable")))
     rows.sort()
-    of_row, called = number[rows], {} if stations is None else stations.named
-    return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called.items()}, said)
+    of_row, called = number[rows], predictor.site.every_station.named.items()
+    return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called}, said)
 
 
 def _select_device(predictor: Predictor, device: str, source: str) -> Predictor:

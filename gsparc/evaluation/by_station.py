@@ -40,17 +40,15 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     see `strongest_told`. Of k stations tied as predicted strongest a right one counts 1 / k. Empty without
     such places.
     """
-    if data.station is None:
-        return {}
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
     if "strongest_told" in scores.samples:
         told = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
         return {BEST_SERVER: float(told.mean())}
     # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
-    most = np.where(data.censored_side(row) < 0, data.target[row, 0] * data.site.target_scale, np.nan)
+    most = np.where(data.censored_side(row) < 0, data.powers(row)[:, 0], np.nan)
     told = scores.samples.get("served", scores.samples["prediction"])
     every = pd.DataFrame({
-        "fold": scores.fold, "place": place[row], "station": data.station[row],
+        "fold": scores.fold, "place": place[row], "station": data.stations_of(row),
         "predicted": told, "measured": np.fmax(scores.samples["target"], most),
     })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.
@@ -114,10 +112,10 @@ def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
 
 def describe_new(old: Measurements, new: Measurements) -> str | None:
     """Return stations of `newly_listed` in words, the surest first; None without."""
-    found, stations = newly_listed(old, new).sort_values("chance"), new.site.stations
-    if stations is None or not len(found):
+    found = newly_listed(old, new).sort_values("chance")
+    if not len(found):
         return None
-    names = np.array(stations.shown)[found.index]
+    names = np.array(new.site.every_station.shown)[found.index]
     surely = np.where(found.chance < BY_CHANCE, "new", "new, or out of its reach before")
     said = zip(names, found.lists, found.expected, surely, found.chance, strict=True)
     return ", ".join(
@@ -127,10 +125,10 @@ def describe_new(old: Measurements, new: Measurements) -> str | None:
 
 def describe_never_listed(scores: Scores, data: Measurements) -> str | None:
     """Return stations of `unlisted_stations` in words, the surest first; None without."""
-    found, stations = unlisted_stations(scores, data).sort_values("chance"), data.site.stations
-    if stations is None or not len(found):
+    found = unlisted_stations(scores, data).sort_values("chance")
+    if not len(found):
         return None
-    names = np.array(stations.shown)[found.index.astype(int)]
+    names = np.array(data.site.every_station.shown)[found.index.astype(int)]
     said = zip(names, found.expected, found.moments, found.chance, strict=True)
     return ", ".join(f"{n} (in {e:.0f} of {r:.0f} lists; chance {c:.0e})" for n, e, r, c in said)
 
@@ -140,15 +138,15 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
 
     Of stations with scored rows; silent ones count in `rmse_db_with_silent`. Empty without stations.
     """
-    if data.station is None or data.site.stations is None:
-        return {}
     columns: dict[str, Any] = {}
+    if not (called := data.site.every_station.named):
+        return columns
     for stem, one in methods.items():
         for name in [name for name in ERRORS if name in one.samples]:
             error = pd.DataFrame({"mean": one.samples[name], "square": one.samples[name] ** 2})
-            by, figure = error.groupby(data.station[one.row]), name.replace("error", "rmse")
+            by, figure = error.groupby(data.stations_of(one.row)), name.replace("error", "rmse")
             means, rows = by.mean(), by["mean"].count()
-            for head, names in data.site.stations.named.items():
+            for head, names in called.items():
                 columns.setdefault(head, np.array(names)[rows.index])
             columns |= {name.replace("error_db", "rows"): rows, stem + figure: means.square**0.5}
             columns |= {f"{stem}bias_db": means["mean"]} if name == ERRORS[0] else {}

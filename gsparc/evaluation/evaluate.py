@@ -261,10 +261,9 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
     if data.site.target.in_decibels:
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
-    if data.station is not None and data.site.stations is not None:
-        of_row = data.station[scores.row]
-        columns |= {head: np.array(names)[of_row] for head, names in data.site.stations.named.items()}
-    if data.site.static_end is None:
-        other = data.tx[scores.row] + data.site.origin
-        columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
+    of_row = data.stations_of(scores.row)
+    columns |= {head: np.array(names)[of_row] for head, names in data.site.every_station.named.items()}
+    for end in data.site.moving_ends[:-1]:
+        other = data.ends[end][scores.row] + data.site.origin
+        columns |= {f"{end}_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
     return columns

@@ -32,7 +32,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         return {}
     mean_db, spread_db = power_in_decibels(mean[known], variance[known])
     row = scores.row[known]
-    power = data.target[row, 0].astype(np.float64) * data.site.target_scale
+    power = data.powers(row)[:, 0]
     silent = data.censored_side(row) > 0
     heard = (data.censored_side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
@@ -92,6 +92,6 @@ def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, 
         figures |= reduced_chi_squared(scores, data)
     else:
         figures |= rmse_with_silent(scores, data) | power_intervals(scores, data) | best_server(scores, data)
-        if split.name == "stations" and data.station is not None:
-            figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.station)
+        if split.name == "stations":
+            figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.stations_of())
     return figures

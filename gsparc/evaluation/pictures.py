@@ -183,15 +183,15 @@ LEAST = 10  # rows that were heard of a sector, whose azimuth is not contradicte
 def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Path) -> None:
     """Draw rows of sectors that were learned from, less the law of distance, where there are patterns."""
     field = method.joint_method()
-    if not isinstance(field, JointPowerField) or field.network is None or data.site.stations is None:
+    if not isinstance(field, JointPowerField) or field.network is None:
         return
     trend = field.network
     heard = rows_of_stations(data, fold.learned(), field.places).measured_rows
     count = np.bincount(heard.station, minlength=len(field.places))
-    azimuth, stations = trend.table[:, 0].numpy(), data.site.stations
+    azimuth, stations = trend.table[:, 0].numpy(), data.site.every_station
     # Without an azimuth there is no angle to draw over.
     count[azimuth == NO_AZIMUTH] = 0
-    given = azimuth if stations.sector is None else stations.sector[:, 0] % 360
+    given = stations.beams[:, 0] % 360
     turned = ~np.isclose(azimuth, given)  # as levels contradict what was given
     enough = count >= np.where(turned, 1, LEAST)
     chosen = [int(t) for t in np.lexsort((-count, ~turned)) if enough[t]][:MOST]

@@ -87,8 +87,7 @@ def errors_with_silent(
     side = data.censored_side(row)
     if not side.any():
         return {}
-    level = data.target[row, 0].astype(np.float64) * data.site.target_scale
-    beyond = side * power_errors(samples["prediction"], level)["error_db"]
+    beyond = side * power_errors(samples["prediction"], data.powers(row)[:, 0])["error_db"]
     return {"error_db_with_silent": np.where(side == 0, samples["error_db"], np.maximum(beyond, 0.0))}
 
 

@@ -18,7 +18,7 @@ from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.checks.outliers import find_outliers, too_far
 from gsparc.data.checks.plausibility import find_outlier_rows
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import ENDS, Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import PALETTE, panels, save
@@ -83,19 +83,17 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
 
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
     """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
-    several = data.site.has_several_stations
+    several = data.site.several
     if data.site.target.is_image:
         return None, ""
-    power = data.site.target.power(data.target.reshape(len(data), -1) * data.site.target_scale)
+    power = data.powers()
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side() < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
     in_decibels, value = data.site.target.in_decibels, power[row, entry]
     # Powers of channels are averaged linearly, levels of a station in decibels.
     value = 10 * np.log10(value) if in_decibels else value
-    each = [which[row]]
-    if in_decibels and data.station is not None:
-        each.append(data.station[row])
+    each = [which[row], data.stations_of(row) if in_decibels else which[row]]
     level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
     if in_decibels:
         of = " of the strongest station" if several else ""
@@ -113,8 +111,7 @@ def draw_site(
     """
     places = find_spots(data, levels)
     points = [places.place[~places.far], static_positions(data)]  # but those far outside
-    if data.site.static_end is None:
-        points.append(data.tx[:, :2] + data.site.origin[:2])
+    points += [data.ends[end][:, :2] + data.site.origin[:2] for end in data.site.moving_ends[:-1]]
     low, high = frame_of(np.concatenate(points))
     width, height = (high - low) / (high - low).max() * INCHES
     width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
@@ -148,12 +145,8 @@ def _title(data: Measurements, places: Spots) -> str:
 
 def static_positions(data: Measurements) -> np.ndarray:
     """Return world x and y (T, 2) of the ends that stand still, where that is known."""
-    site = data.site
-    if site.stations is not None:
-        place = site.stations.position
-    else:
-        place = np.zeros((0, 3)) if site.static_position is None else site.static_position[None]
-    return place[:, :2] + site.origin[:2]
+    place = data.site.every_station.position[:, :2] + data.site.origin[:2]
+    return place if np.isfinite(place).any() else place[:0]
 
 
 def _draw_map(
@@ -161,10 +154,10 @@ def _draw_map(
 ) -> None:
     site, inside = data.site, ~places.far
     size = _size(places.place[inside], float((high - low).max()))
-    if site.static_end is None:
-        tx = np.unique(data.tx[:, :2], axis=0) + site.origin[:2]
-        axis.scatter(*tx.T, s=10, c="0.55", marker="s", linewidths=0, label="transmitter")
-    name = "receiver" if site.moving_end == "rx" else "transmitter"
+    for end in site.moving_ends[:-1]:
+        other = np.unique(data.ends[end][:, :2], axis=0) + site.origin[:2]
+        axis.scatter(*other.T, s=10, c="0.55", marker="s", linewidths=0, label=ENDS[end])
+    name = ENDS[site.moving_end]
     if places.level_db is None or not np.isfinite(places.level_db[inside]).any():
         axis.scatter(*places.place[inside].T, s=size, c=PALETTE[0], linewidths=0, label=name)
     else:
@@ -197,7 +190,7 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     place, site = static_positions(data), data.site
     if not len(place):
         return
-    what = "transmitter" if site.static_end == "tx" else "receiver"
+    what = ENDS[site.still_end]
     label = f"the {what}" if len(place) == 1 else f"{len(place)} stations ({what}s)"
     draw_stations(axis, place, label, zorder=2)
     if jumping:

@@ -77,12 +77,13 @@ class PositionEncoding(nn.Module):
         self.settings = settings
         self.register_buffer("centre", box.mean(0).float())
         self.register_buffer("half_extent", (extent / 2).float())
-        if settings.kind == "fourier":
-            octaves = math.pi * 2.0 ** torch.arange(settings.octaves)
+        if settings.kind in ("raw", "fourier"):  # coordinates alone are those without octaves
+            stored = settings.kind == "fourier"
+            octaves = math.pi * 2.0 ** torch.arange(settings.octaves if stored else 0)
             axes = (octaves[:, None, None] * torch.eye(box.shape[1])).reshape(-1, box.shape[1])
-            self.register_buffer("frequencies", axes.repeat(2, 1))
+            self.register_buffer("frequencies", axes.repeat(2, 1), persistent=stored)
             quarter = torch.full((len(axes),), -math.pi / 2)
-            self.register_buffer("phases", torch.cat([torch.zeros(len(axes)), quarter]))
+            self.register_buffer("phases", torch.cat([torch.zeros(len(axes)), quarter]), persistent=stored)
         elif settings.kind == "kernel":
             if prior is None:
                 raise ValueError(
@@ -97,7 +98,7 @@ class PositionEncoding(nn.Module):
                 whitening = whitened_features(*known).whitening.float()
             # What the prior holds is stored with it.
             self.register_buffer("whitening", whitening, persistent=prior.whitening is None)
-        elif settings.kind != "raw":
+        else:
             raise ValueError(f"model.emission.encoding.kind={settings.kind!r}: choose raw, fourier or kernel")
 
     @property
@@ -105,15 +106,13 @@ class PositionEncoding(nn.Module):
         """Number of encoded values."""
         if self.settings.kind == "kernel":
             return self.whitening.shape[1]
-        return len(self.centre) + (len(self.frequencies) if self.settings.kind == "fourier" else 0)
+        return len(self.centre) + len(self.frequencies)
 
     def forward(self, position: Tensor) -> Tensor:
         """Encode (B, D) [m] as (B, width)."""
         if self.settings.kind == "kernel":
             return correlation(position, self.anchors, self.length, self.kernel) @ self.whitening
         scaled = (position - self.centre) / self.half_extent
-        if self.settings.kind == "raw":
-            return scaled
         return torch.cat([scaled, torch.cos(scaled @ self.frequencies.T + self.phases)], dim=-1)
 
 

@@ -77,7 +77,7 @@ class ClosedForm(Method):
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Set the weights from rows (n,); settings are chosen anew where that costs little."""
-        self.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+        self.fit(data, Fold.of_all(rows), FitContext())
 
     def left_out(self) -> LeftOutRows:
         """Return the rows it was conditioned on, each predicted from the others.

@@ -50,7 +50,7 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
         plain, hides = switches.residual is not False, switches.visibility
         # No Gaussians means the residual alone, where that is not switched off.
         placed = count > 0 or not plain
-        residual_alone = plain and site.kind == "csi" and site.wavelength is not None and not terms.rendered
+        residual_alone = plain and site.has_waves and not terms.rendered
         # The first that is called for: what was heard at the same moment tells more than where it was
         # heard; phases relative to neighbours leave no source to be placed.
         table: tuple[tuple[bool, type[Method]], ...] = (

@@ -23,6 +23,7 @@ from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
 from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.physics.row_factors import align_factors
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 
@@ -157,6 +158,7 @@ class Method(MethodFactory):
     """fit, predict, save, load; nothing else is asked of a method. Unfitted, it makes copies of itself."""
 
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
+    stored: ClassVar[tuple[str, ...]] = ()  # attributes that a fit finds, by their names in a checkpoint
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     has_gaussians = False  # whether what it learns are Gaussians, which `count_components` then counts
     # See `gradient_problem`, which others say as they are fitted.
@@ -225,13 +227,20 @@ class Method(MethodFactory):
         """
         return self.no_gradient
 
-    @abstractmethod
     def state(self) -> dict[str, Any]:
-        """Return tensors, numbers and strings that `restore` needs, as weights-only unpickling accepts."""
+        """Return what `restore` needs, as weights-only unpickling accepts; here the attributes `stored`."""
+        return {name: to_plain(getattr(self, name, None)) for name in self.stored}
 
-    @abstractmethod
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the method whose `state()` this was."""
+        self.site = site
+        self._relearn(state)
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        """Set what `stored` names; what cannot be stored is made again by who overrides this."""
+        for name in self.stored:
+            if name in state or not hasattr(type(self), name):  # older checkpoints lack what has a default
+                setattr(self, name, from_plain(state[name]))
 
     def count_components(self) -> int:
         """Return the number of Gaussians, sources or stored training samples."""

@@ -49,7 +49,7 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
     Raises:
         ValueError: both ends move, and the method knows one that does.
     """
-    if data.site.has_several_stations:
+    if data.site.several:
         return PerStation(factory)
     if data.site.static_end is None and not factory.both_ends:
         raise ValueError(f"{factory.name}: both ends move here; it needs one that stands still")
@@ -65,8 +65,7 @@ class StationsOfFold(NamedTuple):
 
 def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> StationsOfFold:
     """Return which stations `method` can learn, and which it is tested on without."""
-    assert data.site.stations is not None
-    count = len(data.site.stations)
+    count = len(data.site.every_station)
     # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
     known, asked = (np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test))
@@ -81,15 +80,14 @@ def station_site(site: Site, number: int) -> Site:
     site = replace(site, sha256=sha256(f"{site.sha256} {number}".encode()).hexdigest())
     if number == UNHEARD:
         return replace(site, stations=None, static_end=None, static_position=None)
-    stations = site.stations
-    assert stations is not None
-    carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
+    stations, hertz = site.every_station, float(site.carriers[number])
     rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
     place = stations.position[number]
     array = site.array if stations.array is None else stations.array[number]
     return replace(
-        site, name=f"{site.name}{OF_STATION}{stations.shown[number]}", stations=None, carrier_hz=carrier,
-        array=array, static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
+        site, name=f"{site.name}{OF_STATION}{stations.shown[number]}", stations=None, array=array,
+        carrier_hz=None if np.isnan(hertz) else hertz,
+        static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
     )  # fmt: skip
 
 
@@ -175,7 +173,7 @@ class PerStation(Method):
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = pool_station_weights([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
-        lost = [t for t in range(len(data.site.stations or ())) if not {t, UNHEARD} & {*numbers}]
+        lost = [t for t in range(len(data.site.every_station)) if not {t, UNHEARD} & {*numbers}]
         if who := list_first([self._station_name(number) for number in lost]):
             notes.append(Caution(f"answers are NaN, of fewer than {LEAST_ROWS} rows: station {who}"))
         for turn, number in enumerate(numbers):
@@ -191,8 +189,7 @@ class PerStation(Method):
         Raises:
             ValueError: see `fit`.
         """
-        stations = data.site.stations
-        assert stations is not None
+        stations = data.site.every_station
         how = context.stations
         if how == "auto":
             # What trial fits read of the settings is not yet heeded by the fit itself.
@@ -220,10 +217,7 @@ class PerStation(Method):
         return numbers
 
     def _station_name(self, number: int) -> str:
-        assert self.site is not None and self.site.stations is not None
-        if number != UNHEARD:
-            return self.site.stations.shown[number]
-        return "stations never heard"
+        return self.fitted_site.every_station.shown[number] if number != UNHEARD else "stations never heard"
 
     def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""
@@ -276,8 +270,9 @@ class PerStation(Method):
 
     def all_stations(self) -> AllStationsView | None:
         """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
-        stations = None if self.site is None else self.site.stations
-        return AllStationsView(self._copies[UNHEARD], len(stations)) if self._shared and stations else None
+        if not self._shared:
+            return None
+        return AllStationsView(self._copies[UNHEARD], len(self.fitted_site.every_station))
 
     def joint_method(self) -> HasJoint | None:
         """See `Method.joint_method`."""
@@ -287,12 +282,12 @@ class PerStation(Method):
     def add_carrier(self, frequency_hz: float) -> PerStation:
         """See `AddsCarriers`."""
         copy, site = self._copies.get(UNHEARD), self.fitted_site
-        if not self._shared or not isinstance(copy, AddsCarriers) or site.stations is None:
+        if not self._shared or not isinstance(copy, AddsCarriers):
             known = "knows its own carriers alone" if self._shared else "learned each carrier alone"
             raise ValueError(f"{self.name} {known}; model=carriers answers at others")
         result = PerStation(self.factory)
         result._copies, result._shared = {UNHEARD: copy.add_carrier(frequency_hz)}, True
-        result.site = replace(site, stations=site.stations.add_carrier(frequency_hz))
+        result.site = replace(site, stations=site.every_station.add_carrier(frequency_hz))
         return result
 
     def _site_of_copy(self, site: Site, number: int) -> Site:
@@ -301,12 +296,11 @@ class PerStation(Method):
 
     def _stations_of_query(self, query: Query) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
-        assert self.site is not None and self.site.stations is not None
-        ends = Ends.from_query(self.site, query)
-        here = station_distances(torch.from_numpy(self.site.still_places), ends.still) <= SAME_PLACE_M
+        ends, stations = Ends.from_query(self.fitted_site, query), self.fitted_site.every_station
+        here = station_distances(torch.from_numpy(stations.position), ends.still) <= SAME_PLACE_M
         for shared in here[here.sum(1) > 1][:1] if set(self._copies) != {UNHEARD} else ():
             # Sectors of one mast, or carriers.
-            names = " and ".join(self.site.stations.shown[t] for t in shared.nonzero()[:, 0].tolist())
+            names = " and ".join(stations.shown[t] for t in shared.nonzero()[:, 0].tolist())
             raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         for row in (~here.any(1)).nonzero()[:1, 0].tolist() if UNHEARD not in self._copies else ():
             raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}")

@@ -137,8 +137,8 @@ class Interpolated(View):
     def __init__(self, inner: Method, grid: SphereGrid, stride: int) -> None:
         super().__init__(inner)
         self.grid, self.stride = grid, stride
-        height, width = (grid.height - 1) // stride + 1, grid.width // stride
-        self._height = grid.height
+        self._height, few = grid.height, coarsen_grid(grid, stride)
+        height, width = few.height, few.width
         self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it
         self._next = torch.arange(1, width + 1)
         # Across the seam of a full circle the first column follows the last.

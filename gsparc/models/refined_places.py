@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.stack import to_real_entries
-from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
@@ -129,12 +128,9 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
     batch, moving = data.batch(left.rows), torch.from_numpy(data.moving[left.rows])
     if left.mean.numel() != batch.target.numel():
         raise ValueError(f"{field.name}: of several tones or antennas one is kept of rows left out")
-    turned = batch.rx.rotation.double()
 
     def batch_at(places: Tensor) -> Batch:
-        if site.moving_end == "tx":
-            return replace(batch, tx=places, rx=Pose(batch.rx.position.double(), turned))
-        return replace(batch, tx=batch.tx.double(), rx=Pose(places, turned))
+        return batch.with_ends({site.moving_end: places})
 
     def predict_entries(places: Tensor) -> Tensor:
         return to_real_entries(site.target.in_error_unit(field.predict(batch_at(places)).mean))
@@ -159,7 +155,7 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
 
 def move_rows(data: Measurements, rows: np.ndarray, offsets: np.ndarray) -> Measurements:
     """Return the moving end of rows (n,) elsewhere by (n, 3) [m]; all else the same."""
-    name = "tx" if data.site.moving_end == "tx" else "rx_position"
-    moved = getattr(data, name).copy()
+    end = data.site.moving_end
+    moved = data.ends[end].copy()
     moved[rows] += offsets
-    return replace(data, **{name: moved})
+    return data.with_ends({end: moved})

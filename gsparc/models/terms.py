@@ -119,7 +119,7 @@ def _refuse_scene(
         why = obstacles[term] or f"model.effects.{term}=false"
     elif not count:
         why = "model.field.count=0 is the residual alone"
-    elif site.kind == "rssi" and site.has_several_stations:
+    elif site.kind == "rssi" and site.several:
         why = "known walls are of one station's model; say stations=each"
     elif site.kind == "rssi" and site.static_end is not None and site.static_position is None:
         why = "the dataset does not say where the static end is"
@@ -146,7 +146,7 @@ def phase_obstacle(data: Measurements) -> str | None:
     site = data.site
     if site.kind != "csi":
         return f"the target is {site.kind}, which carries no phase"
-    if site.has_several_stations:
+    if site.several:
         return "several stations are learned together, for which sources are not searched"
     if site.static_position is None:
         return "the dataset does not say where the static end is"

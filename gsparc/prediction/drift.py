@@ -85,7 +85,7 @@ class Watch(Stored):
     @classmethod
     def from_site(cls, site: Site) -> Watch:
         """Return one that has seen nothing."""
-        count, box = 1 if site.stations is None else len(site.stations), site.moving_box[:, :2]
+        count, box = len(site.every_station), site.moving_box[:, :2]
         shape = count * (1 + SIDES**2) + 1, len(SIZES)
         kinds, begun = np.zeros((2, count), np.int64)
         empty = np.full(shape, -np.inf), np.zeros(shape), np.zeros(shape, np.int64), kinds, begun

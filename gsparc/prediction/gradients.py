@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.schema import End
 from gsparc.models.method import Method, Prediction, suitable_threads
 from gsparc.ops import Pose
 from gsparc.ops.transforms import carries_tangent, has_vmap_axis, transform_is_active
@@ -40,12 +40,12 @@ def predict_with_gradients(
     problem, site = method.gradient_problem(), queries.site
     if problem is not None:
         raise ValueError(f"grad=True: {method.name} has no gradients by position: {problem}")
-    ends, fixed = {"tx": tx, "rx": rx}, []
+    ends: dict[End, Any] = {"tx": tx, "rx": rx}
+    fixed = []
     if isinstance(rx, Pose):
         # Gradients are by the position of a pose; its rotation must not ask for one.
         ends["rx"], fixed = rx.position, [rx.rotation]
-    if site.static_end is not None:
-        fixed.append(ends.pop(site.static_end))
+    fixed += [ends.pop(end) for end in {*ends} - {*site.moving_ends}]
     for end, value in ends.items():
         if value is not None and not isinstance(value, Tensor):
             raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
@@ -57,13 +57,12 @@ def predict_with_gradients(
     origin = torch.from_numpy(np.asarray(site.origin, np.float64))
     # The origin goes in float64: in UTM coordinates float32 has no centimetres.
     local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
-    at = Pose(local.get("rx", query.rx.position), query.rx.rotation)
     with suitable_threads(method, len(query)):
         if transform_is_active() and method not in prepared:  # what it keeps must not be a transform's
             prepared.append(method)
             with torch._C._DisableFuncTorch(), torch.no_grad():
                 method.predict(query)
-        moments = method.predict(replace(query, tx=local.get("tx", query.tx), rx=at))
+        moments = method.predict(query.with_ends(local))
     dtype = torch.float32
     for value in ends.values():
         # Computed in float64, answered as precisely as the positions were given.

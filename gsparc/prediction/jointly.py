@@ -51,8 +51,8 @@ class JointMixin:
             return None
         still = np.asarray(station, np.float64) - self.site.origin
         more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64), like)
-        count = 0 if self.site.stations is None else len(self.site.stations)
-        level, covariance, _ = self._predict_levels(more, places, count + torch.arange(len(sectors)))
+        new = len(self.site.every_station) + torch.arange(len(sectors))
+        level, covariance, _ = self._predict_levels(more, places, new)
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
     def noise_by_others(self, places: Any, stations: Any, listed: np.ndarray) -> np.ndarray:

@@ -49,8 +49,7 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
     """Return the level (n,) [dB] of rows (n,), NaN where nothing was measured,
     and which side they are censored on.
     """
-    power = data.site.target.power(data.target.reshape(len(data), -1)[rows] * data.site.target_scale)
-    side = data.censored_side(rows)
+    power, side = data.powers(rows), data.censored_side(rows)
     if data.mask is not None:
         # Censored rows are masked out as targets, but their levels are known.
         seen = data.mask[rows].reshape(power.shape) | (side != 0)[:, None]

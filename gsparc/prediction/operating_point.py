@@ -91,8 +91,8 @@ def choose_within_budget(
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
     ways = [with_reduction(method, point.settings, inputs) for point in points]
     site, draw = stored.site, np.random.default_rng(0)
-    ends = 2 if site.static_end is None else 1
-    places = draw.uniform(site.box[0], site.box[1], (QUERIES, ends, 3)).reshape(QUERIES, -1)
+    low, high = site.query_box
+    places = draw.uniform(low, high, (QUERIES, len(low)))
     calls = {i: Predictor(way, site).cycle_places(places) for i, way in enumerate(ways)}
     times = time_interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
     here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}

@@ -72,9 +72,7 @@ def far_outside_and_margin(world: dict[End, np.ndarray], site: Site) -> tuple[np
     >>> far, 0 < margin < 1  # a tenth of the longer side
     (array([False,  True]), True)
     """
-    moving = [end for end in ("tx", "rx") if end in world]
-    place = np.hstack([world[end] - site.origin for end in moving])  # type: ignore[index]
-    low, high = site.moving_box
+    place, (low, high) = site.local_places(world), site.moving_box
     # Of the longest side: a corridor is so narrow that every place beside it would be far outside.
     margin = MARGIN * float((high - low).max())
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
@@ -83,11 +81,10 @@ def far_outside_and_margin(world: dict[End, np.ndarray], site: Site) -> tuple[np
 def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) -> str:
     """Say that places which are `far` (n,) outside are so only in height; empty: they are not."""
     low, high = site.moving_box[:, 2::3] + site.origin[2]
-    ends = [end for end in ("tx", "rx") if end in world]
-    heights = np.column_stack([world[end][:, 2] for end in ends])
+    heights = np.column_stack([world[end][:, 2] for end in site.moving_ends])
     # With heights as measured: if these places are inside, height alone is what was wrong.
     inside = np.clip(heights, low, high)
-    flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(ends)}
+    flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(site.moving_ends)}
     if far_outside_and_margin(flat, site)[0].any():
         return ""
     beyond = (heights - inside)[far].ravel()
@@ -110,7 +107,7 @@ def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Si
 
 
 def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return row of the places and station (N,) int64 of each prediction; -1 without stations.
+    """Return row of the places and station (N,) int64 of each prediction; 0 without stations.
 
     Args:
         queries: a row about the station it names; where none are named, about every station.
@@ -124,7 +121,7 @@ def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> t
     if stations is None:
         if wanted is not None:
             raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
-        return rows, np.full(len(rows), -1)
+        return rows, np.zeros_like(rows)
     called = all_names(stations)
     only = None if wanted is None else find_station(wanted, stations)
     if wanted is not None and only is None:

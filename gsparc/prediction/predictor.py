@@ -112,10 +112,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         >>> gsparc.load("city.ckpt").stations
         ['roof-2', 'roof-3']
         """
-        return [] if self.site.stations is None else list(self.site.stations.shown)
+        return [name for name in self.site.every_station.shown if name]
 
-    def select_station(self, station: str | int) -> Predictor:
-        """Return the same model asked about one station alone, by a name of `stations` or number.
+    def select_station(self, station: str | int | None) -> Predictor:
+        """Return the same model asked about one station alone, by a name of `stations` or number; None: all.
 
         >>> gsparc.load("city.ckpt").select_station("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
         (1,)
@@ -123,12 +123,24 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: no station is called that.
         """
+        if station is None:
+            return self
         stations = self.site.stations
         if stations is None:
             raise ValueError(f"select_station: {self.site.name} has one static end, and no stations")
         number = find_station(station, stations)
         if number is None:
             raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.shown)}")
+        return self.ask_station(number)
+
+    def ask_station(self, number: int) -> Predictor:
+        """Return the same model asked about a station by its number; itself where the one has no name.
+
+        Raises:
+            ValueError: it had too few training rows.
+        """
+        if self.site.stations is None:
+            return self
         # By number: two stations at one place, with different carriers, cannot be told apart by it.
         both = self.method, self._whole
         method, whole = (None if m is None else m.station_method(number) for m in both)
@@ -147,18 +159,18 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: the model knows one carrier, or its own carriers alone.
         """
-        known = None if self.site.stations is None else self.site.stations.carrier_hz
+        known = self.site.every_station.carrier_hz
         if known is None:
             raise ValueError(f"frequency_hz={frequency_hz:g}: {self.site.name} has one carrier alone")
         if not (np.isfinite(frequency_hz) and frequency_hz > 0):
             raise ValueError(f"frequency_hz={frequency_hz}: expected a frequency above 0 [Hz]")
         if len(here := np.flatnonzero(np.isclose(known, frequency_hz, rtol=1e-6))) == 1:
-            return self.select_station(int(here[0]))
+            return self.ask_station(int(here[0]))
         both = self.method, self._whole
         if not all(isinstance(one, AddsCarriers) for one in both):
             raise ValueError(f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers")
         method, whole = (cast(AddsCarriers, one).add_carrier(frequency_hz) for one in both)
-        return self._copy_with(method, whole, method.fitted_site, self._unit).select_station(len(known))
+        return self._copy_with(method, whole, method.fitted_site, self._unit).ask_station(len(known))
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
         copy = Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
@@ -281,10 +293,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     def _each_station(self) -> list[Predictor | None]:
         """The same model asked about each station; None where that had too few training rows."""
         stations: list[Predictor | None] = []
-        for name in () if self.site.stations is None else self.site.stations.name:
+        for number in range(len(self.site.every_station)):
             stations.append(None)
             with suppress(ValueError):
-                stations[-1] = self.select_station(name)
+                stations[-1] = self.ask_station(number)
         return stations
 
     def cycle_places(self, places: np.ndarray) -> Call:
@@ -293,11 +305,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Places are (n, 3), of both ends (n, 6) [m], local: less `site.origin`. Of several stations the first
         that the model answers for is asked.
         """
-        predictor = next(filter(None, self._each_station()), self)
+        predictor = next(filter(None, self._each_station()))
         ask = getattr(predictor, self.site.kind)
-        ends = ("tx", "rx") if places.shape[1] == 6 else (self.site.moving_end,)
-        world = places.reshape(len(places), -1, 3) + self.site.origin
-        return lambda number: ask(**dict(zip(ends, world[number % len(world)], strict=True)))
+        return lambda number: ask(**self.site.world_ends(places[number % len(places)]))
 
     def spectrum(
         self, tx: Any = None, rx: Any = None, *, frequency_hz: float | None = None, grad: bool = False

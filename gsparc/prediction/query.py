@@ -52,8 +52,8 @@ class Queries:
         places = {
             end: read_places(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
         }
-        moving, static = self.site.moving_end, self.site.static_end or "tx"
-        for needed in (moving,) if self.site.static_end else ("rx", "tx"):
+        moving, static = self.site.moving_end, self.site.still_end
+        for needed in sorted(self.site.moving_ends):  # the receiver first
             if needed not in places:
                 raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
         single = all(place.ndim == 1 for place in places.values())
@@ -114,11 +114,10 @@ def usual_heights(site: Site) -> dict[End, float]:
     >>> usual_heights(predictor.site)
     {'rx': 1.5}
     """
-    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
     low, high = site.moving_box[:, 2::3]
+    ends = enumerate(site.moving_ends)
     # Rounded: the origin was taken away from it.
-    above = {end: round(float(low[i] + site.origin[2]), 9) for i, end in enumerate(moving)}
-    return {end: above[end] for i, end in enumerate(moving) if low[i] == high[i]}
+    return {end: round(float(low[i] + site.origin[2]), 9) for i, end in ends if low[i] == high[i]}
 
 
 def read_places(end: str, value: Any) -> np.ndarray:
@@ -230,15 +229,14 @@ def query_ends(
     Raises:
         DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
     """
-    if station is not None and site.static_end is not None:
-        return {site.static_end: station, site.moving_end: places}
-    if site.static_end is not None:
+    moving, other = site.moving_end, site.still_end
+    if len(site.moving_ends) == 1:
         if other_end is not None:
-            raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
-        return {site.moving_end: places}
+            raise DataError(f"other_end: the {other} stood still; leave it out")
+        return {moving: places} | ({} if station is None else {other: station})
     if other_end is None:
         raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    return {"rx": places, "tx": np.broadcast_to(read_place("other_end", other_end), places.shape)}
+    return {moving: places, other: np.broadcast_to(read_place("other_end", other_end), places.shape)}
 
 
 def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
@@ -255,5 +253,4 @@ def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) 
     Raises:
         DataError: both moved, and nobody says where the other end stands.
     """
-    ends = query_ends(site, places, other_end)
-    return np.hstack([ends[end] - site.origin for end in ("tx", "rx") if end in ends])
+    return site.local_places(query_ends(site, places, other_end))

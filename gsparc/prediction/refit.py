@@ -38,7 +38,7 @@ class Learned:
     @property
     def rows(self) -> np.ndarray:
         """Return those (n,) that were learned from, sorted."""
-        return np.sort(np.concatenate([self.fold.train, self.fold.val]))
+        return np.sort(self.fold.learned())
 
     def cut_folds(self, count: int, seed: int, split: SplitSettings | None = None) -> InnerFolds:
         """Return `count` folds of these rows, cut by `split`; None: as the test rows were."""

@@ -126,7 +126,7 @@ class UpdateMixin:
         Raises:
             ValueError: no powers, both ends move, or arrays that do not go together.
         """
-        if self.site.kind != "rssi" or self.site.static_end is None:
+        if not self.site.maps_levels:
             raise ValueError("update: takes powers where one end stands still; train on all rows instead")
         if rows is None:
             rows = self._rows_of_arrays(tx, rx, rssi, unit)
@@ -173,13 +173,12 @@ class UpdateMixin:
         Raises:
             ValueError: no such station, or no finite number.
         """
-        every = self.site.stations
-        number = None if station is None or every is None else find_station(station, every)
+        number = None if station is None else find_station(station, self.site.every_station)
         if station is not None and number is None:
             raise ValueError(f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}")
         if not np.isfinite(change_db):
             raise ValueError(f"shift: change_db={change_db} is no finite number")
-        names = range(len(every or (0,))) if number is None else [number]
+        names = range(len(self.site.every_station)) if number is None else [number]
         changes = self._current.changes
         shifts = {n: dict(changes.shifts).get(n, 0.0) + float(change_db) for n in names}
         shifts = dict(changes.shifts) | shifts
@@ -281,7 +280,7 @@ class UpdateMixin:
     def _rows_of_arrays(self, tx: Any, rx: Any, rssi: Any, unit: str | None) -> LevelRows:
         """Rows of arrays of the API."""
         places = {"tx": tx, "rx": rx}[self.site.moving_end]
-        count = len(self.site.stations or (0,))
+        count = len(self.site.every_station)
         if places is None or rssi is None:
             raise ValueError(f"update: {self.site.moving_end}= and rssi= are needed")
         at = np.atleast_2d(read_places(self.site.moving_end, places)) - self.site.origin

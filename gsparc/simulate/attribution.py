@@ -60,12 +60,12 @@ class Deliverable:
         return Deliverable(kind, tolerance, quantile)
 
     def __str__(self) -> str:
-        share = f"for {self.quantile:.0%} of the receivers"
-        if self.kind == "coverage":
-            return f"received power within +-{self.tolerance:g} dB {share}"
-        if self.kind == "csi":
-            return f"channel NMSE at most {self.tolerance:g} dB {share}"
-        return f"spectrum skill at least {1 - self.tolerance:g} over the nearest receiver's {share}"
+        wanted = {
+            "coverage": f"received power within +-{self.tolerance:g} dB",
+            "csi": f"channel NMSE at most {self.tolerance:g} dB",
+            "spectrum": f"spectrum skill at least {1 - self.tolerance:g} over the nearest receiver's",
+        }
+        return f"{wanted[self.kind]} for {self.quantile:.0%} of the receivers"
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """Alarms: none while nothing changes, then soon, dated, placed and named."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from rooms_later import CABINET, later_rows
 
+from gsparc.data.schema import Site, Stations
 from gsparc.prediction.drift import Watch
 from gsparc.processes.changes import LaterRows
 
@@ -14,7 +15,10 @@ BEGIN, EXTENT = 150, 28.0
 
 
 def site(stations=None):
-    return SimpleNamespace(stations=stations, moving_box=np.array([[0.0, 0, 1.5], [20, 20, 1.5]]))
+    box = np.array([[0.0, 0, 1.5], [20, 20, 1.5]])
+    site = Site("hall", "rssi", "tx", None, None, None, None, moving_box=box)
+    names = tuple(map(str, range(len(stations or ()))))
+    return replace(site, stations=Stations(np.zeros((len(names), 3)), names) if names else None)
 
 
 def sequence(seed, count=150, **changed):

@@ -41,7 +41,7 @@ class SiteField:
         self.predictor, self.site = predictor, predictor.site
         if self.site.static_end is None:
             raise ValueError("locate: both ends move; one that stands still is needed")
-        self.count = 1 if self.site.stations is None else len(self.site.stations)
+        self.count = len(self.site.every_station)
 
     @torch.no_grad()
     def moments_at(self, places: Tensor) -> HeardMoments:

@@ -51,7 +51,7 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
     """
     site = data.site
     rows = np.sort(np.asarray(rows))
-    count = 1 if site.stations is None else len(site.stations)
+    count = len(site.every_station)
     station = data.stations_of(rows)
     moment = np.arange(len(rows)) if count == 1 else number_moments(data, rows)
     _, first, which = np.unique(moment, return_index=True, return_inverse=True)

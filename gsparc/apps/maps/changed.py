@@ -23,12 +23,10 @@ def add_changes(field: FieldMap, predictor: Predictor, dry: bool = False) -> Fie
     if not predictor.versions or not len(predictor.rows):
         return field
     layers = np.full((2, field.best_server.size), np.nan, np.float32)
-    stations = predictor.site.stations
     for row, number in enumerate([] if dry else field.number):
         cells = np.flatnonzero(field.best_server.reshape(-1) == row)
         if len(cells):
-            # By name: a number that is no name is a cell of its own where names are numbers.
-            own = predictor if stations is None else predictor.select_station(stations.name[int(number)])
+            own = predictor.ask_station(int(number))
             layers[:, cells] = own.change(**{own.site.moving_end: field.grid.places(cells)})
     change, deviation = layers.reshape(2, *field.best_server.shape)
     return replace(field, extra={**field.extra, CHANGE: change, DEVIATION: deviation})

@@ -64,8 +64,8 @@ def error_covariances(
         ValueError: the model has no process.
     """
     covariances, every = [], choose_stations(predictor, None)[0]
-    names = [""] if predictor.site.stations is None else predictor.site.stations.name
-    ask = {name: predictor.select_station(name) if name else predictor for name in every}
+    names = predictor.site.every_station.name
+    ask = {name: predictor.ask_station(names.index(name)) for name in every}
     told = {name: predict_levels(ask[name], places, other_end) for name in every}
     each = len(every) if promise is None else min(promise.stations_of_place(), len(every))
     level = np.nan_to_num([told[name][0] for name in every], nan=-np.inf)

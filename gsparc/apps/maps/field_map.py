@@ -169,13 +169,18 @@ def server_chance(
     Returns:
         NaN where no power is known.
     """
-    number = best_server(power_db)
-    first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
+    known, first, cell = _strongest(power_db)
     mean, spread = power_db[first, cell], error_db[first, cell]
     above = ndtr((mean - floor_db[first]) / spread)
     z = ndtri(1 - np.maximum(above, 1e-12) * SHARES)  # equally likely levels above the floor
     beaten = _chance_all_below(mean + spread * z, power_db, error_db, alike, z, first)
-    return np.where(number == REFUSED, np.nan, above * beaten).astype(np.float32)
+    return np.where(known, above * beaten, np.nan).astype(np.float32)
+
+
+def _strongest(power_db: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether a power of (T, n) is known in each cell (n,), the strongest's number there, and the cell's."""
+    number = best_server(power_db)
+    return number != REFUSED, np.maximum(number, 0), np.arange(power_db.shape[1])
 
 
 def outage_probability(
@@ -230,8 +235,7 @@ def sinr(
     """
     # float64: 10^(-12) beside 10^(-4) keeps no digit of interference in float32.
     linear = np.where(np.isfinite(power_db), 10 ** (power_db.astype(np.float64) / 10), 0.0)
-    number = best_server(power_db)
-    first, cell = np.maximum(number, 0), np.arange(linear.shape[1])
+    known, first, cell = _strongest(power_db)
     signal = linear[first, cell]
     same = True if carrier is None else carrier[:, None] == carrier[first]
     every = load @ (linear * same) - load[first] * signal
@@ -240,7 +244,7 @@ def sinr(
     rest = np.maximum(every, 0.0) + noise
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 10 * np.log10(signal / rest)
-    return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
+    return np.where(known & (rest > 0), ratio, np.nan)
 
 
 def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
@@ -250,10 +254,9 @@ def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
     Returns:
         NaN where no power is known.
     """
-    number = best_server(power_db)
-    first, cell = np.maximum(number, 0), np.arange(power_db.shape[1])
+    known, first, cell = _strongest(power_db)
     near = (power_db >= power_db[first, cell] - OVERLAP_DB) & (carrier[:, None] == carrier[first])
-    return np.where(number == REFUSED, np.nan, near.sum(0)).astype(np.float32)
+    return np.where(known, near.sum(0), np.nan).astype(np.float32)
 
 
 def read_loads(

@@ -84,7 +84,7 @@ def predict_map(
     if loss is not None and (loss.shape != (2,) or (loss < 0).any() or buildings is None):
         raise DataError(f"indoor_db={indoor_db}: a loss and its deviation, [15,6], beside buildings=FILE")
     grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings, loss is not None)
-    numbers = np.array([0 if site.stations is None else site.stations.name.index(name) for name in names])
+    numbers = np.array([site.every_station.name.index(name) for name in names])
     about = station_facts(site, numbers)
     load_of = field_map.read_loads(load, names, about["stations"])
     level = PowerUnit.from_name(unit, site.level_unit, levels=True)
@@ -238,7 +238,7 @@ def _asker(
     Of one station (n, 2), or of those that are known together (n, 3 T), with the correlation of their
     errors with the strongest's.
     """
-    own = predictor if joint or predictor.site.stations is None else predictor.select_station(names[0])
+    own = predictor if joint else predictor.ask_station(int(numbers[0]))
 
     def one(cells: np.ndarray) -> np.ndarray:
         if (every := joint_levels(own, grid.places(cells), numbers) if joint else None) is not None:
@@ -289,14 +289,12 @@ def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: floa
 
 def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
     """Return what a `FieldMap` says of stations (T,): names, as in a list of cells, places, carriers, ..."""
-    stations, place = site.stations, (site.still_places + site.origin)[:, :2]
-    if stations is None:
-        return {"stations": ("",), "station_place": place, "bands": ()}
+    stations = site.every_station
     carrier = np.zeros(1) if stations.carrier_hz is None else stations.carrier_hz[numbers]
     several = len(np.unique(carrier)) > 1
     return {
         "stations": tuple((stations.label or stations.name)[number] for number in numbers),
-        "station_place": place[numbers],
+        "station_place": (stations.position + site.origin)[numbers, :2],
         "azimuth": np.zeros(0) if stations.sector is None else stations.sector[numbers, 0],
         "bands": tuple(f"{hertz / 1e6:g} MHz" for hertz in carrier) if several else (),
         "site": number_sites(stations, stations.position)[numbers],

@@ -255,8 +255,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
 
     A sector alone would be left to its site's others, which share its shadowing.
     """
-    data, known, stations = learned.data, learned.rows, learned.data.site.stations
-    assert stations is not None
+    data, known, stations = learned.data, learned.rows, learned.data.site.every_station
     site = number_sites(stations, stations.position)[data.stations_of(known)]
     heard = np.unique(site)
     if len(heard) < LEAST_STATIONS:
@@ -276,7 +275,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
 def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, count: int) -> Any:
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and not draws_shapes(sites):
-        site, end = predictor.site, predictor.site.static_end or "tx"
+        site, end = predictor.site, predictor.site.still_end
         asked = read_query_places(sites, (end,))
         where = asked.ends[end]
         above = np.full(len(asked), height) if where.height is None else where.height
@@ -292,8 +291,7 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
 
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: NewAntenna) -> Any:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
-    assert predictor.site.stations is not None
-    like = antenna.find_alike(predictor.site.stations)
+    like = antenna.find_alike(predictor.site.every_station)
     known = predictor.predict_new(cells, place, antenna.sectors(), like)
     if known is None and (antenna.azimuth is not None or like is not None):
         lacks = (
@@ -310,7 +308,7 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Ne
 
 def assumption(site: Site, height: float, antenna: NewAntenna) -> str:
     """Return in words what a new station is taken to be, `height` [m] high."""
-    carrier = None if site.stations is None else site.stations.carrier_hz
+    carrier = site.every_station.carrier_hz
     # The first band is the lowest: see `gsparc.processes.sectors.Sectors.add_sectors`.
     band = ""
     if carrier is not None and np.ptp(carrier) > 0:

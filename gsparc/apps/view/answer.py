@@ -62,9 +62,8 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
     site, kind = predictor.site, predictor.site.kind
     prediction = predictor.predict_linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
     mean = prediction.mean[0].numpy()
-    still: dict[str, np.ndarray] = {}
-    if site.static_end is not None and site.static_position is not None:
-        still[site.static_end] = site.static_position + site.origin
+    known = site.every_station.position[0] + site.origin
+    still: dict[str, np.ndarray] = {} if np.isnan(known).any() else {site.still_end: known}
     level = spread = None
     if kind != "spectrum":
         level, spread = (float(value[0]) for value in predicted_levels(prediction, kind))

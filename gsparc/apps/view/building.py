@@ -71,7 +71,7 @@ def build_scene(
         parts.append(Points(VALUES, seen.places[chosen], colours, DOT * extent))
     for name, place in stands.items():
         named = len(viewed.stations) <= MOST_NAMES or name == station
-        text = (name or ENDS[viewed.site.static_end or "tx"]) if named else ""
+        text = (name or ENDS[viewed.site.still_end]) if named else ""
         parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.predictor_of(station).method.objects()
     origin = viewed.site.origin

@@ -65,17 +65,16 @@ class Viewed:
     @property
     def moving(self) -> tuple[End, ...]:
         """Return the ends that can be dragged."""
-        return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
+        return self.site.moving_ends
 
     def predictor_of(self, station: str | None) -> Predictor:
         """Return the predictor of a station."""
-        return self.predictor if station is None else self.predictor.select_station(station)
+        return self.predictor.select_station(station)
 
     def static_place(self, station: str | None) -> np.ndarray | None:
         """Return the world place (3,) [m] of the static end; None where it is unknown or moves."""
-        site = self.site if station is None else self.predictor.select_station(station).site
-        place = site.static_position
-        return None if place is None else place + site.origin
+        place = self.predictor_of(station).site.static_position
+        return None if place is None else place + self.site.origin
 
     def box(self) -> np.ndarray:
         """Return world corners (2, 3) of where the moving end was [m]."""
@@ -93,8 +92,7 @@ class Viewed:
         """Return values of a station; None without data."""
         if self.data is None:
             return None
-        data, stations = self.data, self.site.stations
-        number = 0 if station is None or stations is None else stations.name.index(station)
+        data, number = self.data, self.site.every_station.name.index(station or "")
         rows = np.flatnonzero(data.stations_of() == number)
         places = data.moving[rows][:, -3:] + data.site.origin
         if data.site.kind == "spectrum":

@@ -77,14 +77,13 @@ def carrier_warnings(data: Measurements) -> list[str]:
     """Name what several carriers at the same places tell: shifted rows, a mirrored azimuth."""
     if data.site.kind != "spectrum" or data.carrier_hz is None or data.place is None:
         return []
-    assert data.site.stations is not None
-    count, places = len(data.site.stations), int(data.place.max()) + 1
+    stations, places = data.site.every_station, int(data.place.max()) + 1
     step = max(1, data.target[0].size // PIXELS)
     seen = data.site.target.to_real(data.target.reshape(len(data), -1)[:, ::step])
-    table = np.full((count, places, seen.shape[1]), np.nan)
+    table = np.full((len(stations), places, seen.shape[1]), np.nan)
     table[data.stations_of(), data.place] = seen - seen.mean(0)
     shifted = []
-    for station, name in enumerate(data.site.stations.shown):
+    for station, name in enumerate(stations.shown):
         others = np.nansum(np.delete(table, station, axis=0), axis=0)
         fit = {by: _likeness(table[station], np.roll(others, by, axis=0))[1:-1] for by in (-1, 0, 1)}
         ways = [where for by, where in ((1, "before"), (-1, "after")) if _clear(fit[by] - fit[0])]

@@ -71,8 +71,7 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
     site = data.site
     if site.kind != "csi" or site.wavelength is None or data.uplink is not None:
         return None
-    stations = 1 if site.stations is None else len(site.stations)
-    few = max(MOST_ENTRIES // (stations * data.target[0].size), 1)
+    few = max(MOST_ENTRIES // (len(site.every_station) * data.target[0].size), 1)
     rows = Snapshots.from_rows(data, np.arange(min(len(data), few)))
     if rows.values[0].size < 2:
         return None

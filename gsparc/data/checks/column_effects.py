@@ -122,7 +122,7 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
 
 def run_warnings(data: Measurements) -> list[str]:
     """Warn of runs that tell levels apart as a transmitter elsewhere would, or another gain."""
-    if data.site.kind != "rssi" or data.run is None or data.site.static_end is None:
+    if not data.site.maps_levels or data.run is None:
         return []
     links, rows = LevelsAtPlaces.of(data)
     said = {

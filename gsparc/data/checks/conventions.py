@@ -85,10 +85,10 @@ def convention_warnings(data: Measurements) -> list[str]:
 
 def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
-    stations = data.site.stations
+    stations = data.site.every_station
     run, station = data.runs_of(), data.stations_of()
     single = data.site.kind == "csi" and data.target.shape[1] == 1
-    if stations is None or data.place is None or len(stations) < COHERENT or not single:
+    if data.place is None or len(stations) < COHERENT or not single:
         return data, run * (int(station.max()) + 1) + station
     heard = Snapshots.from_rows(data, np.arange(len(data)))
     measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask

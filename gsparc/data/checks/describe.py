@@ -7,7 +7,7 @@ import numpy as np
 from gsparc.data.checks.coherence import estimate_coherence
 from gsparc.data.errors import list_first
 from gsparc.data.load import split_for
-from gsparc.data.schema import ENDS, Measurements, Site
+from gsparc.data.schema import ENDS, LIGHT, Measurements, Site
 from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
@@ -67,15 +67,13 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
 
 
 def _carrier(site: Site) -> str:
-    if site.carrier_hz is None and site.kind == "rssi":  # of which the phase is unknown in any case
-        return ""
-    if site.carrier_hz is None:
-        return "unknown; give frequency_hz, and effects that need the phase become available"
-    carriers = None if site.stations is None else site.stations.carrier_hz
-    several = [] if carriers is None else [f"{hertz / 1e9:.6g}" for hertz in np.unique(carriers)]
-    if len(several) > 1:
-        return f"{list_first(several)} GHz, one for each station"
-    return f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
+    if np.isnan(site.carriers).any():
+        unknown = "unknown; give frequency_hz, and effects that need the phase become available"
+        return "" if site.target.in_decibels else unknown  # of powers the phase is unknown in any case
+    carriers = [f"{hertz / 1e9:.6g}" for hertz in np.unique(site.carriers)]
+    if len(carriers) > 1:
+        return f"{list_first(carriers)} GHz, one for each station"
+    return f"{carriers[0]} GHz, wavelength {LIGHT / site.carriers[0]:.4g} m"
 
 
 def distinct_places(data: Measurements) -> np.ndarray:
@@ -102,8 +100,8 @@ def _static(site: Site) -> str:
     """Which end stands still, and where in the world."""
     if site.static_end is None:
         return "neither end"
-    end, stations = ENDS[site.static_end], site.stations
-    if stations is not None and (len(stations) > 1 or site.static_position is None):
+    end, stations = ENDS[site.static_end], site.every_station
+    if site.stations is not None and (site.several or site.static_position is None):
         known = stations.position[np.isfinite(stations.position).all(axis=1)]
         lost = len(stations) - len(known)
         where = _box(known) if len(known) else ""
@@ -113,15 +111,13 @@ def _static(site: Site) -> str:
     if site.static_position is None:
         return f"the {end}, at an unknown place"
     place = site.static_position + site.origin  # local coordinates are centred in float64
-    name = "" if stations is None else f" {stations.shown[0]},"
+    name = "".join(f" {shown}," for shown in stations.shown if shown)
     return f"the {end},{name} at ({', '.join(f'{x:.3f}' for x in place)}) m"
 
 
 def _moving(data: Measurements) -> str:
-    ends = {"receiver": data.rx_position, "transmitter": data.tx}
-    if data.site.static_end is not None:
-        ends = {ENDS[data.site.moving_end]: data.moving}
-    return "; ".join(f"the {end},{_box(places)}" for end, places in ends.items())
+    moving = sorted(data.site.moving_ends)  # the receiver first
+    return "; ".join(f"the {ENDS[end]},{_box(data.ends[end])}" for end in moving)
 
 
 def _box(places: np.ndarray) -> str:

@@ -26,7 +26,7 @@ class LinkLevels:
         file_row: (n,) its number from 0.
         names: (T,) of the stations, for people.
         keys: (T,) as settings take them.
-        station_position: (T, 3), in the world [m]; None where it is not known.
+        station_position: (T, 3), in the world [m]; NaN where it is not known.
         limited: stations with rows below a level of hearing that the file states, or that lists leave out.
     """
 
@@ -37,7 +37,7 @@ class LinkLevels:
     file_row: np.ndarray
     names: list[str]
     keys: list[str]
-    station_position: np.ndarray | None
+    station_position: np.ndarray
     limited: frozenset[int] = frozenset()
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
@@ -53,15 +53,14 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
         file_row: (S,) number of each row in its file; None: the row's own.
     """
     site = data.site
-    if site.kind != "rssi" or site.static_end is None:
+    if not site.maps_levels:
         return None
-    stations = site.stations
-    station = data.stations_of()
+    stations, station = site.every_station, data.stations_of()
     place = np.arange(len(data)) if data.place is None else data.place
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    count = 1 if stations is None else len(stations)
+    count = len(stations)
     with np.errstate(divide="ignore"):
-        level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
+        level = 10 * np.log10(data.powers()[:, 0])
     link, called = which.reshape(-1) * count + station, data.row_names
     side = data.censored_side()
     rows = np.flatnonzero(side <= 0)
@@ -75,7 +74,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     told = data.censored is not None or data.provenance.get("absent") == "unknown"
     if not told and len(first) < len(np.unique(link)):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
-    parts = [] if stations is None else [name.split(FROM_ROW) for name in stations.name]
+    parts = [name.split(FROM_ROW) for name in stations.name]
     for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
         # A part of a station is not absent before its first row or after its last.
         at, own = absent // count, which[station == t]
@@ -86,9 +85,8 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     of_link = np.concatenate([station[rows], absent % count])[order]
     levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
     of_file = [called[i].partition(", station")[0] for i in of_row]
-    known = site.static_position if stations is None else stations.position
-    known = None if known is None else np.atleast_2d(known) + site.origin
-    names, keys = ([UNNAMED],) * 2 if stations is None else map(list, (stations.shown, stations.name))
+    names, keys = ([name or UNNAMED for name in names] for names in (stations.shown, stations.name))
     number = of_row if file_row is None else file_row[of_row]
     place = data.moving[of_row] + site.origin
+    known = stations.position + site.origin
     return LinkLevels(place, of_link, levels, of_file, number, names, keys, known, limited)

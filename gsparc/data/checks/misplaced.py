@@ -25,8 +25,6 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
 
     Of the sectors of a site the strongest counts, so that no beam makes up for a distance.
     """
-    if levels.station_position is None:
-        return []
     where, first, site = np.unique(levels.station_position, axis=0, return_index=True, return_inverse=True)
     site, known = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
     heard = dict[int, np.ndarray]()

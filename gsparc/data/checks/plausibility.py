@@ -283,8 +283,8 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     steps = []
     blocks = int(np.clip(20 * MOST_BLOCKS / max(len(np.unique(levels.station)), 1), 200, MOST_BLOCKS))
     for t, used in rows_by(levels.station):
-        where = None if levels.station_position is None else levels.station_position[t]
-        where = where if where is not None and np.isfinite(where).all() else None
+        where = levels.station_position[t]
+        where = where if np.isfinite(where).all() else None
         for step in detect_level_steps(levels.position[used], levels.level_db[used], where, blocks):
             steps.append((t, replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return steps

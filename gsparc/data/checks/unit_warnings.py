@@ -38,9 +38,7 @@ def unit_warnings(data: Measurements) -> list[str]:
         if reach > LONG_ARRAY * site.wavelength:
             waves = f"{reach / site.wavelength:.3g} wavelengths"
             hints.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
-    hertz = np.array([] if site.carrier_hz is None else [site.carrier_hz])
-    if site.stations is not None and site.stations.carrier_hz is not None:
-        hertz = np.append(hertz, site.stations.carrier_hz)
+    hertz = site.carriers[np.isfinite(site.carriers)]
     if len(hertz) and not (HERTZ[0] <= hertz.min() and hertz.max() <= HERTZ[1]):
         hints.append(f"carriers of {hertz.min() / 1e6:g} to {hertz.max() / 1e6:g} MHz: another unit?")
     if site.grid is not None:

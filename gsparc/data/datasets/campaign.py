@@ -88,9 +88,8 @@ def find_implausible(
 ) -> tuple[list[str], LinkLevels | None, list[tuple[int, LevelStep]]]:
     """Return warnings of units, conventions and levels, and the levels and their steps, of `most` links."""
     hints: list[str] = [Severe(f"units? {hint}") for hint in unit_warnings(data)]
-    stations = 1 if data.site.stations is None else len(data.site.stations)
     places = len(data) if data.place is None else len(np.unique(data.place))
-    if places * stations > most:
+    if places * len(data.site.every_station) > most:
         said = "too many links to be looked at for implausible levels here; gsparc check does"
         return [*hints, said], None, []
     hints += map(Severe, convention_warnings(data))

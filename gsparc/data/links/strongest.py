@@ -186,15 +186,15 @@ class StrongestLists:
 
 def strongest_lists(data: Measurements) -> StrongestLists | None:
     """Return what is listed at each moment, where these are lists of the strongest; None elsewhere."""
-    if data.place is None or data.station is None or data.site.stations is None:
+    if data.place is None or data.station is None or not data.site.several:
         return None
     heard = np.flatnonzero(data.censored_side() <= 0)
     level, at = levels_db(data, heard), data.moving[heard]
-    count = len(data.site.stations)
+    count = len(data.site.every_station)
     lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)
     return lists if lists.are_strongest() else None
 
 
 def levels_db(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return levels (n,) [dB] of rows of powers."""
-    return 10 * np.log10(data.target[rows, 0].astype(float) * data.site.target_scale)
+    return 10 * np.log10(data.powers(rows)[:, 0])

@@ -110,8 +110,7 @@ class Problem:
     @property
     def network(self) -> bool:
         """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
-        several = self.data.site.target.in_decibels and self.data.site.stations is not None
-        return several and find_sectors(self.data) is not None
+        return self.data.site.target.in_decibels and find_sectors(self.data) is not None
 
     @property
     def scene(self) -> bool:

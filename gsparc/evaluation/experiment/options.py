@@ -90,8 +90,7 @@ def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | 
         method: fitted.
         data: that it learned from.
     """
-    stations = data.site.has_several_stations
-    counted = {"effort": method.takes_effort, "stations": stations}
+    counted = {"effort": method.takes_effort, "stations": data.site.several}
     reads.noted |= {name for name, heeded in counted.items() if heeded}
     known = {option.path for option in reads.options}
     why: dict[str, list[str]] = defaultdict(list)

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from scipy.special import ndtr
 from torch import Tensor
 
-from gsparc.data.schema import Site
+from gsparc.data.schema import ENDS, Site
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
@@ -193,8 +193,7 @@ def fit_site_law(rows: PowerRows, site: Site) -> tuple[Law, tuple[str, ...]]:
     if site.static_position is not None and np.isfinite(site.static_position).all():
         return fit_law(rows, site.static_position), ()
     place = locate_still_end(rows)
-    end = "transmitter" if site.static_end == "tx" else "receiver"
-    return fit_law(rows, place), (f"the {end}'s place {say_estimated(place + site.origin)}",)
+    return fit_law(rows, place), (f"the {ENDS[site.still_end]}'s place {say_estimated(place + site.origin)}",)
 
 
 class DistanceLaw(Differentiable):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from gsparc.data.target import Kind, Target
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import heard_rows, power_rows, training_targets, unheard_note
 from gsparc.processes.powers import PowerRows
-from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
@@ -37,7 +36,6 @@ class Interpolator(Method):
     """
 
     both_ends = True
-    stored: ClassVar[tuple[str, ...]] = ()  # attributes that are learned, by their names in a checkpoint
     shape: tuple[int, ...] = ()
     seen = 0
 
@@ -58,7 +56,7 @@ class Interpolator(Method):
             own = self._learn(data.moving[rows], training_targets(data, rows))
             notes = (*own, *unheard_note(data, known, self.name))
         lost = sorted(set(vars(self)) - before - set(self.stored))
-        if lost and type(self)._relearn is Interpolator._relearn:
+        if lost and type(self)._relearn is Method._relearn:
             raise ValueError(
                 f"{self.name}: its checkpoint loses {', '.join(lost)}: name it in `stored` (tensor, number, "
                 "string) or make it again in `_relearn(state)`"
@@ -76,12 +74,12 @@ class Interpolator(Method):
 
     def state(self) -> dict[str, Any]:
         """Return the target shape, the number of rows, and what the subclass learned."""
-        return {"shape": list(self.shape), "seen": self.seen, **self._stored_state()}
+        return {"shape": list(self.shape), "seen": self.seen, **super().state()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.shape, self.seen = site, tuple(state["shape"]), int(state["seen"])
-        self._relearn(state)
+        self.shape, self.seen = tuple(state["shape"]), int(state["seen"])
+        super().restore(site, state)
 
     def count_components(self) -> int:
         """Return the number of stored training samples."""
@@ -111,15 +109,6 @@ class Interpolator(Method):
     @abstractmethod
     def _look_up(self, queries: np.ndarray) -> Prediction:
         """Predict at (B, 3) float64 [m]."""
-
-    def _stored_state(self) -> dict[str, Any]:
-        return {name: to_plain(getattr(self, name, None)) for name in self.stored}
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        """Set what `stored` names; what cannot be stored is made again by who overrides this."""
-        for name in self.stored:
-            if name in state or not hasattr(type(self), name):  # older checkpoints lack what has a default
-                setattr(self, name, from_plain(state[name]))
 
 
 class Differentiable(Interpolator):

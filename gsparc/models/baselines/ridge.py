@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.method import Prediction
 from gsparc.models.uplink.interface import UplinkMethod, mean_power, root_mean_power
@@ -28,6 +28,7 @@ class Ridge(UplinkMethod):
 
     name = "ridge"
     plain_place = 110
+    stored = ("maps", "unit", "inputs")
 
     @classmethod
     def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
@@ -82,14 +83,6 @@ class Ridge(UplinkMethod):
         mean = torch.einsum("bmf,mfo->bmo", self._inputs(self.query_uplinks(query)), self.maps)
         assert self.site is not None and self.site.antennas is not None
         return Prediction(mean.reshape(len(query), len(self.site.antennas), -1))
-
-    def state(self) -> dict[str, Any]:
-        """See `Method.state`."""
-        return {"maps": self.maps, "unit": self.unit, "inputs": self.inputs}
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        self.site, self.maps, self.unit, self.inputs = site, state["maps"], state["unit"], state["inputs"]
 
 
 def _solve_ridge(gram: Tensor, product: Tensor, penalty: float) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -21,14 +21,13 @@ from gsparc.models.target_rows import training_targets
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.lags import SpectrumLags, pixel_exponent
 from gsparc.processes.left_out import rows_of_groups
-from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext
 
 
 def carriers_obstacle(site: Site) -> str | None:
     """Return why spectra of this site are not those of one array at several carriers; None where they are."""
-    stations = site.stations
-    if site.kind != "spectrum" or stations is None or stations.carrier_hz is None:
+    stations = site.every_station
+    if site.kind != "spectrum" or stations.carrier_hz is None:
         return "targets are no spectra at several carriers"
     if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE_M:
         return "receivers at several places"
@@ -43,9 +42,9 @@ def carriers_obstacle(site: Site) -> str | None:
 
 def _arrays(site: Site) -> np.ndarray:
     """Elements (T, M, 3) [m] of the array at each carrier."""
-    assert site.stations is not None and site.array is not None
-    own = site.stations.array
-    return np.repeat(site.array[None], len(site.stations), axis=0) if own is None else own
+    assert site.array is not None
+    own = site.every_station.array
+    return np.repeat(site.array[None], len(site.every_station), axis=0) if own is None else own
 
 
 class OneArray(Method):
@@ -97,16 +96,6 @@ class OneArray(Method):
         assert grid is not None
         return images.clamp(0, 1).unflatten(1, (grid.height, grid.width)).to(query.tx.dtype)
 
-    def state(self) -> dict[str, Any]:
-        """Return what was learned."""
-        return {name: to_plain(getattr(self, name)) for name in self.stored}
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        self.site, self._spectra = site, None
-        for name, value in state.items():
-            setattr(self, name, from_plain(value))
-
     def add_carrier(self, frequency_hz: float) -> Self:
         """See `AddsCarriers`."""
         result = copy(self)
@@ -115,9 +104,7 @@ class OneArray(Method):
 
     @property
     def _stations(self) -> Stations:
-        stations = self.fitted_site.stations
-        assert stations is not None
-        return stations
+        return self.fitted_site.every_station
 
     def pose(self) -> tuple[Tensor, Tensor]:
         """Return place (3,) float64 [m] and rotation (3, 3) of the receiver."""

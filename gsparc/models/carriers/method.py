@@ -76,7 +76,7 @@ class CarrierField(OneArray):
         Raises:
             ValueError: not spectra of one array at several carriers.
         """
-        watch, known = Stopwatch(), np.concatenate([fold.train, fold.val])
+        watch, known = Stopwatch(), fold.learned()
         whole, known = len(known), known[_at_covering_places(data.tx[known], MOST_ROWS)]
         images, groups = self.read_rows(data, known)
         carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
 from gsparc.data.query import Query
@@ -28,7 +27,7 @@ class OtherCarriers(OneArray):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Method.fit`; `ValueError` where carriers have not one array."""
         watch = Stopwatch()
-        images, groups = self.read_rows(data, np.concatenate([fold.train, fold.val]))
+        images, groups = self.read_rows(data, fold.learned())
         self.means = torch.stack([images[rows].mean(0) for rows in groups])
         return FitReport(watch.seconds)
 
@@ -51,7 +50,7 @@ class DirectBeam(OneArray):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Method.fit`; `ValueError` where carriers have not one array."""
         watch = Stopwatch()
-        self.read_rows(data, np.concatenate([fold.train, fold.val]))
+        self.read_rows(data, fold.learned())
         return FitReport(watch.seconds)
 
     def predict(self, query: Query) -> Prediction:

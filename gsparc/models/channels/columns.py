@@ -135,7 +135,7 @@ class Group(SlotPlaces):
 
 def require_waves(site: Site) -> None:
     """Raise a `ValueError` for data that waves of a known length cannot explain."""
-    if site.kind != "csi" or site.wavelength is None:
+    if not site.has_waves:
         raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
 
 
@@ -149,9 +149,9 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
             columns of a station are one, measured at the moving end's place at the carrier.
     """
     require_waves(data.site)
-    alike, order = np.zeros(len(rows), np.int64), _order_in_station(data)
+    # A copy of one station, or of all as one end that moves, sees one.
+    order, station = _order_in_station(data), data.stations_of(rows) * data.site.several
     run = np.unique(data.runs_of(rows), return_inverse=True)[1].reshape(-1)
-    station = alike if data.station is None or data.site.stations is None else data.station[rows]
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
     target = torch.from_numpy(np.asarray(data.target[rows])).to(torch.complex128)
@@ -184,7 +184,7 @@ def _order_in_station(data: Measurements) -> np.ndarray:
 
 def _slots_of_station(data: Measurements, station: int, rows: np.ndarray, by_antenna: bool) -> list[Slot]:
     site, (antennas, tones) = data.site, data.target.shape[1:]
-    centre, carrier = torch.from_numpy(site.still_places[station]), station_carrier(site, station)
+    centre, carrier = torch.from_numpy(site.every_station.position[station]), float(site.carriers[station])
     every = tuple(range(antennas))
     if not by_antenna:
         return [Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)]
@@ -212,14 +212,6 @@ def coherent_bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]
     width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, NEAR_M))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
     return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
-
-
-def station_carrier(site: Site, station: int) -> float:
-    """Return the carrier [Hz] of a station."""
-    if site.stations is not None and site.stations.carrier_hz is not None:
-        return float(site.stations.carrier_hz[station])
-    assert site.carrier_hz is not None
-    return float(site.carrier_hz)
 
 
 def count_static_ends(groups: tuple[Group, ...]) -> int:

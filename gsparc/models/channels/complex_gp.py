@@ -13,7 +13,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby, product
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -39,7 +39,6 @@ from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.prior import Prior
-from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.stopwatch import Stopwatch
@@ -63,6 +62,7 @@ class ComplexGP(ClosedForm):
 
     name = "complex_gp"
     plain_place = 100
+    stored = ("posterior", "runs", "shape")
     kinds = ("csi",)
     both_ends = True
     count_gaussians = 0  # type: ignore[assignment]
@@ -74,9 +74,7 @@ class ComplexGP(ClosedForm):
     @classmethod
     def stands_beside(cls, data: Measurements, fold: Fold) -> bool:
         """See `MethodFactory.stands_beside`: carrier and all stations must be known."""
-        site = data.site
-        carriers = (site.carrier_hz, None if site.stations is None else site.stations.carrier_hz)
-        if not super().stands_beside(data, fold) or all(one is None for one in carriers):
+        if not super().stands_beside(data, fold) or not np.isfinite(data.site.carriers).all():
             return False
         return data.station is None or not stations_of_fold(cls(), data, fold).only_tested.any()
 
@@ -93,7 +91,7 @@ class ComplexGP(ClosedForm):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
         started = Stopwatch()
-        if data.site.kind != "csi" or data.site.wavelength is None:
+        if not data.site.has_waves:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
         known = fold.learned()
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
@@ -200,19 +198,6 @@ class ComplexGP(ClosedForm):
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
         told = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
         return self.runs.apply_factors(told, query.run)
-
-    def state(self) -> dict[str, Any]:
-        """See `Method.state`."""
-        return {
-            "posterior": to_plain(self.require_fitted(self.posterior)),
-            "runs": to_plain(self.runs),
-            "shape": [*self.shape],
-        }
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """See `Method.restore`."""
-        self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.posterior, self.runs = from_plain(state["posterior"]), from_plain(state["runs"])
 
     def count_components(self) -> int:
         """Return the number of training samples kept."""

@@ -225,7 +225,7 @@ class ChannelField(ClosedForm):
             for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
                 slot, outputs = known.group.slot, known.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
-                middle = torch.from_numpy(self.site.still_places[slot.station])
+                middle = torch.from_numpy(self.site.every_station.position[slot.station])
                 slot = replace(slot, end=slot.end + place - middle)
                 at = SlotPlaces(slot, slot.antenna_places(ends.moving[here], ends.turned[here]))
                 common, left, whole = self.common.predict(prior, at)

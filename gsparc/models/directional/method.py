@@ -64,7 +64,7 @@ class DirectionalGP(SourcesInFrame):
         require_static_phase(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
-        known = np.concatenate([fold.train, fold.val])
+        known = fold.learned()
         if len(known) > MAX_RECEIVERS:
             known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
         places = data.rx_position[known].astype(np.float64)

@@ -98,7 +98,7 @@ class ImageSourceGP(SourcesInFrame):
         """
         require_static_phase(data.site, self.name)
         require_fixed_rotation(data)
-        seen = np.concatenate([fold.train, fold.val])
+        seen = fold.learned()
         self._groups = context.leave_out
         effort = Effort().scale_by(context.effort * (1.0 if context.leave_out else ALONE))
         watch, settings = Stopwatch(), self.settings

@@ -28,8 +28,8 @@ class LearnsTogether(MethodFactory):
 
     def learns_jointly(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
-        waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
-        return (waves and site.phase_reference != "neighbours") or site.kind == "rssi"
+        waves = site.has_waves and len(site.moving_ends) == 1
+        return (waves and site.phase_reference != "neighbours") or site.target.in_decibels
 
     def why_each(self, data: Measurements) -> str | None:
         """Return why several stations cannot be learned together; None where they can."""

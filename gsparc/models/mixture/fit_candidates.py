@@ -73,7 +73,7 @@ def fit_candidates(
             within = replace(context, leave_out=leave_out, race=race, beside=fields)
             with heeded.set_apart() as read[name]:
                 field = parts[name](settings, effects.visibility is not False, within)
-                report = field.fit(data, Fold(rows, rows[:0], rows[:0]), within)
+                report = field.fit(data, Fold.of_all(rows), within)
             if not field.asks_visibility:
                 read[name].discard("model.effects.visibility")
             fields[name] = field

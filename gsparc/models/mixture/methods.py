@@ -87,11 +87,11 @@ class Powers(Mixture):
         """See `Mixture`; `init=scene` is the process of one station that knows walls."""
         if self.init.name == "scene":
             return {"scene": CANDIDATES["powers"]}
-        return _candidates("joint_powers" if data.site.has_several_stations else "powers")
+        return _candidates("joint_powers" if data.site.several else "powers")
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        if data.site.has_several_stations and (why := self.why_each(data)) is not None:
+        if data.site.several and (why := self.why_each(data)) is not None:
             return f"{why}; say stations=each"
         return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
 

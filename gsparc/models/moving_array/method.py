@@ -104,7 +104,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         self._lags, self._steps = None, round(context.effort * self.search.steps)
         report = super().fit(data, fold, context)
         # The rows of `super().fit` in its order: `left_out` names its images by them.
-        self.rows = heard_rows(data, np.concatenate([fold.train, fold.val]))
+        self.rows = heard_rows(data, fold.learned())
         return report
 
     @property
@@ -296,8 +296,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         self._lags = self._query = None
         self.basis = Separable(**state["basis"])
 
-    def _stored_state(self) -> dict[str, Any]:
-        return {**super()._stored_state(), "basis": vars(self.basis)}
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        return {**super().state(), "basis": vars(self.basis)}
 
 
 def _spread_rows(count: int, limit: int) -> np.ndarray:

@@ -49,9 +49,8 @@ class FrequencyEmbedded(GaussianNetwork):
 
     def __init__(self, scene: KnownSite, settings: Wideband) -> None:
         super().__init__(scene, settings.count, settings.ssim_weight)
-        stations = scene.site.stations
-        carriers = [scene.site.carrier_hz] if stations is None else stations.carrier_hz
-        if carriers is None or None in carriers:
+        octaves = torch.from_numpy(scene.site.carriers).log2()
+        if octaves.isnan().any():
             raise ValueError(f"{settings.name}: the dataset declares no carrier")
         self.grid, self.options = rendering_options(scene)
         self.field, self.degree = initial_gaussians(scene, settings.count), settings.degree
@@ -59,7 +58,6 @@ class FrequencyEmbedded(GaussianNetwork):
             0.1 * torch.randn(settings.count, count_terms(self.degree, self.degree), 2)
         )
         # As long as the box of places: features of both have the same octaves.
-        octaves = torch.as_tensor(carriers, dtype=torch.float64).log2()
         span = (octaves.max() - octaves.min()).clamp_min(1.0)
         extent = (scene.box[1] - scene.box[0]).max()
         self.register_buffer("tuned", (extent * (octaves - octaves.min()) / span).float())
@@ -133,8 +131,7 @@ class Wideband(DeformedPeer):
 
     def learns_jointly(self, site: Site) -> bool:
         """See `MethodFactory`."""
-        stations = site.stations
-        return stations is not None and stations.carrier_hz is not None
+        return site.every_station.carrier_hz is not None
 
     def choose_stations(
         self, data: Measurements, fold: Fold, context: FitContext

@@ -79,7 +79,7 @@ class PowerField(ClosedForm):
         Raises:
             ValueError: no rows.
         """
-        watch, rows = Stopwatch(), np.concatenate([fold.train, fold.val])
+        watch, rows = Stopwatch(), fold.learned()
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
         self.site, self.fringes = data.site, None

@@ -67,7 +67,7 @@ class OwnTerms:
         if self.prior is None or data.site.static_end is None:  # a map is about one end that moves
             return self.terms
         heeded.count_reads("model.prior")
-        if data.site.has_several_stations:
+        if data.site.several:
             return (*self.terms, NetworkMaps.from_file(self.prior, data))
         station = data.site.name.rpartition(OF_STATION)[2]
         return (*self.terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
@@ -94,7 +94,8 @@ class UserTerm(Columns):
     @classmethod
     def from_site(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
-        origin, still = map(torch.from_numpy, (site.origin.astype(np.float64), site.still_places[0]))
+        ends = site.origin.astype(np.float64), site.every_station.position[0]
+        origin, still = map(torch.from_numpy, ends)
         return cls(term, origin, still)
 
     @property

@@ -85,9 +85,8 @@ class ImageProcess(LearnedField):
         spent = dict(self.spent)
         if self._average is not None:
             method = self._average[0]
-            known = np.sort(fold.learned())
             # It was weighed without validation rows, and answers with them.
-            more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
+            more = method.fit(data, Fold.of_all(np.sort(fold.learned())), FitContext())
             if not self._is_process_alone:  # components are most of a query
                 self._average = method.with_strongest(BEYOND), self._average[1]
             report = replace(report, seconds=report.seconds + more.seconds)
@@ -111,7 +110,7 @@ class ImageProcess(LearnedField):
         if not self.plain:
             return
         process, left = GaussianProcess(), self._left_out  # a dozen validation rows decide by chance
-        process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
+        process.condition(data, fold.train)
         if not self.count_components() or (left is None and len(fold.val) < LEAST_HELD):
             few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
             log.info("%s: a Gaussian process alone", few if self.count_components() else "no Gaussians")

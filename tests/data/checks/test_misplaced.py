@@ -73,5 +73,4 @@ def test_levels_that_say_nothing_of_places_are_no_evidence():
     right, rng = CITIES[0], np.random.default_rng(0)
     for level in (np.full(len(right.level_db), -80.0), rng.normal(-80, 8, len(right.level_db))):
         assert not misplaced_warnings(replace(right, level_db=level))
-    assert not misplaced_warnings(replace(right, station_position=None))
     assert not misplaced_warnings(replace(right, station_position=np.full((30, 3), np.nan)))

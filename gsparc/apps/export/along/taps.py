@@ -143,8 +143,8 @@ def fit_taps(
     places = way.places_at(time_s)
 
     def ask(place: np.ndarray) -> np.ndarray:
-        tx, rx = (place if end == site.moving_end else None for end in ("tx", "rx"))
-        return predictor.csi(tx, rx)[:, :antennas]
+        where: dict[str, Any] = {site.moving_end: place}
+        return predictor.csi(**where)[:, :antennas]
 
     if np.ptp(tones) > rate_hz:
         raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")

@@ -12,7 +12,6 @@ from gsparc.apps.export.compiled.channels import compile_sources
 from gsparc.apps.export.compiled.powers import compile_powers
 from gsparc.apps.export.compiled.spectra import compile_array, compile_view
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
@@ -28,7 +27,6 @@ from gsparc.models.splat.image_process import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
-from gsparc.training.context import FitContext
 
 ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made from
 
@@ -66,8 +64,7 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     """
     method, site = predictor.method, predictor.site
     if isinstance(method, PerStation):
-        assert site.stations is not None
-        raise ValueError(f"station= is needed, one of {', '.join(site.stations.name)}")
+        raise ValueError(f"station= is needed, one of {', '.join(site.every_station.name)}")
     if site.static_end is None and site.kind != "rssi":
         advice = "take a model of powers, or one end that stands still"
         raise ValueError(f"to=c: channels and spectra of two moving ends have no compiled form; {advice}")
@@ -162,10 +159,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     data = sample_model(predictor, places)
     if sources is not None:
         return _sources_given(sources, data)
-    every = np.arange(len(data))
     # All rows are learned from: a model's answers have no noise that validation would guard against.
     process = GaussianProcess()
-    process.fit(data, Fold(every, every[:0], every[:0]), FitContext())
+    process.condition(data, np.arange(len(data)))
     form = compile_exactly(process, site)
     assert form is not None
     return replace(form, predictor=Predictor(process, site))
@@ -228,17 +224,9 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
     return places
 
 
-def split_ends(site: Site, places: np.ndarray) -> dict[str, np.ndarray]:
-    """Return local places (B, 3) float64 [m] of the ends that move, from (B, 3) or (B, 6)."""
-    places = places.astype(np.float64)
-    return {site.moving_end: places} if site.static_end else {"tx": places[:, :3], "rx": places[:, 3:]}
-
-
 def ask_model(predictor: Predictor, places: np.ndarray) -> np.ndarray:
     """Return the model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
-    site = predictor.site
-    parts = (split_ends(site, places[i : i + 64]) for i in range(0, len(places), 64))
-    asked = [{end: at + site.origin for end, at in part.items()} for part in parts]
+    asked = [predictor.site.world_ends(places[i : i + 64]) for i in range(0, len(places), 64)]
     return np.concatenate([predictor.predict_linear(**ends).mean.numpy() for ends in asked])
 
 
@@ -246,7 +234,8 @@ def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:
     """Return measurements whose targets are the model's answers at local places [m]."""
     site, count = predictor.site, len(places)
     still = np.zeros(3) if site.static_position is None else site.static_position
-    ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | split_ends(site, places)
+    moving = {end: place - site.origin for end, place in site.world_ends(places).items()}
+    ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | moving
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     return Measurements(
         site, ends["tx"].astype(np.float64), ends["rx"].astype(np.float64),

@@ -84,8 +84,8 @@ class JointPowerField(ClosedForm):
         Raises:
             ValueError: not several stations, or no rows.
         """
-        watch, rows = Stopwatch(), np.concatenate([fold.train, fold.val])
-        if data.site.stations is None or len(data.site.stations) < 2:
+        watch, rows = Stopwatch(), fold.learned()
+        if not data.site.several:
             raise ValueError("a process of many stations' powers needs several stations")
         if not len(rows):
             raise ValueError("a process of many stations' powers needs at least one row")
@@ -96,7 +96,6 @@ class JointPowerField(ClosedForm):
 
     def _learn(self, data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
         """Set the processes and what they share; what must be said of them."""
-        assert data.site.stations is not None
         self.places, notes = places_and_notes(data, rows)
         used = rows_of_stations(data, rows, self.places)
         network = find_sectors(data, self.places)
@@ -104,7 +103,7 @@ class JointPowerField(ClosedForm):
             self.own, remarks = learn_station_priors(used, self.seed)
         else:
             used = relabel_by_site(used, network)
-            names = data.site.stations.shown
+            names = data.site.every_station.shown
             evidence, prior, remarks = learn_network(used, network, names, self.seed)
             for maps in self.maps:
                 known, own, said = learn_network(used, maps.put_under(network, self.places), names, self.seed)

@@ -92,7 +92,7 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
     numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
     kernel, priors = _fit_common_kernel(heard, trend, seed)
     if some_silent:
-        each = min(WEIGHED_EACH, max(MOST_ROWS // len(whole.stations), 1))
+        each = whole.share_of(MOST_ROWS, WEIGHED_EACH)
         parts = [whole.select_station(n).draw_stretches(each, seed).view(trend) for n in whole.stations]
         # What lists hold spreads less than what they were drawn from.
         narrow, (_, kernel) = kernel, fit_kernel_by_evidence(kernel, parts, EVIDENCE_LOOKS)
@@ -128,7 +128,7 @@ def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
 
 def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
-    few = heard.thin_rows(min(LEARNED_EACH, max(MOST_ROWS // len(heard.stations), 1)), seed)
+    few = heard.thin_rows(heard.share_of(MOST_ROWS, LEARNED_EACH), seed)
     views = {number: few.select_station(number).view(trend) for number in few.stations}
     at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
     far = distances(at, at)
@@ -159,7 +159,7 @@ def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> t
         must be said of what g gains at these, each after one constant.
     """
     heard = rows.heard_rows
-    few = heard.thin_rows(min(TRIED_EACH, max(TRIED_ON // len(heard.stations), 1)), seed)
+    few = heard.thin_rows(heard.share_of(TRIED_ON, TRIED_EACH), seed)
     short = min(priors.never.kernel.lengths)
     bare = SharedTerms.from_rows(few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
     if len(few.stations) < LEAST_STATIONS:

@@ -69,10 +69,9 @@ def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sector
         data: powers of several stations.
         places: (T, 3) of the stations [m]; None: those that are given.
     """
-    stations = data.site.stations
-    assert stations is not None
+    stations = data.site.every_station
     places = stations.position if places is None else places
-    sector = np.full((len(places), len(USUAL) + 1), np.nan) if stations.sector is None else stations.sector
+    sector = stations.beams
     site = number_sites(stations, places)
     levels = () if data.censored is None else np.unique(data.target[data.censored > 0])
     several = 2 * (np.bincount(site)[site] > 1).sum() >= len(site) and len(levels) > len(site)
@@ -102,9 +101,8 @@ def number_sites(stations: Stations, places: np.ndarray) -> np.ndarray:
     apart = np.linalg.norm(horizontal(places[:, None] - places), axis=-1)
     stem = np.array([site_name(name) for name in stations.name])
     near = (apart <= SAME_SITE_M) | ((apart <= SAME_NAME_M) & (stem[:, None] == stem))
-    if stations.sector is not None:
-        site = stations.sector[:, len(USUAL)]  # as a column of the list says
-        near |= site[:, None] == site
+    site = stations.beams[:, len(USUAL)]  # as a column of the list says
+    near |= site[:, None] == site
     return connected_components(near)[1].astype(np.int64)
 
 
@@ -117,14 +115,14 @@ def relabel_by_site(rows: StationRows, network: Sectors) -> StationRows:
 
 def check_azimuths(data: Measurements, seed: int = 0) -> list[str]:
     """Return what `learn_network` says of azimuths; nothing where `data` are of no network."""
-    if data.site.kind != "rssi" or data.site.stations is None or len(data) < LEAST_TESTED:
+    if data.site.kind != "rssi" or data.station is None or len(data) < LEAST_TESTED:
         return []
     every = np.arange(len(data))
     places, _ = places_and_notes(data, every)
     if (network := find_sectors(data, places)) is None or (network.table[:, 0] == NO_AZIMUTH).all():
         return []
     rows = relabel_by_site(rows_of_stations(data, every, places), network)
-    return _fit_azimuths(rows, network, data.site.stations.shown, seed)[-1]
+    return _fit_azimuths(rows, network, data.site.every_station.shown, seed)[-1]
 
 
 def learn_network(

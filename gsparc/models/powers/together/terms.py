@@ -54,6 +54,10 @@ class StationRows(PowerRows):
         """Return the rows of one station."""
         return self.subset(np.flatnonzero(self.station == number))
 
+    def share_of(self, most: int, each: int) -> int:
+        """Return rows of each station of which all have `most`, at most `each` and at least one."""
+        return min(each, max(most // len(self.stations), 1))
+
     def thin_rows(self, per_station: int, seed: int) -> StationRows:
         """Return at most so many rows of each station, at places that they share where they do.
 
@@ -91,14 +95,13 @@ class StationRows(PowerRows):
 def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
     site, notes = data.site, []
-    assert site.stations is not None
-    places = np.array(site.stations.position, np.float64)
+    places = np.array(site.every_station.position, np.float64)
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
         own = rows[data.stations_of(rows) == number]
         if len(own):
             places[number] = locate_still_end(power_rows(data, own))
             said = say_estimated(places[number] + site.origin)
-            notes.append(f"the place of station {site.stations.shown[number]} {said}")
+            notes.append(f"the place of station {site.every_station.shown[number]} {said}")
     return places, tuple(notes)
 
 
